@@ -1,0 +1,144 @@
+"""Facts of the benchmark: environments, anomalies, split definitions and protocol version.
+
+Names only, no simulator and no data: `list`, the runner, the reports and the recorder all read
+them here. Values of the paper are from Danesh & Fern (2021), Tables 1 and 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Literal
+
+PROTOCOL: Final = 1
+"""Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
+
+Group = Literal["sensor", "dynamics"]
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentInfo:
+    """One environment of the benchmark.
+
+    Attributes
+    ----------
+    id, title
+        The name on the command line and the paper's name.
+    simulator
+        Gymnasium id.
+    family
+        ``"classic"`` (discrete actions) or ``"bullet"`` (continuous actions).
+    observation_dim, action_dim
+        D and A; a discrete action is a one-hot row, so A is then the number of actions.
+    policy
+        Algorithm of the nominal policy.
+    paper_return
+        Mean nominal return in the paper's Table 2.
+    episode_cap
+        Longest episode, in transitions.
+    """
+
+    id: str
+    title: str
+    simulator: str
+    family: Literal["classic", "bullet"]
+    observation_dim: int
+    action_dim: int
+    policy: Literal["IQN", "TD3"]
+    paper_return: float
+    episode_cap: int
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are discrete."""
+        return self.family == "classic"
+
+
+@dataclass(frozen=True, slots=True)
+class AnomalyInfo:
+    """One anomaly type: its name, the paper's name, its group and what it changes."""
+
+    id: str
+    title: str
+    group: Group
+    summary: str
+
+
+@dataclass(frozen=True, slots=True)
+class SplitDefinition:
+    """The recipe of a split: parts in trajectories, episode cap in transitions, seed base.
+
+    `episode_cap` None means the simulator's own limit. Trajectory seeds are
+    ``seed_base * 10**6 + offset of the part + index``.
+    """
+
+    name: str
+    train: int
+    calibration: int
+    test: int
+    episode_cap: int | None
+    seed_base: int
+
+
+ENVIRONMENTS: Final = MappingProxyType(
+    {
+        e.id: e
+        for e in (
+            EnvironmentInfo("acrobot", "Acrobot", "Acrobot-v1", "classic", 6, 3, "IQN", -78.7, 500),
+            EnvironmentInfo("cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500),
+            EnvironmentInfo(
+                "lunarlander", "LunarLander", "LunarLander-v3", "classic", 8, 4, "IQN", 213.5, 1000
+            ),
+            EnvironmentInfo("ant", "Ant", "AntBulletEnv-v0", "bullet", 28, 8, "TD3", 3297.2, 1000),
+            EnvironmentInfo(
+                "halfcheetah", "HalfCheetah", "HalfCheetahBulletEnv-v0", "bullet",
+                26, 6, "TD3", 2820.9, 1000,
+            ),
+            EnvironmentInfo(
+                "hopper", "Hopper", "HopperBulletEnv-v0", "bullet", 15, 3, "TD3", 2678.0, 1000
+            ),
+            EnvironmentInfo(
+                "walker2d", "Walker2D", "Walker2DBulletEnv-v0", "bullet",
+                22, 6, "TD3", 2240.8, 1000,
+            ),
+        )
+    }
+)  # fmt: skip
+"""Environments by id, in the order of the paper's tables."""
+
+ANOMALIES: Final = MappingProxyType(
+    {
+        a.id: a
+        for a in (
+            AnomalyInfo("iid", "IID", "sensor", "chosen sensors += Normal(mean, std), fresh every step"),
+            AnomalyInfo("calibration", "Calibration Failure", "sensor", "chosen sensors *= factor"),
+            AnomalyInfo("drift", "Sensor Drift", "sensor", "chosen sensors += slope * step"),
+            AnomalyInfo("shutdown", "Sensor Shutdown", "sensor", "chosen sensors = 0"),
+            AnomalyInfo("wind-l2r", "L2R", "dynamics", "wind from left to right"),
+            AnomalyInfo("wind-r2l", "R2L", "dynamics", "wind from right to left"),
+            AnomalyInfo("gravity", "Gravity", "dynamics", "another magnitude of gravity"),
+            AnomalyInfo(
+                "components", "Agent's Components", "dynamics",
+                "other lengths, masses or motor powers",
+            ),
+        )
+    }
+)  # fmt: skip
+"""Anomaly types by id, in the order of the paper's Table 2."""
+
+GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
+
+SPLITS: Final = MappingProxyType(
+    {
+        s.name: s
+        for s in (
+            SplitDefinition("mini", 40, 20, 10, 300, 1),
+            SplitDefinition("standard", 500, 100, 50, None, 2),
+            SplitDefinition("paper", 10_000, 1_000, 1_000, None, 3),
+        )
+    }
+)
+"""The published splits by name."""
+
+PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
+"""Seed offset of each part within the million seeds of a split's base."""

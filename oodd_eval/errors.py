@@ -1,0 +1,91 @@
+"""Every error that oodd-eval raises on purpose: one tree, each also the nearest builtin.
+
+A message says what went wrong, in which object, what was expected, what was found and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class OoddError(Exception):
+    """Base of all errors raised on purpose by oodd-eval."""
+
+
+class UsageError(OoddError, ValueError):
+    """The request itself is wrong: an unknown name, a bad value, nothing selected."""
+
+
+class UnknownNameError(UsageError, LookupError):
+    """A name that is not among the known ones.
+
+    Parameters
+    ----------
+    kind
+        What is named, in the singular: ``"detector"``, ``"environment"``.
+    name
+        The unknown name.
+    known
+        The names that exist.
+
+    Examples
+    --------
+    >>> print(UnknownNameError("environment", "hoper", ["ant", "hopper"]))
+    unknown environment 'hoper': did you mean 'hopper'? Known: ant, hopper
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        names = sorted(known)
+        close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        super().__init__(f"unknown {kind} {name!r}: {hint}Known: {', '.join(names) or 'none'}")
+        self.kind, self.name, self.known = kind, name, names
+
+
+class TrajectoryError(OoddError, ValueError):
+    """Arrays that do not form a trajectory."""
+
+
+class SplitError(OoddError, ValueError):
+    """A split that cannot be read as what it claims to be."""
+
+
+class SplitNotFoundError(SplitError, FileNotFoundError):
+    """A split, or one of its environments, that is not on this machine."""
+
+
+class DigestError(SplitError):
+    """Content whose digest differs from the manifest."""
+
+
+class ContractError(OoddError, ValueError):
+    """A detector that broke the contract of `oodd_eval.detector`."""
+
+
+class NotFittedError(OoddError, RuntimeError):
+    """`score` was called before `fit`."""
+
+
+class PluginError(OoddError, ImportError):
+    """A plug-in that cannot be loaded, or two that offer the same name."""
+
+
+class MissingExtraError(OoddError, ImportError):
+    """An optional dependency that the requested work needs."""
+
+
+class PolicyError(OoddError, ValueError):
+    """A policy file that cannot be used."""
+
+
+class SimulationError(OoddError, RuntimeError):
+    """A trajectory that cannot be recorded as the protocol asks."""
+
+
+class ResultsError(OoddError, ValueError):
+    """A results directory or record that cannot be read."""
+
+
+class OutputError(OoddError, OSError):
+    """A place that cannot be written to."""

@@ -1,0 +1,140 @@
+"""One episode as a detector sees it, and ragged batches of episodes.
+
+Time runs as in the protocol: observations ``o_0 .. o_T`` (T + 1 rows) and the commanded actions
+``a_0 .. a_{T-1}`` between them; ``a_t`` was chosen after ``o_t`` was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from oodd_eval.errors import TrajectoryError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """One frozen, validated episode: observations and actions, and nothing that tells the answer.
+
+    Parameters
+    ----------
+    observations : array of shape (T + 1, D)
+        Rows ``o_0 .. o_T`` in the simulator's units; stored as read-only float32.
+    actions : array of shape (T, A)
+        Rows ``a_0 .. a_{T-1}``, commanded by the policy; a discrete action is a one-hot row.
+        Stored as read-only float32.
+
+    Raises
+    ------
+    TrajectoryError
+        When a shape does not fit, an array is empty or a value is not finite.
+
+    Examples
+    --------
+    >>> episode = Trajectory([[0.0, 1.0], [0.1, 1.0], [0.2, 1.0]], [[1.0], [-1.0]])
+    >>> len(episode), episode.transitions, episode.observation_dim, episode.action_dim
+    (3, 2, 2, 1)
+    >>> len(episode[:2])
+    2
+    """
+
+    observations: NDArray[np.float32]
+    actions: NDArray[np.float32]
+
+    def __init__(self, observations: ArrayLike, actions: ArrayLike) -> None:
+        o = _matrix("observations", observations)
+        a = _matrix("actions", actions)
+        if len(o) != len(a) + 1:
+            raise TrajectoryError(
+                f"a trajectory has one observation more than actions: got {len(o)} observations "
+                f"and {len(a)} actions, expected {len(a) + 1} observations (o_0 .. o_T) for "
+                f"{len(a)} actions (a_0 .. a_T-1)"
+            )
+        object.__setattr__(self, "observations", o)
+        object.__setattr__(self, "actions", a)
+
+    def __len__(self) -> int:
+        """Return the number of observations, T + 1: the length of a score sequence."""
+        return len(self.observations)
+
+    def __getitem__(self, rows: slice) -> Trajectory:
+        """Return the episode as it was known at an earlier time: only prefixes ``[:n]``, n >= 1."""
+        n = len(range(len(self))[rows]) if isinstance(rows, slice) else 0
+        if n < 1 or rows.step not in (None, 1) or rows.start not in (None, 0):
+            raise TrajectoryError(
+                f"only a non-empty prefix of a trajectory is a trajectory: expected [:n] with "
+                f"1 <= n <= {len(self)}, got [{rows}]"
+            )
+        return Trajectory(self.observations[:n], self.actions[: n - 1])
+
+    @property
+    def transitions(self) -> int:
+        """Number of transitions, T."""
+        return len(self.actions)
+
+    @property
+    def observation_dim(self) -> int:
+        """Number of sensors, D."""
+        return int(self.observations.shape[1])
+
+    @property
+    def action_dim(self) -> int:
+        """Width of an action row, A."""
+        return int(self.actions.shape[1])
+
+
+def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
+    try:
+        array = np.array(values, dtype=np.float32, order="C", ndmin=1)
+    except (TypeError, ValueError) as error:
+        raise TrajectoryError(f"{what} cannot be read as a float32 matrix: {error}") from None
+    if array.ndim != 2 or array.shape[1] == 0 or (what == "observations" and len(array) == 0):
+        raise TrajectoryError(
+            f"{what} have shape {array.shape}, expected (rows, columns) with at least one column"
+            + (" and one row" if what == "observations" else "")
+        )
+    bad = ~np.isfinite(array)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise TrajectoryError(
+            f"{what} hold {int(bad.sum())} values that are not finite, the first at row {row}, "
+            f"column {column}: {array[row, column]}; a trajectory has finite values only"
+        )
+    array.flags.writeable = False
+    return array
+
+
+def pad(
+    arrays: Sequence[NDArray[np.float32]],
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Stack sequences of unequal length, padded with zeros behind their ends.
+
+    Parameters
+    ----------
+    arrays : sequence of B arrays of shape (n_b, D)
+
+    Returns
+    -------
+    batch : float32 array of shape (B, max n_b, D)
+    lengths : int64 array of shape (B,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> batch, lengths = pad([np.ones((2, 1), "f4"), np.ones((3, 1), "f4")])
+    >>> batch[..., 0].tolist(), lengths.tolist()
+    ([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], [2, 3])
+    """
+    if not arrays:
+        raise TrajectoryError("no sequences to stack: expected at least one")
+    widths = {a.shape[1] for a in arrays}
+    if len(widths) > 1:
+        raise TrajectoryError(f"sequences of different widths cannot be stacked: {sorted(widths)}")
+    lengths = np.array([len(a) for a in arrays], dtype=np.int64)
+    batch = np.zeros((len(arrays), int(lengths.max()), widths.pop()), dtype=np.float32)
+    for row, array in zip(batch, arrays, strict=True):
+        row[: len(array)] = array
+    return batch, lengths
