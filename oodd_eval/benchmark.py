@@ -85,7 +85,9 @@ ENVIRONMENTS: Final = MappingProxyType(
         e.id: e
         for e in (
             EnvironmentInfo("acrobot", "Acrobot", "Acrobot-v1", "classic", 6, 3, "IQN", -78.7, 500),
-            EnvironmentInfo("cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500),
+            EnvironmentInfo(
+                "cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500
+            ),
             EnvironmentInfo(
                 "lunarlander", "LunarLander", "LunarLander-v3", "classic", 8, 4, "IQN", 213.5, 1000
             ),
@@ -110,7 +112,7 @@ ANOMALIES: Final = MappingProxyType(
     {
         a.id: a
         for a in (
-            AnomalyInfo("iid", "IID", "sensor", "chosen sensors += Normal(mean, std), fresh every step"),
+            AnomalyInfo("iid", "IID", "sensor", "chosen sensors += fresh Normal(mean, std)"),
             AnomalyInfo("calibration", "Calibration Failure", "sensor", "chosen sensors *= factor"),
             AnomalyInfo("drift", "Sensor Drift", "sensor", "chosen sensors += slope * step"),
             AnomalyInfo("shutdown", "Sensor Shutdown", "sensor", "chosen sensors = 0"),

@@ -1,0 +1,77 @@
+"""The score contract, and the messages of those who break it."""
+
+import numpy as np
+import pytest
+
+from oodd_eval.detector import check_scores
+from oodd_eval.errors import ContractError, OoddError, UnknownNameError
+from oodd_eval.trajectory import Trajectory
+
+EPISODE = Trajectory(np.zeros((6, 2)), np.zeros((5, 1)))
+
+
+def check(scores, horizon=1, warm_up=0):
+    return check_scores(
+        scores, EPISODE, horizon=horizon, warm_up=warm_up, detector="rf", where="hopper/test[7]"
+    )
+
+
+@pytest.mark.parametrize("undefined", [0, 1, 3])
+def test_nan_is_allowed_in_the_leading_block(undefined):
+    scores = np.zeros(6)
+    scores[:undefined] = np.nan
+    assert check(scores, warm_up=3) is scores
+
+
+def test_a_trajectory_shorter_than_the_block_may_be_undefined_throughout():
+    assert np.isnan(check(np.full(6, np.nan), horizon=10)).all()
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        (np.zeros(5), r"'rf' returned 5 scores for hopper/test\[7\], expected 6 \(one per obs"),
+        (np.zeros((6, 1)), r"shape \(6, 1\) .* expected \(6,\)"),
+        ([0.0] * 6, "returned list"),
+        (np.zeros(6, np.float32), "float32 scores .* expected float64"),
+        (np.array([0, 0, np.nan, 0, 0, 0]), "nan at t = 2"),
+        (np.array([np.inf, 0, 0, 0, 0, 0]), "inf at t = 0"),
+        (np.array([0, 0, 0, 0, 0, -np.inf]), "-inf at t = 5"),
+    ],
+)
+def test_broken_scores_are_named(scores, message):
+    with pytest.raises(ContractError, match=message):
+        check(scores)
+
+
+def test_nan_after_a_defined_score_is_refused_even_inside_the_block():
+    with pytest.raises(ContractError, match="in one leading block only"):
+        check(np.array([0, np.nan, 0, 0, 0, 0]), horizon=3)
+
+
+@pytest.mark.parametrize("warm_up", [-1, 21, 1.0, True])
+def test_warm_up_is_an_int_of_at_most_twenty(warm_up):
+    with pytest.raises(ContractError, match="between 0 and 20"):
+        check(np.zeros(6), warm_up=warm_up)
+
+
+def test_every_error_is_also_a_builtin():
+    def subclasses(kind):
+        for child in kind.__subclasses__():
+            yield child
+            yield from subclasses(child)
+
+    own = set(subclasses(OoddError))
+    assert len(own) >= 10
+    for kind in own:
+        assert any(base.__module__ == "builtins" and base is not Exception
+                   for base in kind.__mro__[1:-3]), kind  # fmt: skip
+
+
+def test_unknown_name_suggests_the_nearest():
+    message = str(UnknownNameError("environment", "hoper", ["ant", "hopper"]))
+    assert message == "unknown environment 'hoper': did you mean 'hopper'? Known: ant, hopper"
+
+
+def test_unknown_name_far_from_all_lists_them():
+    assert "did you mean" not in str(UnknownNameError("detector", "zzz", ["rf", "npn"]))
