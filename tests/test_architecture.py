@@ -63,8 +63,6 @@ def test_listing_detectors_imports_nothing_heavy():
         "bad = {'torch', 'sklearn', 'h5py', 'gymnasium', 'pybullet'} & set(sys.modules)\n"
         "sys.exit(f'imported {sorted(bad)}' if bad else 0)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "riqn" in done.stdout

@@ -1,0 +1,57 @@
+"""The README's commands and the names in the documents cannot rot."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
+             *sorted((ROOT / "detectors").rglob("*.md"))]  # fmt: skip
+
+
+def commands():
+    return dict(re.findall(r"<!-- command: (\w+) -->\n```sh\n(.*?)\n```", README, re.S))
+
+
+def test_there_are_two_commands_of_one_line_each():
+    assert set(commands()) == {"main", "tests"}
+    assert all("\n" not in command for command in commands().values())
+
+
+def test_both_commands_do_all_the_setup_themselves():
+    for command in commands().values():
+        assert command.startswith("python3.11 -m venv .venv && .venv/bin/pip install")
+        assert "-c constraints.txt" in command
+
+
+def test_extras_in_the_commands_exist():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    named = re.findall(r'-e "\.\[(.*?)\]"', README)
+    assert len(named) >= 2
+    assert all(extra in extras for group in named for extra in group.split(","))
+
+
+def test_main_command_selects_cells():
+    from oodd_eval.cli import main
+
+    arguments = commands()["main"].split("oodd-eval ", 1)[1].split()
+    assert main([*arguments, "--collect-only", "-q"]) == 0
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_relative_links_lead_somewhere(path):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text()):
+        assert (path.parent / target).exists(), f"{path.name} links to {target}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_in_documents_parse(path, capsys):
+    from oodd_eval.cli import build_parser
+
+    for line in re.findall(r"^(?:\$ )?oodd-eval ([^\n|`]*)$", path.read_text(), re.MULTILINE):
+        build_parser().parse_args(line.split("#")[0].split())
