@@ -1,0 +1,57 @@
+"""The hooks a plug-in may implement. All are optional; none may change a result.
+
+A plug-in is an importable module (or object) registered under the entry-point group ``oodd_eval``
+that marks functions of these names with `hookimpl`. Arguments a hook does not need may be left out.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import pluggy
+
+if TYPE_CHECKING:
+    from oodd_eval.detector import DetectorSpec
+    from oodd_eval.records import Record
+    from oodd_eval.runner import Plan
+
+PROJECT: Final = "oodd_eval"
+"""Name of the pluggy project and of the entry-point group."""
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec
+def oodd_detectors() -> list[DetectorSpec] | None:  # type: ignore[empty-body]
+    """Offer detectors.
+
+    Called once per plug-in at discovery, for every command that names detectors, so it has to be
+    quick: import heavy libraries inside the factories. Return the specs; None means none.
+    """
+
+
+@hookspec
+def oodd_run_started(plan: Plan) -> None:
+    """Observe that a run is about to start.
+
+    Called once, before any detector is fitted, with everything the run is going to do.
+    """
+
+
+@hookspec
+def oodd_cell_finished(record: Record) -> None:
+    """Observe a finished cell, whatever its status.
+
+    Called in the harness's process, in the order in which cells finish; cells that were taken from
+    an earlier run are reported too.
+    """
+
+
+@hookspec
+def oodd_run_finished(plan: Plan, records: list[Record], interrupted: bool) -> None:
+    """Observe the end of a run.
+
+    Called once, after the records are written, with the records in the order of the plan; when the
+    run was interrupted, with those that were finished.
+    """
