@@ -1,5 +1,50 @@
-"""oodd-eval: does a detector notice when the dynamics of a controlled system change?"""
+"""An evaluation harness for detectors of out-of-distribution dynamics.
+
+Does a detector notice when the dynamics of a controlled system change?
+
+The names below are all that a plug-in or a script needs. They are imported when first used, so
+that ``oodd-eval --help`` and the listing of plug-ins stay quick.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from oodd_eval._version import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from oodd_eval.detector import Detector, DetectorSpec
+    from oodd_eval.hookspecs import hookimpl
+    from oodd_eval.runner import evaluate
+    from oodd_eval.splits import load_split
+    from oodd_eval.trajectory import Trajectory
+
+__all__ = [
+    "Detector",
+    "DetectorSpec",
+    "Trajectory",
+    "__version__",
+    "evaluate",
+    "hookimpl",
+    "load_split",
+]
+
+_HOMES = {
+    "Detector": "detector",
+    "DetectorSpec": "detector",
+    "Trajectory": "trajectory",
+    "evaluate": "runner",
+    "hookimpl": "hookspecs",
+    "load_split": "splits",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

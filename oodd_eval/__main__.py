@@ -1,0 +1,7 @@
+"""``python -m oodd_eval``: the same as the command ``oodd-eval``."""
+
+import sys
+
+from oodd_eval.cli import main
+
+sys.exit(main())

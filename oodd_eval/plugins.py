@@ -1,0 +1,276 @@
+"""Discovery of plug-ins: one entry point at a time, so that a broken one harms nobody else.
+
+pluggy's own loader stops at the first plug-in that cannot be imported and drops the second of two
+that share a name without a word. Here each entry point of the group ``oodd_eval`` is loaded,
+checked and asked for its detectors on its own; what fails is kept with its reason, for `list` and
+for the exit code.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
+from typing import Any, Final
+
+import pluggy
+
+from oodd_eval import hookspecs, trivial
+from oodd_eval._version import __version__
+from oodd_eval.detector import DetectorSpec
+from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError
+
+BUILT_IN: Final = "trivial"
+"""Name of the plug-in that is part of the harness."""
+
+RESTRICT: Final = "OODD_EVAL_PLUGINS"
+"""Environment variable that names the only entry points to load, separated by commas."""
+
+OWN_DISTRIBUTION: Final = "oodd-eval"
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A detector together with the plug-in that offers it.
+
+    Attributes
+    ----------
+    spec
+        What the plug-in says about the detector.
+    plugin
+        Name of the entry point.
+    module
+        Name of the module that the entry point leads to.
+    distribution, version
+        What pip installed it from.
+    """
+
+    spec: DetectorSpec
+    plugin: str
+    module: str
+    distribution: str
+    version: str
+
+    @property
+    def origin(self) -> str:
+        """Distribution and version, as printed."""
+        return f"{self.distribution} {self.version}"
+
+    def unavailable(self) -> str:
+        """Return why the detector cannot run here, with the command that helps; empty if it can."""
+        missing = [name for name in self.spec.requires if not _importable(name)]
+        if not missing:
+            return ""
+        install = f'pip install "{self.spec.extra}"' if self.spec.extra else (
+            f"pip install {' '.join(missing)}"
+        )  # fmt: skip
+        return f"needs {', '.join(missing)}: {install}"
+
+    def require(self) -> None:
+        """Raise `MissingExtraError` when the detector cannot run here."""
+        if reason := self.unavailable():
+            raise MissingExtraError(f"detector {self.spec.name!r} {reason}")
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """A plug-in that is installed and does not work, with the reason."""
+
+    plugin: str
+    distribution: str
+    reason: str
+
+
+@dataclass
+class Plugins:
+    """What discovery found.
+
+    Attributes
+    ----------
+    manager
+        pluggy's manager, with every working plug-in registered.
+    offers
+        Detectors by name, sorted.
+    broken
+        Plug-ins that failed, in the order in which they did.
+    """
+
+    manager: pluggy.PluginManager
+    offers: dict[str, Offer] = field(default_factory=dict)
+    broken: list[Broken] = field(default_factory=list)
+    foreign: dict[str, str] = field(default_factory=dict)
+
+    def offer(self, name: str) -> Offer:
+        """Return the offered detector of this name.
+
+        Raises
+        ------
+        UnknownNameError
+            When no working plug-in offers it.
+        """
+        try:
+            return self.offers[name]
+        except KeyError:
+            raise UnknownNameError("detector", name, self.offers) from None
+
+    def observe(self, observer: object, name: str) -> None:
+        """Register an observer of runs that is part of the program, such as a reporter."""
+        self.manager.register(observer, name=name)
+
+    def notify(self, hook: str, **arguments: Any) -> None:
+        """Call an observer hook of every plug-in, one plug-in at a time.
+
+        An observer from an entry point that raises is unregistered and noted in `broken`: a plug-in
+        that watches may not stop the run. The program's own observers may raise.
+        """
+        plugins = dict(self.manager.list_name_plugin())
+        for name, plugin in plugins.items():
+            others = [p for p in plugins.values() if p is not plugin]
+            call = self.manager.subset_hook_caller(hook, remove_plugins=others)
+            if name not in self.foreign:
+                call(**arguments)
+                continue
+            try:
+                call(**arguments)
+            except Exception as error:  # noqa: BLE001  foreign code may raise anything
+                self.manager.unregister(name=name)
+                self.broken.append(
+                    Broken(name, self.foreign[name], f"hook {hook} failed: {describe(error)}")
+                )
+
+
+def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = None) -> Plugins:
+    """Load the built-in plug-in and every entry point of the group ``oodd_eval``.
+
+    Parameters
+    ----------
+    disabled
+        Names of plug-ins to leave out.
+    only
+        Names of the entry points to load. None means all, or those that the environment variable
+        ``OODD_EVAL_PLUGINS`` names; the built-in plug-in is loaded in any case.
+
+    Raises
+    ------
+    UnknownNameError
+        When `disabled`, `only` or the environment variable name a plug-in that is not installed.
+    """
+    found = sorted(entry_points(group=hookspecs.PROJECT), key=_own_first)
+    names = {BUILT_IN, *(point.name for point in found)}
+    if only is None and RESTRICT in os.environ:
+        only = [name.strip() for name in os.environ[RESTRICT].split(",") if name.strip()]
+    for name in (*disabled, *(only or ())):
+        if name not in names:
+            raise UnknownNameError("plug-in", name, names)
+
+    manager = pluggy.PluginManager(hookspecs.PROJECT)
+    manager.add_hookspecs(hookspecs)
+    plugins = Plugins(manager)
+    if BUILT_IN not in disabled:
+        plugins.manager.register(trivial, name=BUILT_IN)
+        for spec in trivial.oodd_detectors():
+            plugins.offers[spec.name] = Offer(
+                spec, BUILT_IN, trivial.__name__, OWN_DISTRIBUTION, __version__
+            )
+    for point in found:
+        if point.name not in disabled and (only is None or point.name in only):
+            _load(plugins, point)
+    plugins.offers = dict(sorted(plugins.offers.items()))
+    return plugins
+
+
+def describe(error: BaseException) -> str:
+    """Return an exception in one line: its type and its message."""
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+
+
+def _own_first(point: EntryPoint) -> tuple[bool, str, str]:
+    """Order entry points so that no other distribution can take a name from this one."""
+    distribution = _distribution(point)
+    return distribution != OWN_DISTRIBUTION, distribution, point.name
+
+
+def _distribution(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else "unknown distribution"
+
+
+def _load(plugins: Plugins, point: EntryPoint) -> None:
+    """Load one entry point; afterwards it is registered with its detectors, or noted as broken."""
+    name, distribution = point.name, _distribution(point)
+    if plugins.manager.has_plugin(name):
+        owner = plugins.foreign.get(name, OWN_DISTRIBUTION)
+        reason = f"{owner} has a plug-in of the same name: uninstall one of them"
+        plugins.broken.append(Broken(name, distribution, reason))
+        return
+    try:
+        module = point.load()
+        plugins.manager.register(module, name=name)
+        plugins.manager.check_pending()
+        _add_offers(plugins, module, point)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  foreign code may raise anything
+        if plugins.manager.has_plugin(name):
+            plugins.manager.unregister(name=name)
+        plugins.broken.append(Broken(name, distribution, describe(error)))
+    else:
+        plugins.foreign[name] = distribution
+
+
+def _add_offers(plugins: Plugins, module: ModuleType, point: EntryPoint) -> None:
+    """Take over the detectors that a registered plug-in offers: all of them or none."""
+    distribution = _distribution(point)
+    mine: dict[str, Offer] = {}
+    for spec in _offered(plugins.manager, module, point):
+        previous = plugins.offers.get(spec.name) or mine.get(spec.name)
+        if previous:
+            raise PluginError(
+                f"detector {spec.name!r} is offered twice, by {previous.distribution} (plug-in "
+                f"{previous.plugin!r}) and by {distribution} (plug-in {point.name!r}): uninstall "
+                f"one of them, or leave it out with -p no:{point.name}"
+            )
+        version = point.dist.version if point.dist else ""
+        mine[spec.name] = Offer(spec, point.name, module.__name__, distribution, version)
+    plugins.offers.update(mine)
+
+
+def _offered(
+    manager: pluggy.PluginManager, module: ModuleType, point: EntryPoint
+) -> list[DetectorSpec]:
+    """Return what the plug-in's own `oodd_detectors` returns, checked."""
+    specs: list[DetectorSpec] = []
+    for implementation in manager.hook.oodd_detectors.get_hookimpls():
+        offered: object = implementation.function() if implementation.plugin is module else None
+        if offered is None:
+            continue
+        if not isinstance(offered, list) or not all(isinstance(s, DetectorSpec) for s in offered):
+            raise PluginError(
+                f"oodd_detectors of plug-in {point.name!r} ({_distribution(point)}) returned "
+                f"{offered!r:.80}, expected a list of oodd_eval.DetectorSpec"
+            )
+        specs += offered
+    return specs
+
+
+def _importable(name: str) -> bool:
+    """Whether a module could be imported; only its parents are."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def resolve_parameters(spec: DetectorSpec, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a detector's parameters with defaults filled in, sorted by name.
+
+    Raises
+    ------
+    UnknownNameError
+        When `given` names a parameter that the detector does not declare.
+    """
+    for name in given:
+        if name not in spec.parameters:
+            raise UnknownNameError(f"parameter of {spec.name}", name, spec.parameters)
+    return dict(sorted({**spec.parameters, **given}.items()))
