@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from oodd_eval.benchmark import ENVIRONMENTS
 from oodd_eval.errors import MissingExtraError, SimulationError, UnknownNameError
-from oodd_eval.simulate.quiet import quiet_stdout
+from oodd_eval.simulate.quiet import quiet_streams
 
 try:
-    with quiet_stdout():
+    with quiet_streams():
         import pybullet_envs_gymnasium.gym_locomotion_envs as bullet
         from gymnasium.envs.box2d import lunar_lander
         from gymnasium.envs.classic_control.acrobot import AcrobotEnv
@@ -239,7 +239,7 @@ class Bullet:
         self.env, self.wind = kind(), 0
 
     def reset(self, seed: int) -> Row:
-        with quiet_stdout():
+        with quiet_streams():
             return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Row, float, bool]:
@@ -262,7 +262,7 @@ class Bullet:
         return float(self.env.robot.power)
 
     def close(self) -> None:
-        with quiet_stdout():
+        with quiet_streams():
             self.env.close()
 
 

@@ -1,7 +1,7 @@
-"""Keep what C libraries print away from standard output.
+"""Keep what C libraries print away from the terminal.
 
-PyBullet prints its build time when imported and a line per client from C, past ``sys.stdout``, so
-that programs that parse our output would stumble over it.
+PyBullet prints its build time when imported (standard error) and a line per client (standard
+output) from C, past ``sys.stdout``, so that programs that parse our output would stumble over it.
 """
 
 from __future__ import annotations
@@ -14,25 +14,29 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def quiet_stdout() -> Iterator[None]:
-    """Send file descriptor 1 to the null device for the duration of the block.
+def quiet_streams() -> Iterator[None]:
+    """Send file descriptors 1 and 2 to the null device for the duration of the block.
 
-    Not for use while another thread prints. A process without a standard output is left alone.
+    Exceptions pass as ever. Not for use while another thread prints; a process without these
+    streams is left alone.
     """
-    if sys.stdout is not None:
-        sys.stdout.flush()
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
     try:
-        saved = os.dup(1)
+        saved = [(fd, os.dup(fd)) for fd in (1, 2)]
     except OSError:
         yield
         return
     null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(null, 1)
+        for fd, _ in saved:
+            os.dup2(null, fd)
         yield
     finally:
-        # C buffers of its own: what it printed has to go while the null device is in place.
+        # C has buffers of its own: what was printed has to go while the null device is in place.
         ctypes.CDLL(None).fflush(None)
-        os.dup2(saved, 1)
-        os.close(saved)
+        for fd, copy in saved:
+            os.dup2(copy, fd)
+            os.close(copy)
         os.close(null)

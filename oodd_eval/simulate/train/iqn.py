@@ -29,21 +29,20 @@ HYPER_PARAMETERS: dict[str, Any] = {
     "quantiles_acting": 32,
     "discount": 0.99,
     "n_step": 3,
-    "learning_rate": 5e-4,
-    "final_learning_rate": 5e-5,
+    "learning_rate": 1e-3,
+    "final_learning_rate": 1e-4,
     "target_rate": 0.005,
     "replay": 200_000,
     "environments": 8,
     "steps_per_update": 2,
     "warm_up": 2_000,
     "exploration": [1.0, 0.02, 0.15],  # from, to, over this share of the steps
-    "reward_scale": 1.0,
+    "reward_scale": 0.1,  # returns of a few units against the Huber loss's unit of 1
     "evaluate_every": 5_000,
 }
 
 OVERRIDES: dict[str, dict[str, Any]] = {
-    # Rewards of ±100 at the end against the Huber loss's unit of 1.
-    "lunarlander": {"width": 96, "reward_scale": 0.1, "evaluate_every": 20_000, "exploration": [1.0, 0.02, 0.2]},
+    "lunarlander": {"width": 96, "evaluate_every": 20_000, "exploration": [1.0, 0.02, 0.2]},
 }
 
 
