@@ -1,0 +1,168 @@
+"""The process that holds one detector: it receives trajectories without names and returns scores.
+
+It never holds onsets, anomalies, twins' pairing or the name of the environment. Training
+trajectories come first, in the order of the split; then, shuffled together and in chunks, the
+trajectories to score. The harness starts it as ``python -m oodd_eval.worker READ_FD WRITE_FD`` with
+descriptors of their own, so that nothing a detector prints gets between the messages.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from oodd_eval.channel import Channel
+from oodd_eval.detector import Detector
+from oodd_eval.errors import ContractError, PluginError
+from oodd_eval.plugins import describe, discover
+from oodd_eval.trajectory import Trajectory
+
+
+def fit_detector(
+    factory: Callable[..., Detector],
+    train: Sequence[Trajectory],
+    *,
+    seed: int,
+    horizon: int,
+    parameters: Mapping[str, Any],
+) -> Detector:
+    """Make a detector and fit it.
+
+    Raises
+    ------
+    ContractError
+        When the factory returns something without `fit` and `score`.
+    """
+    detector = factory(seed=seed, horizon=horizon, **parameters)
+    if not isinstance(detector, Detector):
+        raise ContractError(
+            f"the factory returned {type(detector).__name__}, expected an object with the methods "
+            "fit(nominal) and score(trajectory)"
+        )
+    detector.fit(train)
+    return detector
+
+
+def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
+    """Score some trajectories, all at once if the detector can; the scores are not checked yet.
+
+    Raises
+    ------
+    ContractError
+        When ``score_many`` returns another number of score arrays than it got trajectories.
+    """
+    score_many = getattr(detector, "score_many", None)
+    if score_many is None:
+        return [detector.score(trajectory) for trajectory in chunk]
+    scores = list(score_many(chunk))
+    if len(scores) != len(chunk):
+        raise ContractError(
+            f"score_many returned {len(scores)} score arrays, expected {len(chunk)}: one for each "
+            "trajectory"
+        )
+    return scores
+
+
+def classify(error: BaseException) -> str:
+    """Return the status of a cell whose detector raised this."""
+    match error:
+        case MemoryError():
+            return "oom"
+        case NotImplementedError():
+            return "incompatible"
+        case ContractError():
+            return "invalid"
+        case ModuleNotFoundError() if not isinstance(error, PluginError):
+            return "unavailable"
+        case _:
+            return "error"
+
+
+def reason_of(error: BaseException) -> str:
+    """Return one line: what was raised, and where in the detector's own code."""
+    if isinstance(error, SystemExit):
+        return f"called sys.exit({error.code!r})"
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return describe(error) + ("" if isinstance(error, ContractError) else place)
+
+
+def peak_rss_mb() -> float:
+    """Return the largest resident memory of this process so far, in MB of 10^6 bytes.
+
+    Linux keeps it per program; getrusage would also count the harness this was started from.
+    """
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+        kib = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
+        return int(kib) * 1024 / 1e6
+    except (OSError, StopIteration):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def serve(channel: Channel) -> None:
+    """Fit the requested detector and score what comes until a chunk of zero."""
+    request = channel.receive()
+    train = [channel.receive_trajectory() for _ in range(request["train"])]
+    plugins = discover(only=request["plugin"])
+    for broken in plugins.broken:
+        raise PluginError(f"plug-in {broken.plugin!r} cannot be loaded: {broken.reason}")
+    spec = plugins.offer(request["detector"]).spec
+
+    start = time.perf_counter()
+    detector = fit_detector(
+        spec.factory,
+        train,
+        seed=request["seed"],
+        horizon=request["horizon"],
+        parameters=request["parameters"],
+    )
+    seconds_fit = time.perf_counter() - start
+    channel.send({"seconds_fit": seconds_fit, "warm_up": getattr(detector, "warm_up", 0)})
+
+    seconds_score = 0.0
+    while size := channel.receive()["score"]:
+        chunk = [channel.receive_trajectory() for _ in range(size)]
+        start = time.perf_counter()
+        scores = score_chunk(detector, chunk)
+        seconds_score += time.perf_counter() - start
+        for one in scores:
+            plain = isinstance(one, np.ndarray) and not one.dtype.hasobject
+            channel.send({"type": "array" if plain else type(one).__name__})
+            if plain:
+                channel.send_array(np.asarray(one))
+    channel.send({"seconds_score": seconds_score, "peak_rss_mb": peak_rss_mb()})
+
+
+def main(arguments: Sequence[str]) -> NoReturn:
+    """Serve one request and end the process, whatever the detector has left running."""
+    reading, writing = (int(a) for a in arguments)
+    for descriptor in (reading, writing):
+        os.set_inheritable(descriptor, False)
+    faulthandler.enable()
+    channel = Channel(reading, writing)
+    code = 0
+    try:
+        serve(channel)
+    except BaseException as error:  # noqa: BLE001  a detector may raise anything; all is reported
+        traceback.print_exc()
+        channel.send({"status": classify(error), "reason": reason_of(error)})
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Threads and exit handlers of the detector have no say any more: the scores are sent.
+    os._exit(code)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
