@@ -12,8 +12,8 @@ import pluggy
 
 if TYPE_CHECKING:
     from oodd_eval.detector import DetectorSpec
+    from oodd_eval.plan import Plan
     from oodd_eval.records import Record
-    from oodd_eval.runner import Plan
 
 PROJECT: Final = "oodd_eval"
 """Name of the pluggy project and of the entry-point group."""
@@ -23,7 +23,7 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 @hookspec
-def oodd_detectors() -> list[DetectorSpec] | None:  # type: ignore[empty-body]
+def oodd_detectors() -> list[DetectorSpec] | None:
     """Offer detectors.
 
     Called once per plug-in at discovery, for every command that names detectors, so it has to be
