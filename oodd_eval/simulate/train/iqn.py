@@ -37,11 +37,14 @@ HYPER_PARAMETERS: dict[str, Any] = {
     "steps_per_update": 2,
     "warm_up": 2_000,
     "exploration": [1.0, 0.02, 0.15],  # from, to, over this share of the steps
+    "exploration_hold": 1,  # steps for which a random action is kept up
     "reward_scale": 0.1,  # returns of a few units against the Huber loss's unit of 1
     "evaluate_every": 5_000,
 }
 
 OVERRIDES: dict[str, dict[str, Any]] = {
+    # Single random torques cancel out and never swing the links up to the first reward.
+    "acrobot": {"exploration_hold": 6, "exploration": [1.0, 0.02, 0.4]},
     "lunarlander": {"width": 96, "evaluate_every": 20_000, "exploration": [1.0, 0.02, 0.2]},
 }
 
@@ -117,6 +120,8 @@ class _Actor:
     ) -> None:
         self.environment, self.seed, self.replay, self.p = environment, first_seed, replay, p
         self.cap = ENVIRONMENTS[environment].episode_cap
+        self.actions = ENVIRONMENTS[environment].action_dim
+        self.held, self.random = 0, 0
         self.restart()
 
     def restart(self) -> None:
@@ -125,6 +130,16 @@ class _Actor:
         self.seed += 1
         self.length = 0
         self.window: deque[tuple[Any, int, float]] = deque()
+
+    def explore(self, greedy: int, epsilon: float, rng: np.random.Generator) -> int:
+        """Return the greedy action or, for a share epsilon of the steps, a random one, held."""
+        hold = self.p["exploration_hold"]
+        if self.held == 0 and rng.random() < epsilon / (hold - (hold - 1) * epsilon):
+            self.held, self.random = hold, int(rng.integers(self.actions))
+        if self.held == 0:
+            return greedy
+        self.held -= 1
+        return self.random
 
     def step(self, action: int) -> None:
         row, reward, over = self.simulator.step(action)
@@ -182,8 +197,7 @@ def train(environment: str, *, out: Path, steps: int, seed: int, progress: Progr
             tau = torch.rand(len(actors), p["quantiles_acting"])
             greedy = online(rows, tau).mean(1).argmax(1).tolist()
         for actor, action in zip(actors, greedy, strict=True):
-            explore = rng.random() < epsilon
-            actor.step(int(rng.integers(info.action_dim)) if explore else action)
+            actor.step(actor.explore(action, epsilon, rng))
         before, step = step, step + len(actors)
         if replay.count >= p["warm_up"]:
             for _ in range(len(actors) // p["steps_per_update"]):
