@@ -1,0 +1,70 @@
+"""History windows of standardized observations, gathered from many trajectories at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval import Trajectory
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Observations of several trajectories under each other.
+
+    Attributes
+    ----------
+    values : float32 array of shape (N, D)
+        Standardized observations.
+    first : int64 array of shape (N,)
+        Row number of ``o_0`` of the trajectory that each row belongs to.
+    """
+
+    values: NDArray[np.float32]
+    first: Indices
+
+    @classmethod
+    def stack(cls, trajectories: Sequence[Trajectory], mean: Floats, std: Floats) -> Rows:
+        """Standardize the observations of the trajectories and stack them."""
+        lengths = np.array([len(x) for x in trajectories], dtype=np.int64)
+        values = np.concatenate(
+            [((x.observations - mean) / std).astype(np.float32) for x in trajectories]
+        )
+        return cls(values, np.repeat(np.cumsum(lengths) - lengths, lengths))
+
+    def with_history(self, horizon: int) -> Indices:
+        """Return the rows ``o_t`` with t >= horizon: those that a forecast can be made for."""
+        rows = np.arange(len(self.first))
+        return rows[rows - self.first >= horizon]
+
+    def window(self, last: Indices, length: int) -> NDArray[np.float32]:
+        """Return the windows that end in the given rows, newest first.
+
+        Before a trajectory begins, its first observation is repeated.
+
+        Parameters
+        ----------
+        last : int64 array of shape (B,)
+            Row number of the newest observation of each window.
+        length
+            Observations in a window, W.
+
+        Returns
+        -------
+        float32 array of shape (B, W, D)
+
+        Examples
+        --------
+        >>> rows = Rows(np.array([[0.0], [1.0], [2.0]], np.float32), np.array([0, 0, 0]))
+        >>> rows.window(np.array([0, 2]), 2)[..., 0].tolist()
+        [[0.0, 0.0], [2.0, 1.0]]
+        """
+        lags = last[:, None] - np.arange(length)
+        windows: NDArray[np.float32] = self.values[np.maximum(lags, self.first[last][:, None])]
+        return windows
