@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from oodd_eval._version import __version__
 
 if TYPE_CHECKING:
+    from oodd_eval.api import evaluate
     from oodd_eval.detector import Detector, DetectorSpec
     from oodd_eval.hookspecs import hookimpl
-    from oodd_eval.runner import evaluate
     from oodd_eval.splits import load_split
     from oodd_eval.trajectory import Trajectory
 
@@ -32,7 +32,7 @@ _HOMES = {
     "Detector": "detector",
     "DetectorSpec": "detector",
     "Trajectory": "trajectory",
-    "evaluate": "runner",
+    "evaluate": "api",
     "hookimpl": "hookspecs",
     "load_split": "splits",
 }

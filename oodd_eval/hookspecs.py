@@ -40,11 +40,11 @@ def oodd_run_started(plan: Plan) -> None:
 
 
 @hookspec
-def oodd_cell_finished(record: Record) -> None:
+def oodd_cell_finished(record: Record, resumed: bool) -> None:
     """Observe a finished cell, whatever its status.
 
-    Called in the harness's process, in the order in which cells finish; cells that were taken from
-    an earlier run are reported too.
+    Called in the harness's process, in the order in which cells finish. `resumed` tells that the
+    scores are of an earlier run with the same key; nothing was fitted.
     """
 
 

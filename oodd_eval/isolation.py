@@ -14,8 +14,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
@@ -43,13 +43,14 @@ _SINGLE_THREAD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a worker is told beside the trajectories."""
+    """What a worker is told beside the trajectories; `train` is how many of them are to fit on."""
 
     plugin: str
     detector: str
     parameters: dict[str, Any]
     seed: int
     horizon: int
+    train: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ class _Abort(Exception):  # noqa: N818  a signal between two functions here, nev
 
 def run_isolated(
     request: Request,
-    train: Sequence[Trajectory],
+    train: Iterable[Trajectory],
     score: Iterable[Trajectory],
     *,
     limits: Limits,
@@ -229,7 +230,7 @@ class _Sender:
         self,
         descriptor: int,
         request: Request,
-        train: Sequence[Trajectory],
+        train: Iterable[Trajectory],
         score: Iterable[Trajectory],
     ) -> None:
         self.error: BaseException | None = None
@@ -238,20 +239,11 @@ class _Sender:
         self._thread.start()
 
     def _run(
-        self, request: Request, train: Sequence[Trajectory], score: Iterable[Trajectory]
+        self, request: Request, train: Iterable[Trajectory], score: Iterable[Trajectory]
     ) -> None:
         channel = Channel(None, self._descriptor)
         try:
-            channel.send(
-                {
-                    "plugin": [] if request.plugin == "trivial" else [request.plugin],
-                    "detector": request.detector,
-                    "parameters": request.parameters,
-                    "seed": request.seed,
-                    "horizon": request.horizon,
-                    "train": len(train),
-                }
-            )
+            channel.send(asdict(request))
             for trajectory in train:
                 channel.send_trajectory(trajectory)
             for chunk in _chunks(score):

@@ -114,7 +114,7 @@ def serve(channel: Channel) -> None:
     """Fit the requested detector and score what comes until a chunk of zero."""
     request = channel.receive()
     train = [channel.receive_trajectory() for _ in range(request["train"])]
-    plugins = discover(only=request["plugin"])
+    plugins = discover(only=[request["plugin"]])
     for broken in plugins.broken:
         raise PluginError(f"plug-in {broken.plugin!r} cannot be loaded: {broken.reason}")
     spec = plugins.offer(request["detector"]).spec

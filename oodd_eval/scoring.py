@@ -1,0 +1,164 @@
+"""Get the checked scores of one unit: from an earlier run, a worker, or this process."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final
+
+import numpy as np
+
+from oodd_eval.detector import Scores, check_scores
+from oodd_eval.errors import ContractError
+from oodd_eval.isolation import Limits, Outcome, Request, run_isolated
+from oodd_eval.plan import Plan, Unit
+from oodd_eval.plugins import Offer
+from oodd_eval.results import ResultsDirectory, ScoreFile, unit_key
+from oodd_eval.splits import EnvironmentData, TrajectorySet
+from oodd_eval.splits_format import TWINS
+from oodd_eval.trajectory import Trajectory
+from oodd_eval.worker import fit_detector, score_chunk
+
+CALIBRATION: Final = "calibration"
+
+LOCAL: Final = ""
+"""Plug-in name of a detector that is no plug-in's: it runs in this process."""
+
+
+@dataclass(slots=True)
+class Scored:
+    """Checked scores of one unit by part, or the way in which it failed.
+
+    `log` is the end of what a failing detector printed; `resumed` tells scores of an earlier run.
+    """
+
+    status: str = "ok"
+    reason: str = ""
+    file: ScoreFile = field(default_factory=lambda: ScoreFile({}, {}))
+    log: str = ""
+    resumed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class UnitJob:
+    """One unit's work, in a thread of its own: scores from the cache, a worker or this process."""
+
+    plan: Plan
+    unit: Unit
+    data: EnvironmentData
+    offer: Offer
+
+    def __call__(
+        self,
+        limits: Limits,
+        stop: threading.Event,
+        results: ResultsDirectory | None,
+        *,
+        fresh: bool,
+    ) -> Scored:
+        """Return the unit's scores, or how its detector failed."""
+        sets = parts_of(self.data, self.unit.anomalies)
+        counts = {part: limited(len(s), self.plan.limit) for part, s in sets.items()}
+        if self.offer.plugin == LOCAL:
+            return self._in_process(sets, counts)
+        if reason := self.offer.unavailable():
+            return Scored("unavailable", reason)
+        if results and not fresh:
+            lengths = lengths_of(sets, self.plan.limit)
+            key = unit_key(self.plan, self.unit, self.offer).text
+            if kept := results.scores(key, lengths):
+                return Scored(file=kept, resumed=True)
+        order = _shuffled(counts, self.unit.seed)
+        outcome = run_isolated(
+            Request(
+                plugin=self.offer.plugin,
+                detector=self.unit.detector,
+                parameters=dict(self.unit.parameters),
+                seed=self.unit.seed,
+                horizon=self.unit.horizon,
+                train=limited(len(self.data.train), self.plan.limit),
+            ),
+            islice(self.data.train, self.plan.limit),
+            (sets[part][i] for part, i in order),
+            limits=limits,
+            stop=stop,
+        )
+        return self._checked(outcome, order, sets, counts)
+
+    def _checked(
+        self,
+        outcome: Outcome,
+        order: list[tuple[str, int]],
+        sets: Mapping[str, TrajectorySet],
+        counts: Mapping[str, int],
+    ) -> Scored:
+        """Check every score sequence and put them back in order."""
+        if outcome.status != "ok":
+            return Scored(outcome.status, outcome.reason, log=outcome.log)
+        parts: dict[str, list[Scores]] = {p: [np.empty(0)] * n for p, n in counts.items()}
+        try:
+            for (part, i), scores in zip(order, outcome.scores, strict=True):
+                parts[part][i] = self._check(scores, outcome.warm_up, part, i, sets[part][i])
+        except ContractError as error:
+            return Scored("invalid", str(error), log=outcome.log)
+        cost = {
+            "seconds_fit": outcome.seconds_fit,
+            "seconds_score": outcome.seconds_score,
+            "peak_rss_mb": outcome.peak_rss_mb,
+        }
+        known = {name: value for name, value in cost.items() if value is not None}
+        return Scored(file=ScoreFile(parts, known))
+
+    def _check(
+        self, scores: object, warm_up: object, part: str, i: int, trajectory: Trajectory
+    ) -> Scores:
+        return check_scores(
+            scores,
+            trajectory,
+            horizon=self.unit.horizon,
+            warm_up=warm_up,  # type: ignore[arg-type]  # check_scores is what checks it
+            detector=self.unit.detector,
+            where=f"{self.unit.environment}/{part}[{i}]",
+        )
+
+    def _in_process(self, sets: Mapping[str, TrajectorySet], counts: Mapping[str, int]) -> Scored:
+        """Fit and score here: what the detector raises passes through."""
+        detector = fit_detector(
+            self.offer.spec.factory,
+            list(islice(self.data.train, self.plan.limit)),
+            seed=self.unit.seed,
+            horizon=self.unit.horizon,
+            parameters=self.unit.parameters,
+        )
+        parts: dict[str, list[Scores]] = {}
+        for part, trajectories in sets.items():
+            chunk = trajectories[: counts[part]]
+            parts[part] = [
+                self._check(scores, getattr(detector, "warm_up", 0), part, i, chunk[i])
+                for i, scores in enumerate(score_chunk(detector, chunk))
+            ]
+        return Scored(file=ScoreFile(parts, {}))
+
+
+def parts_of(data: EnvironmentData, anomalies: tuple[str, ...]) -> dict[str, TrajectorySet]:
+    """Return the parts to score by name: calibration, the twins and the anomalies."""
+    anomalous = {f"test/{a}": data.anomalous(a) for a in anomalies}
+    return {CALIBRATION: data.calibration, TWINS: data.twins, **anomalous}
+
+
+def lengths_of(sets: Mapping[str, TrajectorySet], limit: int | None) -> dict[str, list[int]]:
+    """Return the number of observations of each trajectory to score, by part."""
+    return {part: [int(n) + 1 for n in s.lengths[:limit]] for part, s in sets.items()}
+
+
+def limited(n: int, limit: int | None) -> int:
+    """Return how many of n trajectories are used."""
+    return n if limit is None else min(n, limit)
+
+
+def _shuffled(counts: Mapping[str, int], seed: int) -> list[tuple[str, int]]:
+    """Return all trajectories to score in an order that tells nothing of their parts."""
+    ordered = [(part, i) for part, n in counts.items() for i in range(n)]
+    return [ordered[i] for i in np.random.default_rng(seed).permutation(len(ordered))]
