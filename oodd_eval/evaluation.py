@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Any
 
-from oodd_eval.alarms import calibrate
+import numpy as np
+
+from oodd_eval.alarms import CALIBRATED, MIN_STEPS, TARGETS, calibrate
 from oodd_eval.benchmark import ANOMALIES, PROTOCOL
 from oodd_eval.cusum import Standardization
 from oodd_eval.detector import Scores
@@ -22,19 +24,46 @@ from oodd_eval.scoring import CALIBRATION, Scored, lengths_of, limited, parts_of
 from oodd_eval.splits import EnvironmentData, Split
 from oodd_eval.splits_format import TWINS
 
-_LEVELS: Final = {"_at_1pct": (0.01, 0), "_at_01pct": (0.001, 100)}
-"""Calibrated false-alarm rates by suffix, each with the calibration trajectories it takes."""
-
-_CALIBRATED: Final = ("far", "far_twin", "delay", "delay_censored", "missed")
-
 _weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
 
 
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """The alarm rules of one fitted detector, made from its calibration scores.
+
+    Attributes
+    ----------
+    standard
+        With the paper's drift and threshold.
+    calibrated
+        By suffix, such as ``"at_1pct"``: the smallest threshold that keeps the false-alarm rate of
+        the calibration trajectories at the target. Targets for which there are too few calibration
+        steps are left out.
+    """
+
+    standard: AlarmRule
+    calibrated: dict[str, AlarmRule]
+
+    @classmethod
+    def fit(cls, calibration: Sequence[Scores]) -> Rules:
+        """Standardize and calibrate on the scores of nominal trajectories."""
+        rule = AlarmRule(Standardization.fit(calibration))
+        steps = sum(int(np.count_nonzero(~np.isnan(s))) for s in calibration)
+        return cls(
+            rule,
+            {
+                suffix: replace(rule, threshold=calibrate(calibration, rule, target))
+                for suffix, target in TARGETS.items()
+                if steps >= MIN_STEPS[suffix]
+            },
+        )
+
+
 def cell_metrics(
-    calibration: Sequence[Scores],
     anomalous: Sequence[Scores],
     twins: Sequence[Scores],
     onsets: Sequence[int],
+    rules: Rules,
     *,
     environment: str,
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
@@ -42,61 +71,53 @@ def cell_metrics(
 
     Parameters
     ----------
-    calibration : sequence of arrays
-        Scores of the nominal trajectories that standardize and calibrate.
     anomalous, twins : sequences of n arrays
         Scores of the test trajectories and of their nominal twins, in the same order.
     onsets : sequence of n ints
+    rules
+        Of the same fitted detector.
     environment
         Cells of one environment share their bootstrap resamples, so that they can be compared.
 
     Returns
     -------
     metrics
-        By name: those of `oodd_eval.metrics.METRICS`, then with suffix ``_at_1pct`` (and
-        ``_at_01pct``, given at least 100 calibration trajectories) those under the threshold
-        whose false-alarm rate on the calibration trajectories is at most 1 % (0.1 %).
+        By name: those of `oodd_eval.metrics.METRICS`, then those under each calibrated rule.
     contributions
         Numerators and denominators of those that are ratios of sums.
     """
-    standardization = Standardization.fit(calibration)
-    rule = AlarmRule(standardization)
-    found = cell_contributions(anomalous, twins, onsets, rule)
-    thresholds: dict[str, float] = {}
-    for suffix, (target, least) in _LEVELS.items():
-        if len(calibration) < least:
-            continue
-        threshold = thresholds[suffix] = calibrate(calibration, rule, target=target)
-        strict = replace(rule, threshold=threshold)
-        alarms = alarm_contributions(anomalous, twins, onsets, strict)
-        found |= {f"{name}{suffix}": alarms[name] for name in _CALIBRATED}
+    found = cell_contributions(anomalous, twins, onsets, rules.standard)
+    for suffix, rule in rules.calibrated.items():
+        alarms = alarm_contributions(anomalous, twins, onsets, rule)
+        found |= {f"{name}_{suffix}": alarms[name] for name in CALIBRATED}
     weights = _weights(len(anomalous), key=environment)
-    metrics = {name: Metric(c.value, *interval(c, weights), n=c.n) for name, c in found.items()} | {
-        f"threshold{suffix}": Metric(value, n=len(calibration))
-        for suffix, value in thresholds.items()
-    }
-    return metrics, found
+    metrics = {name: Metric(c.value, *interval(c, weights), n=c.n) for name, c in found.items()}
+    thresholds = {f"threshold_{s}": Metric(r.threshold) for s, r in rules.calibrated.items()}
+    return metrics | thresholds, found
 
 
-def make_record(
+def make_records(
     plan: Plan,
     unit: Unit,
-    anomaly: str,
     offer: Offer,
     data: EnvironmentData,
     scored: Scored,
-    provenance: dict[str, Any],
-) -> Record:
-    """Return the record of one cell of a unit, whatever became of it."""
-    record = Record(
-        cell=plan.cell(unit, anomaly),
+    provenance: Mapping[str, Any],
+) -> list[Record]:
+    """Return the records of a unit's cells, in the order of its anomalies, whatever became of it.
+
+    `provenance` is common to all of them.
+    """
+    cost = scored.file.cost
+    blank = Record(
+        cell="",
         detector=unit.detector,
         detector_version=offer.version,
         plugin=f"{offer.distribution}:{offer.plugin}",
         parameters=dict(unit.parameters),
         environment=unit.environment,
-        anomaly=anomaly,
-        group=ANOMALIES[anomaly].group,
+        anomaly="",
+        group="",
         horizon=unit.horizon,
         seed=unit.seed,
         split=plan.split,
@@ -109,28 +130,28 @@ def make_record(
             "calibration": limited(len(data.calibration), plan.limit),
             "test": limited(len(data.twins), plan.limit),
         },
-        provenance={**provenance, "limit": plan.limit, "overrides": dict(unit.overrides)},
-    )
-    if not record.ok:
-        return record
-    cost = scored.file.cost
-    record = replace(
-        record,
         seconds_fit=cost.get("seconds_fit", NAN),
         seconds_score=cost.get("seconds_score", NAN),
         peak_rss_mb=cost.get("peak_rss_mb", NAN),
+        provenance={**provenance, "limit": plan.limit, "overrides": dict(unit.overrides)},
     )
-    return with_metrics(record, data, scored.file)
+    records = [
+        replace(blank, cell=plan.cell(unit, a), anomaly=a, group=ANOMALIES[a].group)
+        for a in unit.anomalies
+    ]
+    if scored.status != "ok":
+        return records
+    rules = Rules.fit(scored.file.parts[CALIBRATION])
+    return [_with_metrics(record, data, scored.file, rules) for record in records]
 
 
-def with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile) -> Record:
-    """Return a record with its metrics computed from scores."""
+def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
     anomalous = scores.parts[f"test/{record.anomaly}"]
     metrics, contributions = cell_metrics(
-        calibration=scores.parts[CALIBRATION],
-        anomalous=anomalous,
-        twins=scores.parts[TWINS],
-        onsets=data.anomalous(record.anomaly).onsets[: len(anomalous)].tolist(),
+        anomalous,
+        scores.parts[TWINS],
+        data.anomalous(record.anomaly).onsets[: len(anomalous)].tolist(),
+        rules,
         environment=record.environment,
     )
     per_trajectory = {
@@ -148,33 +169,40 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
         When the split is not the one that the records are of, or scores are missing.
     """
     data: dict[str, EnvironmentData] = {}
+    rules: dict[str, Rules] = {}
+    rescored = []
     try:
-        return [_rescored(record, results, split, data) for record in records]
+        for record in records:
+            if record.split_digest != split.digest:
+                raise ResultsError(
+                    f"{record.cell} is of a split with digest {record.split_digest[:12]}, but "
+                    f"split {split.name!r} here has {split.digest[:12]}: name the right one with "
+                    "--split"
+                )
+            if not record.ok:
+                rescored.append(record)
+                continue
+            if record.environment not in data:
+                data[record.environment] = split.environment(record.environment)
+            environment = data[record.environment]
+            scores = _stored(record, results, environment)
+            key = str(record.provenance["scores"])
+            if key not in rules:
+                rules[key] = Rules.fit(scores.parts[CALIBRATION])
+            rescored.append(_with_metrics(record, environment, scores, rules[key]))
     finally:
         for environment in data.values():
             environment.close()
+    return rescored
 
 
-def _rescored(
-    record: Record, results: ResultsDirectory, split: Split, data: dict[str, EnvironmentData]
-) -> Record:
-    if record.split_digest != split.digest:
-        raise ResultsError(
-            f"{record.cell} is of a split with digest {record.split_digest[:12]}, but split "
-            f"{split.name!r} here has {split.digest[:12]}: name the right one with --split"
-        )
-    if not record.ok:
-        return record
-    if record.environment not in data:
-        data[record.environment] = split.environment(record.environment)
-    environment = data[record.environment]
+def _stored(record: Record, results: ResultsDirectory, data: EnvironmentData) -> ScoreFile:
     key = str(record.provenance.get("scores", ""))
-    sets = parts_of(environment, (record.anomaly,))
-    limit = record.provenance.get("limit")
-    scores = results.scores(key, lengths_of(sets, limit)) if key else None
+    sets = parts_of(data, (record.anomaly,))
+    scores = results.scores(key, lengths_of(sets, record.provenance.get("limit"))) if key else None
     if scores is None:
         raise ResultsError(
             f"{record.cell}: no scores that fit the split in {str(results.path)!r}, expected "
             f"scores/{key or '<key>'}.h5: run it again, or show the stored metrics with --stored"
         )
-    return with_metrics(record, environment, scores)
+    return scores

@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 
 from oodd_eval import provenance
-from oodd_eval.evaluation import make_record
+from oodd_eval.evaluation import make_records
 from oodd_eval.isolation import Limits
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.plugins import Offer, Plugins
@@ -114,12 +114,9 @@ def run(
             offer = plugins.offer(unit.detector)
             scored = future.result()
             key = _keep(plan, unit, offer, scored, results)
-            finished[index] = [
-                make_record(
-                    plan, unit, anomaly, offer, data[unit.environment], scored, {**origin, **key}
-                )
-                for anomaly in unit.anomalies
-            ]
+            finished[index] = make_records(
+                plan, unit, offer, data[unit.environment], scored, {**origin, **key}
+            )
             for record in finished[index]:
                 plugins.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
             if settings.stop_on_failure and scored.status != "ok":
