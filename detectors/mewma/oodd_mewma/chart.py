@@ -1,0 +1,79 @@
+"""The multivariate EWMA chart: exponentially weighted residuals and their Mahalanobis distance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_mewma.forecast import product
+
+Floats = NDArray[np.float64]
+
+
+def smooth(residuals: Floats, weights: Sequence[float]) -> Floats:
+    r"""Return exponentially weighted residuals, scaled to the variance of a single residual.
+
+    .. math:: z_n = (1 - \lambda) z_{n-1} + \lambda u_n, \quad z_0 = 0, \quad
+              \tilde z_n = z_n \Big/ \sqrt{\tfrac{\lambda}{2 - \lambda} (1 - (1 - \lambda)^{2n})}
+
+    The divisor is exact from the first step on: for residuals :math:`u` without autocorrelation
+    :math:`\tilde z_n` has the covariance of :math:`u` at every n, so the start needs no warm-up.
+
+    Parameters
+    ----------
+    residuals : array of shape (N, D)
+        In the order of time.
+    weights
+        W values of the weight, in (0, 1]: small ones have a long memory, of about 1 / weight steps.
+
+    Returns
+    -------
+    array of shape (W, N, D)
+
+    Examples
+    --------
+    >>> smooth(np.array([[3.0], [3.0]]), [1.0])[0].tolist()
+    [[3.0], [3.0]]
+    """
+    n, d = residuals.shape
+    weight = np.asarray(weights, dtype=np.float64)[:, None]  # (W, 1)
+    keep = 1.0 - weight
+    smoothed = np.empty((n, len(weight), d))
+    z = np.zeros((len(weight), d))
+    for t, u in enumerate(residuals):
+        z = keep * z + weight * u
+        smoothed[t] = z
+    # A running product, not a power: its first n factors are the same however many follow.
+    forgotten = np.cumprod(np.broadcast_to(keep**2, (n, len(weight), 1)), axis=0)
+    smoothed /= np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
+    return np.ascontiguousarray(smoothed.swapaxes(0, 1))
+
+
+def whitening(covariance: Floats, shrinkage: float) -> Floats:
+    """Return the matrix M such that ``|x M|`` is the Mahalanobis length of the row x.
+
+    The covariance is shrunk towards the identity, which bounds what a combination of sensors that
+    hardly varies in nominal operation, or a constant sensor, can contribute.
+
+    Parameters
+    ----------
+    covariance : array of shape (D, D)
+    shrinkage
+        Share of the identity, in (0, 1].
+
+    Returns
+    -------
+    array of shape (D, D)
+    """
+    shrunk = (1.0 - shrinkage) * covariance + shrinkage * np.eye(len(covariance))
+    root: Floats = np.linalg.inv(np.linalg.cholesky(shrunk)).T
+    return root
+
+
+def distance(rows: Floats, root: Floats) -> Floats:
+    """Return the Mahalanobis lengths of rows of shape (N, D), given `whitening`'s matrix."""
+    whitened = product(rows, root)
+    lengths: Floats = np.sqrt((whitened * whitened).sum(axis=1))
+    return lengths

@@ -1,0 +1,246 @@
+"""Fit and score of the vector autoregression with a multivariate EWMA chart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval import Trajectory
+from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_mewma.chart import Floats, distance, smooth, whitening
+from oodd_mewma.forecast import Moments, product, regressors
+
+CONSTANT: Final = 1e-6
+"""A standard deviation below this is a quantity that does not vary; its scale is then 1."""
+
+FOLDS: Final = 5
+"""Parts of the nominal trajectories, each judged by what was learnt from the others."""
+
+
+class MewmaDetector:
+    r"""Signed forecast residuals, accumulated with several memories, far from where they belong.
+
+    .. math:: u_t = \mathrm{clip}\left(\frac{o_t - B^\top x_t}{\rho}\right), \quad
+              z^\lambda_t = (1 - \lambda) z^\lambda_{t-1} + \lambda u_t, \quad
+              d^\lambda_t = \sqrt{\tilde z^{\lambda\top}_t \Sigma_\lambda^{-1} \tilde z^\lambda_t},
+              \quad s_t = \max_\lambda \frac{d^\lambda_t - m_\lambda}{q_\lambda}
+
+    where :math:`x_t` holds the latest observations up to :math:`o_{t-h}` (and actions, if asked
+    for), B a ridge regression, :math:`\rho` the root mean square of the residuals, and
+    :math:`\tilde z` is z scaled to one variance at all times (`smooth`). Higher means more
+    anomalous. Scores are undefined (NaN) for t < h only.
+
+    A score per step forgets at once; this one adds up evidence with its sign. So it sees small
+    changes that persist, and stays high for a while after a change has gone.
+
+    Parameters
+    ----------
+    seed
+        Accepted as the contract asks; nothing here is random.
+    horizon
+        Steps between the last observation that a forecast uses and the one it predicts, h. The
+        regression is fitted to that horizon directly, without feeding forecasts back.
+    actions
+        Whether the forecast uses the commanded actions ``a_{t-h}, a_{t-h-1}, ...`` too.
+    order
+        Observations that a forecast uses; before the beginning the first one is repeated.
+    ridge
+        Penalty on the squared coefficients of standardized sensors, relative to the mean squared
+        error; positive.
+    clip
+        Residuals are limited to this many root mean squares on either side; positive.
+    shrinkage
+        Share of the identity in every covariance, in (0, 1].
+    weights
+        Weights of the newest residual, each in (0, 1].
+
+    Raises
+    ------
+    UsageError
+        When a parameter is not in its range.
+
+    Notes
+    -----
+    Residuals, covariances, m and q come from nominal trajectories that the regression (and for m
+    and q, the covariance) has not seen: five folds take turns, and scoring uses what all of them
+    give together. With autocorrelated residuals, as for h > 1, the variance of the first steps is
+    approximate.
+
+    Source: Lowry, Woodall, Champ & Rigdon, "A multivariate exponentially weighted moving average
+    control chart", Technometrics 34 (1992).
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        horizon: int = 1,
+        actions: bool = False,
+        order: int = 3,
+        ridge: float = 1e-4,
+        clip: float = 3.0,
+        shrinkage: float = 0.05,
+        weights: Sequence[float] = (0.3, 0.1, 0.03),
+    ) -> None:
+        self._name = "mewma-a" if actions else "mewma"
+        self.seed, self.actions = seed, actions
+        self.horizon, self.order = self._integer("horizon", horizon), self._integer("order", order)
+        self.ridge = self._number("ridge", ridge)
+        self.clip = self._number("clip", clip)
+        self.shrinkage = self._number("shrinkage", shrinkage, most=1.0)
+        if isinstance(weights, str) or not isinstance(weights, Sequence) or not weights:
+            raise self._wrong("weights", "a list of at least one number", weights)
+        self.weights = tuple(self._number("weights", w, most=1.0) for w in weights)
+        self._widths: tuple[int, int] | None = None
+
+    def fit(self, nominal: Sequence[Trajectory]) -> MewmaDetector:
+        """Learn the forecast, then where its accumulated residuals lie.
+
+        Raises
+        ------
+        TrajectoryError
+            When fewer than two trajectories are longer than the horizon, or they differ in their
+            number of sensors or the width of their actions.
+        """
+        usable = [x for x in nominal if x.transitions >= self.horizon]
+        widths = {(x.observation_dim, x.action_dim) for x in nominal}
+        if len(usable) < 2 or len(widths) != 1:
+            raise TrajectoryError(
+                f"detector {self._name!r} cannot be fitted on {len(nominal)} trajectories, of "
+                f"which {len(usable)} have at least {self.horizon} transitions, of (sensors, "
+                f"action columns) {sorted(widths)}: expected at least two that long, all of the "
+                "same shape"
+            )
+        self._widths = widths.pop()
+        self.observation_scale_ = _mean_and_std([x.observations for x in usable])
+        self.action_scale_ = _mean_and_std([x.actions for x in usable])
+        folds = [usable[i :: min(FOLDS, len(usable))] for i in range(min(FOLDS, len(usable)))]
+
+        moments = [
+            _total([Moments.of(self._regressors(x), self._targets(x)) for x in fold])
+            for fold in folds
+        ]
+        every = _total(moments)
+        self.coefficients_ = every.solve(self.ridge)
+        # What scoring will see: residuals of forecasts that were fitted to other trajectories.
+        unseen = [(every - own).solve(self.ridge) for own in moments]
+
+        squares, rows = np.zeros(self._widths[0]), 0
+        for fold, coefficients in zip(folds, unseen, strict=True):
+            for x in fold:
+                residuals = self._residuals(x, coefficients)
+                squares += (residuals**2).sum(axis=0)
+                rows += len(residuals)
+        self.residual_scale_ = _scale(np.sqrt(squares / rows))
+
+        # One uncentred covariance per weight: residuals are zero on average, by the regression.
+        sums, counts = [], []
+        for fold, coefficients in zip(folds, unseen, strict=True):
+            charts = [self._smoothed(x, coefficients) for x in fold]
+            sums.append(sum((z.swapaxes(1, 2) @ z for z in charts), start=np.zeros(())))
+            counts.append(sum(z.shape[1] for z in charts))
+        total, count = sum(sums, start=np.zeros(())), sum(counts)
+        self.whitening_ = self._whitening(total / count)
+
+        distances: list[Floats] = []
+        for fold, coefficients, own, n in zip(folds, unseen, sums, counts, strict=True):
+            root = self._whitening((total - own) / (count - n))
+            distances += [self._distances(self._smoothed(x, coefficients), root) for x in fold]
+        pooled = np.concatenate(distances, axis=1)  # (W, N)
+        self.distance_mean_ = pooled.mean(axis=1, keepdims=True)
+        self.distance_std_ = _scale(pooled.std(axis=1, keepdims=True))
+        return self
+
+    def score(self, trajectory: Trajectory) -> Floats:
+        """Return one score per observation, NaN for t < horizon.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            When sensors or actions have another width than those of `fit`.
+        """
+        if self._widths is None:
+            raise NotFittedError(
+                f"detector {self._name!r} was asked for scores before fit: fit it on nominal "
+                "trajectories"
+            )
+        found = (trajectory.observation_dim, trajectory.action_dim)
+        if found != self._widths:
+            raise TrajectoryError(
+                f"detector {self._name!r} was fitted on (sensors, action columns) {self._widths} "
+                f"and asked to score a trajectory of {found}: score trajectories of the "
+                "environment that it was fitted on"
+            )
+        scores = np.full(len(trajectory), np.nan)
+        if trajectory.transitions >= self.horizon:
+            smoothed = self._smoothed(trajectory, self.coefficients_)
+            distances = self._distances(smoothed, self.whitening_)
+            standardized = (distances - self.distance_mean_) / self.distance_std_
+            scores[self.horizon :] = standardized.max(axis=0)
+        return scores
+
+    def _targets(self, x: Trajectory) -> Floats:
+        mean, std = self.observation_scale_
+        return (x.observations[self.horizon :] - mean) / std
+
+    def _regressors(self, x: Trajectory) -> Floats:
+        mean, std = self.observation_scale_
+        actions = None
+        if self.actions:
+            action_mean, action_std = self.action_scale_
+            actions = (x.actions - action_mean) / action_std
+        observations = (x.observations - mean) / std
+        return regressors(observations, actions, order=self.order, horizon=self.horizon)
+
+    def _residuals(self, x: Trajectory, coefficients: Floats) -> Floats:
+        return self._targets(x) - product(self._regressors(x), coefficients)  # (N, D)
+
+    def _smoothed(self, x: Trajectory, coefficients: Floats) -> Floats:
+        """Return the scaled, exponentially weighted, clipped residuals: (W, N, D)."""
+        residuals = self._residuals(x, coefficients) / self.residual_scale_
+        return smooth(np.clip(residuals, -self.clip, self.clip), self.weights)
+
+    def _whitening(self, covariances: Floats) -> list[Floats]:
+        return [whitening(c, self.shrinkage) for c in covariances]
+
+    def _distances(self, smoothed: Floats, roots: list[Floats]) -> Floats:
+        return np.stack([distance(z, r) for z, r in zip(smoothed, roots, strict=True)])  # (W, N)
+
+    def _integer(self, name: str, value: object) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise self._wrong(name, "an integer of at least 1", value)
+        return value
+
+    def _number(self, name: str, value: object, most: float = np.inf) -> float:
+        if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= most:
+            return float(value)
+        bound = "" if most == np.inf else f" of at most {most:g}"
+        raise self._wrong(name, f"a positive number{bound}", value)
+
+    def _wrong(self, name: str, expected: str, value: object) -> UsageError:
+        return UsageError(
+            f"parameter {name} of detector {self._name!r}: expected {expected}, got {value!r}"
+        )
+
+
+def _mean_and_std(arrays: Sequence[NDArray[np.float32]]) -> tuple[Floats, Floats]:
+    rows = sum(len(a) for a in arrays)
+    mean: Floats = np.sum([a.sum(axis=0, dtype=np.float64) for a in arrays], axis=0) / rows
+    squares = np.sum([((a - mean) ** 2).sum(axis=0) for a in arrays], axis=0)
+    return mean, _scale(np.sqrt(squares / rows))
+
+
+def _scale(std: Floats) -> Floats:
+    return np.where(std < CONSTANT, 1.0, std)
+
+
+def _total(moments: Sequence[Moments]) -> Moments:
+    total = moments[0]
+    for other in moments[1:]:
+        total = total + other
+    return total

@@ -1,0 +1,106 @@
+"""Ridge vector autoregression: a linear forecast of an observation from the latest ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+BLOCK: Final = 64
+"""Rows that are multiplied by a matrix at once."""
+
+
+def regressors(observations: Floats, actions: Floats | None, *, order: int, horizon: int) -> Floats:
+    """Return what the forecasts of ``o_h .. o_T`` may use, one row per forecast.
+
+    The row of time t holds ``o_{t-h} .. o_{t-h-order+1}``, then the actions of the same times if
+    there are any, then 1. Times before the beginning count as time 0.
+
+    Parameters
+    ----------
+    observations : array of shape (T + 1, D)
+    actions : array of shape (T, A), or None
+    order
+        Latest times that a forecast looks at.
+    horizon
+        Steps from the newest of them to the forecast, h.
+
+    Returns
+    -------
+    array of shape (max(T + 1 - h, 0), order * (D + A) + 1)
+
+    Examples
+    --------
+    >>> o = np.array([[1.0], [2.0], [3.0]])
+    >>> regressors(o, None, order=2, horizon=1).tolist()
+    [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
+    """
+    newest = np.arange(max(len(observations) - horizon, 0))
+    times = np.maximum(newest[:, None] - np.arange(order), 0)  # (N, order)
+    n = len(newest)
+    parts = [observations[times].reshape(n, order * observations.shape[1])]
+    if actions is not None:
+        parts.append(actions[times].reshape(n, order * actions.shape[1]))
+    return np.concatenate([*parts, np.ones((n, 1))], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Sums that decide a least-squares fit; those of two sets of rows add up.
+
+    Attributes
+    ----------
+    gram : array of shape (K, K)
+        X'X of the regressors.
+    cross : array of shape (K, D)
+        X'Y of regressors and targets.
+    """
+
+    gram: Floats
+    cross: Floats
+
+    @classmethod
+    def of(cls, x: Floats, y: Floats) -> Moments:
+        """Return the moments of regressors and targets with the same number of rows."""
+        return cls(x.T @ x, x.T @ y)
+
+    def __add__(self, other: Moments) -> Moments:
+        return Moments(self.gram + other.gram, self.cross + other.cross)
+
+    def __sub__(self, other: Moments) -> Moments:
+        return Moments(self.gram - other.gram, self.cross - other.cross)
+
+    def solve(self, ridge: float) -> Floats:
+        """Return the coefficients B that minimize mean |y - xB|^2 + ridge |B|^2.
+
+        The last regressor is the constant and goes unpunished.
+        """
+        penalty = np.full(len(self.gram), ridge * self.gram[-1, -1])
+        penalty[-1] = 0.0
+        return np.asarray(np.linalg.solve(self.gram + np.diag(penalty), self.cross), np.float64)
+
+
+def product(rows: Floats, matrix: Floats) -> Floats:
+    """Return ``rows @ matrix`` such that the bits of a row do not depend on how many follow it.
+
+    A matrix product picks its order of summation by the shapes. Blocks of one fixed shape, the last
+    one filled up with zeros, make the scores of a prefix the prefix of the scores exactly.
+
+    Parameters
+    ----------
+    rows : array of shape (N, K)
+    matrix : array of shape (K, M)
+
+    Returns
+    -------
+    array of shape (N, M)
+    """
+    n = len(rows)
+    blocks = np.zeros((-(-n // BLOCK), BLOCK, rows.shape[1]))
+    blocks.reshape(-1, rows.shape[1])[:n] = rows
+    multiplied: Floats = np.matmul(blocks, matrix).reshape(-1, matrix.shape[1])[:n]
+    return multiplied
