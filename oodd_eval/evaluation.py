@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -141,7 +141,11 @@ def make_records(
     ]
     if scored.status != "ok":
         return records
-    rules = Rules.fit(scored.file.parts[CALIBRATION])
+    try:
+        rules = Rules.fit(scored.file.parts[CALIBRATION])
+    except OverflowError:
+        reason = "scores are too large: their sum over the calibration trajectories overflows"
+        return [replace(record, status="invalid", reason=reason) for record in records]
     return [_with_metrics(record, data, scored.file, rules) for record in records]
 
 

@@ -1,0 +1,1 @@
+"""What people read: tables, Markdown and the terminal, all of them functions of records."""

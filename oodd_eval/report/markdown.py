@@ -1,0 +1,70 @@
+"""Results as Markdown: one section per board, the paper's layout among its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tabulate import tabulate
+
+from oodd_eval.records import Record
+from oodd_eval.report import tables
+from oodd_eval.report.board import Board, boards
+from oodd_eval.report.tables import Table
+
+
+def render(records: Sequence[Record], *, intervals: bool = False) -> str:
+    """Return a report on records as Markdown.
+
+    Parameters
+    ----------
+    records
+        In any number of splits; each digest gets a section of its own.
+    intervals
+        Whether to print 95 % intervals behind the values.
+    """
+    sections = [_board(board, intervals=intervals) for board in boards(records)]
+    return "\n".join(["# Results", "", *sections]) if sections else "# Results\n\nNo records.\n"
+
+
+def table(one: Table) -> str:
+    """Return a table as Markdown under its title."""
+    escaped = [[_escape(cell) for cell in row] for row in one.rows]
+    align = ("left", *["right"] * (len(one.header) - 1))
+    text = tabulate(
+        escaped,
+        headers=[_escape(h) for h in one.header],
+        tablefmt="pipe",
+        colalign=align if escaped else None,
+        disable_numparse=True,
+    )
+    return f"### {one.title}\n\n{text}\n"
+
+
+def _board(board: Board, *, intervals: bool) -> str:
+    ok = sum(r.ok for r in board.records)
+    parts = [
+        f"## Split {_escape(board.split)}",
+        "",
+        f"{len(board.records)} cells, {ok} ok, {len(board.records) - ok} failed.",
+        "",
+        *(f"**{_escape(sentence)}**\n" for sentence in tables.findings(board)),
+        table(tables.ranking(board, intervals=intervals)),
+        *(table(tables.anomaly_groups(board, h, intervals=intervals)) for h in board.horizons),
+    ]
+    parts.append(table(tables.all_metrics(board, intervals=intervals)))
+    if alarms := tables.calibrated(board, intervals=intervals):
+        parts.append(table(alarms))
+    parts += [table(tables.by_anomaly(board, e, intervals=intervals)) for e in board.entries]
+    if failures := board.failures():
+        rows = [[r.environment, r.cell.partition("::")[2], r.status, r.reason] for r in failures]
+        parts.append(table(Table("Failures", ["environment", "detector", "state", "reason"], rows)))
+    parts += [f"- {_escape(line)}" for line in tables.notes(board)]
+    return "\n".join(parts) + "\n"
+
+
+def _escape(text: str) -> str:
+    """Keep text from being read as table or HTML: names and reasons are other people's."""
+    flat = " ".join(text.split())
+    for character in "\\|<>*_`[":
+        flat = flat.replace(character, f"\\{character}")
+    return flat
