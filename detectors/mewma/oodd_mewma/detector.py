@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
 from oodd_mewma.chart import Floats, distance, smooth, whitening
-from oodd_mewma.forecast import Moments, product, regressors
+from oodd_mewma.forecast import Moments, first_forecast, product, regressors
 
 CONSTANT: Final = 1e-6
 """A standard deviation below this is a quantity that does not vary; its scale is then 1."""
@@ -31,7 +31,8 @@ class MewmaDetector:
     where :math:`x_t` holds the latest observations up to :math:`o_{t-h}` (and actions, if asked
     for), B a ridge regression, :math:`\rho` the root mean square of the residuals, and
     :math:`\tilde z` is z scaled to one variance at all times (`smooth`). Higher means more
-    anomalous. Scores are undefined (NaN) for t < h only.
+    anomalous. Scores are undefined (NaN) for t < h, and 0, about the mean of nominal scores, in the
+    next ``order - 1`` steps, when a forecast has too few observations yet: no evidence either way.
 
     A score per step forgets at once; this one adds up evidence with its sign. So it sees small
     changes that persist, and stays high for a while after a change has gone.
@@ -46,7 +47,7 @@ class MewmaDetector:
     actions
         Whether the forecast uses the commanded actions ``a_{t-h}, a_{t-h-1}, ...`` too.
     order
-        Observations that a forecast uses; before the beginning the first one is repeated.
+        Latest observations that a forecast uses.
     ridge
         Penalty on the squared coefficients of standardized sensors, relative to the mean squared
         error; positive.
@@ -88,6 +89,7 @@ class MewmaDetector:
         self._name = "mewma-a" if actions else "mewma"
         self.seed, self.actions = seed, actions
         self.horizon, self.order = self._integer("horizon", horizon), self._integer("order", order)
+        self._first = first_forecast(order=self.order, horizon=self.horizon)
         self.ridge = self._number("ridge", ridge)
         self.clip = self._number("clip", clip)
         self.shrinkage = self._number("shrinkage", shrinkage, most=1.0)
@@ -102,15 +104,15 @@ class MewmaDetector:
         Raises
         ------
         TrajectoryError
-            When fewer than two trajectories are longer than the horizon, or they differ in their
-            number of sensors or the width of their actions.
+            When fewer than two trajectories are long enough for a forecast, or they differ in
+            their number of sensors or the width of their actions.
         """
-        usable = [x for x in nominal if x.transitions >= self.horizon]
+        usable = [x for x in nominal if x.transitions >= self._first]
         widths = {(x.observation_dim, x.action_dim) for x in nominal}
         if len(usable) < 2 or len(widths) != 1:
             raise TrajectoryError(
                 f"detector {self._name!r} cannot be fitted on {len(nominal)} trajectories, of "
-                f"which {len(usable)} have at least {self.horizon} transitions, of (sensors, "
+                f"which {len(usable)} have at least {self._first} transitions, of (sensors, "
                 f"action columns) {sorted(widths)}: expected at least two that long, all of the "
                 "same shape"
             )
@@ -177,16 +179,17 @@ class MewmaDetector:
                 "environment that it was fitted on"
             )
         scores = np.full(len(trajectory), np.nan)
-        if trajectory.transitions >= self.horizon:
+        scores[self.horizon :] = 0.0
+        if trajectory.transitions >= self._first:
             smoothed = self._smoothed(trajectory, self.coefficients_)
             distances = self._distances(smoothed, self.whitening_)
             standardized = (distances - self.distance_mean_) / self.distance_std_
-            scores[self.horizon :] = standardized.max(axis=0)
+            scores[self._first :] = standardized.max(axis=0)
         return scores
 
     def _targets(self, x: Trajectory) -> Floats:
         mean, std = self.observation_scale_
-        return (x.observations[self.horizon :] - mean) / std
+        return (x.observations[self._first :] - mean) / std
 
     def _regressors(self, x: Trajectory) -> Floats:
         mean, std = self.observation_scale_

@@ -14,11 +14,16 @@ BLOCK: Final = 64
 """Rows that are multiplied by a matrix at once."""
 
 
-def regressors(observations: Floats, actions: Floats | None, *, order: int, horizon: int) -> Floats:
-    """Return what the forecasts of ``o_h .. o_T`` may use, one row per forecast.
+def first_forecast(*, order: int, horizon: int) -> int:
+    """Return the first time t that has all of its regressors: ``horizon + order - 1``."""
+    return horizon + order - 1
 
-    The row of time t holds ``o_{t-h} .. o_{t-h-order+1}``, then the actions of the same times if
-    there are any, then 1. Times before the beginning count as time 0.
+
+def regressors(observations: Floats, actions: Floats | None, *, order: int, horizon: int) -> Floats:
+    """Return what the forecasts of ``o_f .. o_T`` may use, one row per forecast.
+
+    f is the first time that has all regressors, `first_forecast`. The row of time t holds
+    ``o_{t-h} .. o_{t-h-order+1}``, then the actions of the same times if there are any, then 1.
 
     Parameters
     ----------
@@ -31,16 +36,16 @@ def regressors(observations: Floats, actions: Floats | None, *, order: int, hori
 
     Returns
     -------
-    array of shape (max(T + 1 - h, 0), order * (D + A) + 1)
+    array of shape (max(T + 1 - f, 0), order * (D + A) + 1)
 
     Examples
     --------
-    >>> o = np.array([[1.0], [2.0], [3.0]])
+    >>> o = np.array([[1.0], [2.0], [3.0], [4.0]])
     >>> regressors(o, None, order=2, horizon=1).tolist()
-    [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
+    [[2.0, 1.0, 1.0], [3.0, 2.0, 1.0]]
     """
-    newest = np.arange(max(len(observations) - horizon, 0))
-    times = np.maximum(newest[:, None] - np.arange(order), 0)  # (N, order)
+    newest = np.arange(order - 1, max(len(observations) - horizon, order - 1))
+    times = newest[:, None] - np.arange(order)  # (N, order)
     n = len(newest)
     parts = [observations[times].reshape(n, order * observations.shape[1])]
     if actions is not None:

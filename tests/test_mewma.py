@@ -1,0 +1,360 @@
+"""The vector autoregression and its chart, by hand and against slow, obvious forms of them."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from oodd_mewma import make_mewma, make_mewma_a, oodd_detectors
+from oodd_mewma.chart import distance, smooth, whitening
+from oodd_mewma.forecast import Moments, product, regressors
+
+from oodd_eval import Trajectory
+from oodd_eval.detector import check_scores
+from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+
+A1 = np.array([[0.5, 0.2, 0.0], [-0.3, 0.6, 0.1], [0.0, 0.1, 0.4]])
+A2 = np.array([[-0.2, 0.0, 0.1], [0.0, -0.3, 0.0], [0.1, 0.0, 0.2]])
+PUSH = np.array([[0.0, 0.0, 2.0]])
+
+
+def episode(seed, n=80, noise=0.1):
+    """``o_t = A1 o_{t-1} + A2 o_{t-2} + PUSH a_{t-1} + noise``, with a fourth sensor that is 7."""
+    rng = np.random.default_rng(seed)
+    before = 30  # steps until the start is forgotten
+    n += before
+    o, a = np.zeros((n, 3)), rng.normal(size=(n - 1, 1))
+    for t in range(2, n):
+        o[t] = A1 @ o[t - 1] + A2 @ o[t - 2] + a[t - 1] @ PUSH + noise * rng.normal(size=3)
+    return Trajectory(np.c_[o, np.full(n, 7.0)][before:], a[before:])
+
+
+NOMINAL = [episode(seed) for seed in range(12)]
+
+
+def shifted(x, onset, by):
+    rows = x.observations.copy()
+    rows[onset:, 0] += by
+    return Trajectory(rows, x.actions)
+
+
+@pytest.fixture(scope="module")
+def chart():
+    return make_mewma().fit(NOMINAL)
+
+
+@pytest.fixture(scope="module")
+def chart_a():
+    return make_mewma_a().fit(NOMINAL)
+
+
+# The forecast
+
+
+def test_regressors_hold_the_latest_times_newest_first_then_actions_then_one():
+    o, a = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([[10.0], [20.0], [30.0]])
+    found = regressors(o, a, order=2, horizon=1)
+    assert found.tolist() == [[2, 1, 20, 10, 1], [3, 2, 30, 20, 1]]
+    assert regressors(o, a, order=1, horizon=3).tolist() == [[1, 10, 1]]
+    assert regressors(o, None, order=3, horizon=1).tolist() == [[3, 2, 1, 1]]
+    assert regressors(o, None, order=3, horizon=2).shape == (0, 4)
+    assert regressors(o[:1], None, order=3, horizon=2).shape == (0, 4)
+
+
+def test_ridge_by_hand():
+    # x = 1, 2, 3 around 2, y = 2, 4, 6 around 4: slope sum(xy) / (sum(xx) + ridge n) = 4 / (2 + 2).
+    x, y = np.array([[-1.0, 1], [0.0, 1], [1.0, 1]]), np.array([[2.0], [4.0], [6.0]])
+    np.testing.assert_allclose(Moments.of(x, y).solve(2 / 3), [[1.0], [4.0]])
+    np.testing.assert_allclose(Moments.of(x, y).solve(1e-12), [[2.0], [4.0]])
+
+
+def test_moments_add_and_subtract():
+    x, y = np.arange(8.0).reshape(4, 2), np.arange(4.0).reshape(4, 1)
+    whole = Moments.of(x, y)
+    rest = whole - Moments.of(x[3:], y[3:])
+    assert rest.gram.tolist() == (x[:3].T @ x[:3]).tolist()
+    assert (rest + Moments.of(x[3:], y[3:])).cross.tolist() == whole.cross.tolist()
+
+
+def test_autoregression_of_a_known_process_is_recovered():
+    detector = make_mewma_a(ridge=1e-9, order=2).fit([episode(s, n=1000) for s in range(20)])
+    (_, std), (_, action_std) = detector.observation_scale_, detector.action_scale_
+    b = detector.coefficients_
+    # Coefficients are those of standardized sensors: back to the process's units.
+    unit = std[None, :3] / std[:3, None]
+    np.testing.assert_allclose(b[0:3, :3] * unit, A1.T, atol=0.02)
+    np.testing.assert_allclose(b[4:7, :3] * unit, A2.T, atol=0.02)
+    np.testing.assert_allclose(b[8, :3] * std[:3] / action_std, PUSH[0], atol=0.02)
+    np.testing.assert_allclose(b[9, :3], 0.0, atol=0.02)  # the action before has no effect
+    np.testing.assert_allclose(detector.residual_scale_[:3] * std[:3], 0.1, rtol=0.05)
+
+
+def test_longer_horizon_is_the_best_linear_forecast_at_that_distance():
+    """Of ``o_t = 0.8 o_{t-1} + e`` the forecast at distance h is ``0.8^h o_{t-h}``."""
+    rng = np.random.default_rng(0)
+    o = np.zeros((4000, 1))
+    for t in range(1, 4000):
+        o[t] = 0.8 * o[t - 1] + rng.normal()
+    x = Trajectory(o, np.zeros((3999, 1)))
+    detector = make_mewma(order=1, horizon=3, ridge=1e-9).fit([x, x])
+    assert detector.coefficients_[0, 0] == pytest.approx(0.8**3, abs=0.04)
+
+
+@pytest.mark.parametrize("n", [0, 1, 63, 64, 65, 200])
+def test_product_is_the_matrix_product_and_prefix_exact(n):
+    rng = np.random.default_rng(n)
+    rows, matrix = rng.normal(size=(n, 37)), rng.normal(size=(37, 5))
+    whole = product(rows, matrix)
+    np.testing.assert_allclose(whole, rows @ matrix, rtol=1e-12, atol=1e-12)
+    for k in range(0, n, 9):
+        np.testing.assert_array_equal(product(rows[:k], matrix), whole[:k])
+
+
+# The chart
+
+
+def test_smoothing_by_hand():
+    # z = 0.5 * 4 = 2, then 0.5 * 2 + 0.5 * 0 = 1; variances 1/3 (1 - 1/4), 1/3 (1 - 1/16).
+    expected = [2 / 0.25**0.5, 1 / (15 / 48) ** 0.5]
+    np.testing.assert_allclose(smooth(np.array([[4.0], [0.0]]), [0.5])[0, :, 0], expected)
+
+
+def test_smoothing_is_the_weighted_sum_of_all_residuals():
+    u = np.random.default_rng(0).normal(size=(30, 2))
+    for weight, z in zip((0.3, 0.03), smooth(u, (0.3, 0.03)), strict=True):
+        for n in range(30):
+            w = weight * (1 - weight) ** np.arange(n, -1, -1)
+            np.testing.assert_allclose(z[n], w @ u[: n + 1] / np.sqrt((w**2).sum()), rtol=1e-9)
+
+
+def test_smoothed_white_residuals_have_unit_variance_from_the_first_step():
+    u = np.random.default_rng(1).normal(size=(40, 5000))
+    variance = smooth(u, (0.1,))[0].var(axis=1)
+    # Standard error of a variance over 5000 columns: sqrt(2 / 5000) = 0.02.
+    np.testing.assert_allclose(variance, 1.0, atol=0.1)
+
+
+def test_mahalanobis_distance_by_hand():
+    # Without much shrinkage (2, 0) lies 1 away where the variance is 4; (1, 1) against
+    # [[1, .5], [.5, 1]]: inverse 4/3 [[1, -.5], [-.5, 1]], squared distance 4/3.
+    far = distance(np.array([[2.0, 0.0]]), whitening(np.diag([4.0, 1.0]), 1e-12))
+    correlated = whitening(np.array([[1.0, 0.5], [0.5, 1.0]]), 1e-12)
+    np.testing.assert_allclose(far, [1.0])
+    np.testing.assert_allclose(distance(np.array([[1.0, 1.0]]), correlated), [(4 / 3) ** 0.5])
+
+
+def test_whole_shrinkage_is_the_euclidean_length():
+    np.testing.assert_allclose(distance(np.array([[3.0, 4.0]]), whitening(np.eye(2) * 9, 1.0)), [5])
+
+
+def test_shrinkage_bounds_the_share_of_a_constant_sensor():
+    # Shrunk variance 0.05 * 1: a residual of 1 is 1 / sqrt(0.05) long.
+    root = whitening(np.diag([1.0, 0.0]), 0.05)
+    np.testing.assert_allclose(distance(np.array([[0.0, 1.0]]), root), [0.05**-0.5])
+
+
+# The detector
+
+
+@pytest.mark.parametrize("make", [make_mewma, make_mewma_a])
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_scores_are_those_of_a_slow_loop(make, horizon):
+    detector = make(horizon=horizon).fit(NOMINAL)
+    x = shifted(episode(70, n=30), 15, 2.0)
+    (mean, std), (action_mean, action_std) = detector.observation_scale_, detector.action_scale_
+    o, a = (x.observations - mean) / std, (x.actions - action_mean) / action_std
+    z = np.zeros((3, 4))
+    expected = np.full(len(x), np.nan)
+    expected[horizon : horizon + 2] = 0  # a forecast needs three observations
+    for n, t in enumerate(range(horizon + 2, len(x)), start=1):
+        times = [t - horizon - lag for lag in range(3)]
+        known = [o[i] for i in times] + ([a[i] for i in times] if detector.actions else [])
+        forecast = np.concatenate([*known, [1.0]]) @ detector.coefficients_
+        u = np.clip((o[t] - forecast) / detector.residual_scale_, -3, 3)
+        standardized = []
+        for i, weight in enumerate((0.3, 0.1, 0.03)):
+            z[i] = (1 - weight) * z[i] + weight * u
+            scaled = z[i] / np.sqrt(weight / (2 - weight) * (1 - (1 - weight) ** (2 * n)))
+            length = np.linalg.norm(scaled @ detector.whitening_[i])
+            standardized.append(
+                (length - detector.distance_mean_[i, 0]) / detector.distance_std_[i, 0]
+            )
+        expected[t] = max(standardized)
+    np.testing.assert_allclose(detector.score(x), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [make_mewma, make_mewma_a])
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_scores_of_a_prefix_are_the_prefix_of_the_scores(make, horizon):
+    detector = make(horizon=horizon).fit(NOMINAL)
+    x = episode(40, n=150)
+    whole = detector.score(x)
+    for n in range(1, len(x) + 1):
+        np.testing.assert_array_equal(detector.score(x[:n]), whole[:n])
+
+
+def test_standardization_holds_on_trajectories_that_fit_has_not_seen():
+    detector = make_mewma(weights=[0.1]).fit([episode(s) for s in range(60)])
+    scores = np.concatenate([detector.score(episode(s))[1:] for s in range(500, 560)])
+    assert abs(scores.mean()) < 0.15
+    assert abs(scores.std() - 1) < 0.15
+
+
+def test_start_is_not_more_anomalous_than_the_rest():
+    """Nominal scores of an episode that starts like it goes on have no trend in time."""
+    episodes = [episode(s) for s in range(60)]
+    detector = make_mewma(order=2, weights=[0.03]).fit(episodes[:40])
+    scores = np.array([detector.score(x) for x in episodes[40:]])[:, 1:]
+    assert abs(np.median(scores[:, 4:14]) - np.median(scores[:, -30:])) < 0.6
+
+
+@pytest.mark.parametrize("weights", [[1.0], [0.3, 0.1, 0.03]])
+def test_gross_anomaly_scores_higher(weights):
+    detector = make_mewma(weights=weights).fit(NOMINAL)
+    x = episode(30)
+    nominal, anomalous = detector.score(x), detector.score(shifted(x, 40, 50.0))
+    np.testing.assert_array_equal(anomalous[:40], nominal[:40])
+    assert anomalous[40:45].max() > np.nanmax(nominal)
+    assert anomalous[40] > nominal[40] + 1
+
+
+def test_small_persistent_change_shows_when_evidence_adds_up(chart_a):
+    """A shift of half the noise hides in single residuals and shows in a long memory."""
+    memoryless = make_mewma_a(weights=[1.0]).fit(NOMINAL)
+    excess = {}
+    for name, detector in (("memoryless", memoryless), ("chart", chart_a)):
+        differences = [
+            detector.score(shifted(episode(s, n=200), 60, 0.15))[120:]
+            - detector.score(episode(s, n=200))[120:]
+            for s in range(600, 610)
+        ]
+        excess[name] = np.mean(differences)
+    assert excess["chart"] > 1.0
+    assert excess["chart"] > 3 * excess["memoryless"]
+
+
+def test_actions_explain_what_observations_cannot(chart, chart_a):
+    assert chart_a.residual_scale_[2] < 0.4 * chart.residual_scale_[2]
+
+
+def test_only_mewma_a_depends_on_actions(chart, chart_a):
+    x = episode(5)
+    pushed = Trajectory(x.observations, x.actions + 1)
+    np.testing.assert_array_equal(chart.score(x), chart.score(pushed))
+    assert not np.array_equal(chart_a.score(x)[1:], chart_a.score(pushed)[1:])
+
+
+def test_residuals_are_clipped_on_both_sides(chart):
+    x = episode(5)
+    scores = [chart.score(shifted(x, 79, by))[-1] for by in (1e3, 1e6)]
+    assert scores[0] == scores[1]
+    assert chart.score(shifted(x, 79, -1e3))[-1] == chart.score(shifted(x, 79, -1e6))[-1]
+
+
+def test_constant_sensor_gives_no_residual_and_its_change_is_seen(chart):
+    assert chart.observation_scale_[1][3] == 1.0
+    assert chart.residual_scale_[3] == 1.0
+    x = episode(5)
+    rows = x.observations.copy()
+    rows[50:, 3] = 0.0
+    assert chart.score(Trajectory(rows, x.actions))[55] > np.nanmax(chart.score(x)) + 1
+
+
+def test_world_without_motion_scores_zero():
+    still = [Trajectory(np.ones((9, 2)), np.zeros((8, 1)))] * 3
+    scores = make_mewma().fit(still).score(still[0])
+    np.testing.assert_allclose(scores[1:], 0.0, atol=1e-6)
+
+
+def test_refit_forgets(chart):
+    other = [Trajectory(5 - 3 * x.observations, x.actions) for x in NOMINAL]
+    refitted = make_mewma().fit(other).fit(NOMINAL)
+    np.testing.assert_array_equal(refitted.score(NOMINAL[0]), chart.score(NOMINAL[0]))
+
+
+def test_nothing_depends_on_seed_or_order_of_scoring(chart):
+    another = make_mewma(seed=3).fit(NOMINAL)
+    first = [chart.score(x) for x in NOMINAL]
+    again = [another.score(x) for x in NOMINAL[::-1]][::-1]
+    np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.parametrize("horizon", [1, 10, 30])
+@pytest.mark.parametrize("n", [1, 2, 3, 25])
+def test_short_trajectories_keep_the_contract(horizon, n):
+    x = episode(3, n=40)[:n]
+    detector = make_mewma_a(horizon=horizon).fit(NOMINAL)
+    scores = check_scores(
+        detector.score(x), x, horizon=horizon, warm_up=0, detector="mewma-a", where="synthetic[0]"
+    )
+    assert np.isnan(scores).sum() == min(n, horizon)
+    assert not scores[horizon : horizon + 2].any()
+
+
+def test_short_training_trajectories_are_left_out(chart):
+    with_short = make_mewma().fit([*NOMINAL, episode(0)[:1]])
+    np.testing.assert_array_equal(with_short.score(NOMINAL[0]), chart.score(NOMINAL[0]))
+
+
+def test_scoring_before_fit_is_refused():
+    with pytest.raises(NotFittedError, match="'mewma-a' was asked for scores before fit"):
+        make_mewma_a().score(NOMINAL[0])
+
+
+def test_another_width_is_refused(chart):
+    x = NOMINAL[0]
+    with pytest.raises(TrajectoryError, match=r"fitted on .*\(4, 1\) .* trajectory of \(2, 1\)"):
+        chart.score(Trajectory(x.observations[:, :2], x.actions))
+
+
+@pytest.mark.parametrize(
+    ("nominal", "message"),
+    [
+        ([], "0 trajectories, of which 0 have at least 3 transitions"),
+        (NOMINAL[:1], "1 trajectories, of which 1 have"),
+        ([x[:1] for x in NOMINAL], "12 trajectories, of which 0 have"),
+        ([NOMINAL[0], Trajectory(np.zeros((9, 2)), np.zeros((8, 1)))], r"\[\(2, 1\), \(4, 1\)\]"),
+    ],
+)
+def test_unusable_training_data_are_refused(nominal, message):
+    with pytest.raises(TrajectoryError, match=message):
+        make_mewma().fit(nominal)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "shown"),
+    [
+        ("horizon", 0, "0"), ("order", 1.5, "1.5"), ("order", True, "True"), ("ridge", 0, "0"),
+        ("ridge", "small", "'small'"), ("clip", -1.0, "-1.0"), ("clip", float("nan"), "nan"),
+        ("shrinkage", 1.5, "1.5"), ("weights", [], r"\[\]"), ("weights", 0.1, "0.1"),
+        ("weights", "0.1", "'0.1'"), ("weights", [0.1, 2], "2"),
+    ],
+)  # fmt: skip
+def test_wrong_parameters_are_named(parameter, value, shown):
+    message = rf"parameter {parameter} of detector 'mewma'.* got {shown}$"
+    with pytest.raises(UsageError, match=message):
+        make_mewma(**{parameter: value})
+
+
+def test_offers_declare_the_defaults_of_the_detector():
+    specs = {spec.name: spec for spec in oodd_detectors()}
+    assert specs["mewma"].inputs == "observations"
+    assert specs["mewma-a"].inputs == "observations+actions"
+    for spec in specs.values():
+        default = spec.factory()
+        detector = spec.factory(seed=0, horizon=1, **spec.parameters)
+        assert detector.actions is default.actions is (spec.name == "mewma-a")
+        for name, value in spec.parameters.items():
+            wanted = tuple(value) if name == "weights" else value
+            assert getattr(detector, name) == getattr(default, name) == wanted
+
+
+def test_scoring_needs_numpy_alone():
+    code = (
+        "import sys\nimport numpy as np\n"
+        "from oodd_mewma import make_mewma\nfrom oodd_eval import Trajectory\n"
+        "x = Trajectory(np.random.default_rng(0).normal(size=(9, 2)), np.zeros((8, 1)))\n"
+        "make_mewma().fit([x, x]).score(x)\n"
+        "sys.exit(bool({'sklearn', 'scipy', 'torch'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,210 @@
+"""The random forests: forecasts, score and causality against slow, obvious forms of them."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from oodd_eval import Trajectory
+from oodd_eval.detector import check_scores
+from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+
+pytest.importorskip("sklearn")
+from oodd_rf import make_rf, oodd_detectors
+from oodd_rf.windows import Rows
+
+SMALL = {"members": 3, "trees": 4, "leaves": 60, "rows": 400, "draws": 200}
+
+
+def episode(seed, n=60, d=3):
+    """Phases that differ between episodes: sines are predictable from one window to the next."""
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0, 6.28, d)
+    rows = np.sin(phase + 0.3 * np.arange(n)[:, None]) + 0.02 * rng.normal(size=(n, d))
+    return Trajectory(rows * [1.0, 10.0, 0.1][:d], np.zeros((n - 1, 1)))
+
+
+NOMINAL = [episode(seed) for seed in range(8)]
+
+
+def fitted(**changes):
+    return make_rf(**{**SMALL, **changes}).fit(NOMINAL)
+
+
+@pytest.fixture(scope="module")
+def rf():
+    return fitted()
+
+
+def test_windows_repeat_the_first_observation_of_their_own_trajectory():
+    rows = Rows.stack(
+        [Trajectory([[1.0], [2.0]], [[0.0]]), Trajectory([[3.0], [4.0]], [[0.0]])],
+        np.zeros(1), np.ones(1),
+    )  # fmt: skip
+    windows = rows.window(np.array([0, 1, 2, 3]), 3)[..., 0]
+    assert windows.tolist() == [[1, 1, 1], [2, 1, 1], [3, 3, 3], [4, 3, 3]]
+    assert rows.with_history(1).tolist() == [1, 3]
+    assert rows.with_history(2).tolist() == []
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_scores_are_those_of_a_slow_loop(horizon):
+    rf = fitted(horizon=horizon)
+    x = episode(90, n=12)
+    z = (x.observations.astype(np.float64) - rf.mean_) / rf.std_
+    expected = np.full(len(x), np.nan)
+    for t in range(horizon, len(x)):
+        errors = []
+        for member in rf.members_:
+            known = list(z[: t - horizon + 1])
+            for _ in range(horizon):
+                window = [known[max(len(known) - 1 - lag, 0)] for lag in range(member.window)]
+                features = np.concatenate(window)[None].astype(np.float32)
+                trees = [tree.predict(features)[0] for tree in member.forest.estimators_]
+                known.append(known[-1] + np.mean(trees, axis=0))
+            errors.append(np.mean(np.abs(z[t] - known[t])))
+        expected[t] = np.mean(errors)
+    np.testing.assert_allclose(rf.score(x), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_score_is_the_mean_distance_in_standard_deviations():
+    """Forests of a motionless world predict no motion, so the score is the size of the step."""
+    still = [Trajectory([[v, 0.0]] * 5, np.zeros((4, 1))) for v in (-1.0, 1.0)]
+    rf = make_rf(**SMALL).fit(still)
+    x = Trajectory([[1.0, 0.0], [1.5, 0.25], [1.5, 0.25]], np.zeros((2, 1)))
+    # Standard deviations 1 and, for the constant sensor, 1: (0.5 + 0.25) / 2.
+    np.testing.assert_array_equal(rf.score(x), [np.nan, 0.375, 0.0])
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_scores_of_a_prefix_are_the_prefix_of_the_scores(horizon):
+    rf = fitted(horizon=horizon)
+    whole = rf.score(NOMINAL[0])
+    for n in range(1, len(whole) + 1):
+        np.testing.assert_array_equal(rf.score(NOMINAL[0][:n]), whole[:n])
+
+
+def test_scores_in_many_batches_are_those_of_one_trajectory(rf, monkeypatch):
+    monkeypatch.setattr("oodd_rf.detector.BATCH", 7)
+    trajectories = [episode(1), episode(2, n=1), episode(3, n=5)]
+    many = rf.score_many(trajectories)
+    monkeypatch.undo()
+    for x, scores in zip(trajectories, many, strict=True):
+        np.testing.assert_array_equal(scores, rf.score(x))
+
+
+def test_order_of_scoring_does_not_matter(rf):
+    first = [rf.score(x) for x in NOMINAL]
+    again = [rf.score(x) for x in NOMINAL[::-1]][::-1]
+    np.testing.assert_array_equal(first, again)
+    assert rf.score_many([]) == []
+
+
+def test_same_seed_gives_the_same_bits_and_another_seed_does_not(rf):
+    np.testing.assert_array_equal(rf.score(NOMINAL[0]), fitted().score(NOMINAL[0]))
+    assert not np.array_equal(rf.score(NOMINAL[0])[1:], fitted(seed=1).score(NOMINAL[0])[1:])
+
+
+def test_members_differ_in_seed_window_and_settings(rf):
+    members = fitted(members=6).members_
+    assert [m.window for m in members] == [4, 3, 2, 1, 4, 3]
+    forests = [m.forest for m in members]
+    assert len({f.random_state for f in forests}) == 6
+    assert len({(f.max_features, f.min_samples_leaf) for f in forests}) == 5
+
+
+def test_refit_forgets():
+    other = [Trajectory(5 - 3 * x.observations, x.actions) for x in NOMINAL]
+    refitted = make_rf(**SMALL).fit(other).fit(NOMINAL)
+    np.testing.assert_array_equal(refitted.score(NOMINAL[0]), fitted().score(NOMINAL[0]))
+
+
+def test_gross_anomaly_scores_higher(rf):
+    rows = episode(50).observations.copy()
+    before = rf.score(episode(50))
+    rows[30:] += 5 * rf.std_ * np.where(np.arange(30) % 2, 1, -1)[:, None]
+    after = rf.score(Trajectory(rows, np.zeros((59, 1))))
+    np.testing.assert_array_equal(after[:30], before[:30])
+    assert after[30:].min() > 3 * np.nanmax(before)
+
+
+def test_forecasts_beat_persistence_on_held_out_trajectories():
+    rf = make_rf(members=3).fit([episode(seed) for seed in range(100, 140)])
+    x = episode(60)
+    moved = np.abs(np.diff(x.observations / rf.std_, axis=0)).mean()
+    assert np.nanmean(rf.score(x)) < 0.5 * moved
+
+
+@pytest.mark.parametrize("horizon", [1, 10, 30])
+@pytest.mark.parametrize("n", [1, 2, 3, 25])
+def test_short_trajectories_keep_the_contract(horizon, n):
+    rf = fitted(horizon=horizon)
+    x = episode(3, n=n)
+    scores = check_scores(
+        rf.score(x), x, horizon=horizon, warm_up=0, detector="rf", where="synthetic[0]"
+    )
+    assert np.isnan(scores).sum() == min(n, horizon)
+
+
+def test_single_sensor_fits():
+    rf = make_rf(**SMALL).fit([episode(seed, d=1) for seed in range(3)])
+    assert np.isfinite(rf.score(episode(4, d=1))[1:]).all()
+
+
+def test_size_of_training_and_trees_is_bounded():
+    rf = make_rf(members=1, trees=2, leaves=8, rows=30, draws=20).fit(NOMINAL)
+    for tree in rf.members_[0].forest.estimators_:
+        assert tree.tree_.n_leaves <= 8
+        assert tree.tree_.weighted_n_node_samples[0] == 20
+    assert rf.members_[0].forest._n_samples == 30
+
+
+def test_scoring_before_fit_is_refused():
+    with pytest.raises(NotFittedError, match="'rf' was asked for scores before fit"):
+        make_rf().score(NOMINAL[0])
+
+
+def test_another_number_of_sensors_is_refused(rf):
+    with pytest.raises(TrajectoryError, match=r"fitted on 3 sensors .* trajectory of 2"):
+        rf.score(episode(0, d=2))
+
+
+@pytest.mark.parametrize(
+    ("nominal", "message"),
+    [
+        ([], "0 trajectories with 0 transitions"),
+        ([episode(0, n=1)], "1 trajectories with 0 transitions"),
+        ([episode(0), episode(0, d=2)], r"\[2, 3\] sensors"),
+    ],
+)
+def test_unusable_training_data_are_refused(nominal, message):
+    with pytest.raises(TrajectoryError, match=message):
+        make_rf().fit(nominal)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [("window", 0), ("members", -1), ("trees", 1.5), ("leaves", 1), ("rows", "many"),
+     ("draws", True), ("horizon", 0), ("seed", -1)],
+)  # fmt: skip
+def test_wrong_parameters_are_named(parameter, value):
+    with pytest.raises(UsageError, match=rf"parameter {parameter} of detector 'rf'.*{value!r}"):
+        make_rf(**{parameter: value})
+
+
+def test_offer_declares_the_defaults_of_the_detector():
+    (spec,) = oodd_detectors()
+    default, detector = make_rf(), spec.factory(seed=0, horizon=1, **spec.parameters)
+    assert (spec.name, spec.requires) == ("rf", ("sklearn",))
+    for name, value in spec.parameters.items():
+        assert getattr(detector, name) == getattr(default, name) == value
+
+
+def test_offering_and_making_import_no_sklearn():
+    code = (
+        "import sys, oodd_rf\n"
+        "oodd_rf.oodd_detectors()[0].factory(seed=0, horizon=1)\n"
+        "sys.exit('sklearn' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
