@@ -196,10 +196,8 @@ def findings(board: Board) -> list[str]:
 def notes(board: Board) -> list[str]:
     """Return what has to stand below the tables of a board."""
     seeds = ", ".join(map(str, board.test_seeds()))
-    lines = [
-        f"Split {board.split}, digest {board.digest[:12]}, protocol {board.protocol}, "
-        f"test seeds per environment: {seeds}."
-    ]
+    facts = f"digest {board.digest[:12]}, protocol {board.protocol}"
+    lines = [f"Split {board.split}, {facts}, test seeds per environment: {seeds}."]
     if board.limit is not None:
         lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
     for group in GROUPS:

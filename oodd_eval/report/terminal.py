@@ -167,13 +167,14 @@ def summary(records: Sequence[Record]) -> str:
 
 def _set(table: Table) -> str:
     align = ("left", *["right"] * (len(table.header) - 1))
-    return tabulate(
+    text: str = tabulate(
         table.rows,
         headers=table.header,
         tablefmt="simple",
         colalign=align if table.rows else None,
         disable_numparse=True,
     )
+    return text
 
 
 def _width(text: str) -> int:

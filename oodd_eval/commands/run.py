@@ -1,0 +1,98 @@
+"""``oodd-eval run``: plan, run, report."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from oodd_eval.benchmark import ANOMALIES
+from oodd_eval.commands.discovery import discovered, report_broken
+from oodd_eval.errors import UsageError
+from oodd_eval.isolation import Limits
+from oodd_eval.plan import Plan, make_plan
+from oodd_eval.plugins import Plugins
+from oodd_eval.report import markdown
+from oodd_eval.report.terminal import TerminalReporter, make_console
+from oodd_eval.results import ResultsDirectory
+from oodd_eval.runner import Run, Settings, available_cores
+from oodd_eval.runner import run as carry_out
+from oodd_eval.selection import expression, memory_bytes, seconds, select, whole_numbers
+from oodd_eval.splits import Split, load_split
+
+
+def run(options: argparse.Namespace) -> int:
+    """Carry out ``oodd-eval run`` and return its exit code."""
+    plugins = discovered(options.plugins)
+    report_broken(plugins)
+    settings = _settings(options)
+    split = load_split(options.split)
+    plan = _plan(options, plugins, split)
+    if not plan.cells:
+        print(f"oodd-eval: no cell matches -k {options.expression!r}", file=sys.stderr)  # noqa: T201
+        return 5
+    console = make_console()
+    if options.collect_only:
+        if options.verbosity >= 0:
+            console.print("\n".join(plan.cells))
+        console.print(f"{len(plan.cells)} cells in {len(plan.units)} fits")
+        return 0
+    results = ResultsDirectory(options.output)
+    reporter = TerminalReporter(console, verbosity=options.verbosity, intervals=options.intervals)
+    plugins.observe(reporter, "terminal")
+    done = carry_out(plan, split, plugins, settings, results)
+    if done.records:
+        report = markdown.render(results.records(), intervals=options.intervals)
+        path = results.write_report(report)
+        if options.verbosity >= 0:
+            console.print(f"results in {results.path}, tables in {path}")
+    return _exit_code(done, plugins)
+
+
+def _exit_code(done: Run, plugins: Plugins) -> int:
+    if done.interrupted:
+        return 2
+    return int(bool(plugins.broken) or not all(record.ok for record in done.records))
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    for name in ("jobs", "limit"):
+        if getattr(options, name) is not None and getattr(options, name) < 1:
+            raise UsageError(f"--{name} is {getattr(options, name)}, expected at least 1")
+    return Settings(
+        jobs=options.jobs or available_cores(),
+        limits=Limits(seconds(options.timeout), memory_bytes(options.memory)),
+        fresh=options.fresh,
+        stop_on_failure=options.stop,
+    )
+
+
+def _plan(options: argparse.Namespace, plugins: Plugins, split: Split) -> Plan:
+    plan = make_plan(
+        plugins,
+        split=split.name,
+        split_digest=split.digest,
+        detectors=select("detector", options.detector, plugins.offers),
+        environments=select("environment", options.env, split.environments),
+        anomalies=select("anomaly", options.anomaly, ANOMALIES),
+        horizons=whole_numbers("--horizon", options.horizon, least=1),
+        seeds=whole_numbers("--seed", options.seed, least=0),
+        parameters=_parameters(options.param),
+        limit=options.limit,
+    )
+    return plan.matching(expression(options.expression)) if options.expression else plan
+
+
+def _parameters(given: Sequence[str]) -> dict[str, Any]:
+    parameters = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise UsageError(f"--param {text!r}, expected NAME=VALUE")
+        try:
+            parameters[name] = json.loads(value)
+        except json.JSONDecodeError:
+            parameters[name] = value
+    return parameters
