@@ -98,8 +98,8 @@ def _add_run(commands: _Commands[Parser]) -> None:
     run = _command(commands, "run", "run:run", "fit and score every selected cell", plugins=True)
     add = run.add_argument
     names = "names separated by commas, globs, or 'all'"
-    add("--detector", required=True, metavar="NAMES", help=names)
-    add("--env", required=True, metavar="NAMES", help=names)
+    add("--detector", metavar="NAMES", help=f"{names} (required)")
+    add("--env", metavar="NAMES", help=f"{names} (required)")
     add("--anomaly", default="all", metavar="NAMES", help=f"{names} (default: all)")
     add("--split", default="mini", help="name or path of a split (default: mini)")
     add("--horizon", default="1", metavar="N,...", help="prediction horizons (default: 1)")

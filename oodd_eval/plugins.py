@@ -21,7 +21,7 @@ import pluggy
 from oodd_eval import hookspecs, trivial
 from oodd_eval._version import __version__
 from oodd_eval.detector import DetectorSpec
-from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError
+from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
 
 BUILT_IN: Final = "trivial"
 """Name of the plug-in that is part of the harness."""
@@ -269,8 +269,30 @@ def resolve_parameters(spec: DetectorSpec, given: Mapping[str, Any]) -> dict[str
     ------
     UnknownNameError
         When `given` names a parameter that the detector does not declare.
+    UsageError
+        When a value is of another kind than a default that is a number, a text or a truth value.
     """
-    for name in given:
+    for name, value in given.items():
         if name not in spec.parameters:
             raise UnknownNameError(f"parameter of {spec.name}", name, spec.parameters)
+        default = spec.parameters[name]
+        kind = _kind(default)
+        if kind and _kind(value) != kind:
+            raise UsageError(
+                f"parameter {name!r} of {spec.name} is {value!r}, expected {kind} like its "
+                f"default {default!r}"
+            )
     return dict(sorted({**spec.parameters, **given}.items()))
+
+
+def _kind(value: object) -> str:
+    """Return what sort of plain value this is; empty for None, lists and everything else."""
+    match value:
+        case bool():
+            return "true or false"
+        case int() | float():
+            return "a number"
+        case str():
+            return "a text"
+        case _:
+            return ""

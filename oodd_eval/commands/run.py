@@ -25,9 +25,9 @@ from oodd_eval.splits import Split, load_split
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval run`` and return its exit code."""
+    settings = _settings(options)
     plugins = discovered(options.plugins)
     report_broken(plugins)
-    settings = _settings(options)
     split = load_split(options.split)
     plan = _plan(options, plugins, split)
     if not plan.cells:
@@ -58,6 +58,9 @@ def _exit_code(done: Run, plugins: Plugins) -> int:
 
 
 def _settings(options: argparse.Namespace) -> Settings:
+    for name in ("detector", "env"):
+        if getattr(options, name) is None:
+            raise UsageError(f"--{name} is missing, on the command line and in --config")
     for name in ("jobs", "limit"):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise UsageError(f"--{name} is {getattr(options, name)}, expected at least 1")

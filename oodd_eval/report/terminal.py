@@ -115,7 +115,7 @@ class TerminalReporter:
         for board in boards(records):
             for record in board.failures():
                 name = f"{record.environment}/{record.cell.partition('::')[2]}"
-                self._print(f"{record.status.upper()} {name}: {record.reason}", "red")
+                self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
 
     def table(self, table: Table) -> None:
         """Print one table, turned by 90 degrees if it is too wide only the way it is."""
@@ -136,9 +136,9 @@ class TerminalReporter:
                         tables.anomaly_groups(board, horizon, [group], intervals=self.intervals)
                     )
         for sentence in tables.findings(board):
-            self._print(sentence, "yellow")
+            self._prose(sentence, "yellow")
         for line in tables.notes(board):
-            self._print(line, "dim")
+            self._prose(line, "dim")
         self._print("")
 
     def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
@@ -154,6 +154,10 @@ class TerminalReporter:
             elif spent == spent:  # noqa: PLR0124
                 parts.append(f"{spent:.1f} s")
         self._print("  ".join(parts), _COLOURS.get(last.status, "red"))
+
+    def _prose(self, text: str, style: str) -> None:
+        """Print a sentence, wrapped between words."""
+        self.console.print(text, style=style, soft_wrap=False)
 
     def _print(self, text: str, style: str = "") -> None:
         self.console.print(text, style=style or None)
