@@ -1,0 +1,8 @@
+"""What the recurrent reference detectors share: network, training, forecasting, the detector.
+
+Importing this package imports torch; plug-in modules do so inside their factories only.
+"""
+
+from oodd_torch.detector import ForecastDetector, Settings
+
+__all__ = ["ForecastDetector", "Settings"]

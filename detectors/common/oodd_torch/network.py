@@ -1,0 +1,151 @@
+"""An ensemble of forecasting networks as one set of batched matrix products.
+
+Letters in shape comments: E members, B trajectories, T steps, D sensors, N quantile levels,
+H = 64 units, W window.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from oodd_eval.prediction import GRID
+
+
+@dataclass(frozen=True, slots=True)
+class Architecture:
+    """What the members look like.
+
+    Attributes
+    ----------
+    features
+        Sensors, D.
+    window
+        Observations in the input, W: 1 with memory.
+    recurrent
+        Whether a GRU stands between the first and the second layer.
+    quantiles
+        Whether the output is a quantile function rather than one value.
+    units, cosines
+        Width of every layer, and of the cosine embedding.
+    """
+
+    features: int
+    window: int = 1
+    recurrent: bool = True
+    quantiles: bool = True
+    units: int = 64
+    cosines: int = 64
+
+
+class Ensemble(torch.nn.Module):
+    """E networks of the paper's appendix B side by side.
+
+    ``f = relu(x W1 + b1)``, ``g = GRU(f)``, ``z = relu(g W2 + b2) + f`` (the skip connection),
+    ``phi(tau) = relu(cos(pi i tau) C + c)``, and for sensor d
+    ``q_d(tau) = o_d + (z * phi(tau)) v_d + u_d``: the output is the difference from the newest
+    observation, so that an untrained network predicts no change. Without memory ``g = f``; without
+    quantiles ``phi = 1``.
+    """
+
+    def __init__(self, architecture: Architecture, generators: list[torch.Generator]) -> None:
+        super().__init__()
+        a = self.architecture = architecture
+        h, d = a.units, a.features
+
+        def weight(rows: int, columns: int, fan_in: int | None = None) -> torch.nn.Parameter:
+            bound = 1 / math.sqrt(fan_in or rows)
+            drawn = [
+                torch.empty(rows, columns).uniform_(-bound, bound, generator=g) for g in generators
+            ]
+            return torch.nn.Parameter(torch.stack(drawn))
+
+        def zeros(rows: int, columns: int) -> torch.nn.Parameter:
+            return torch.nn.Parameter(torch.zeros(len(generators), rows, columns))
+
+        self.first, self.first_bias = weight(a.window * d, h), weight(1, h, a.window * d)
+        if a.recurrent:
+            # Gates in the order reset, update, candidate.
+            self.gru_in, self.gru_in_bias = weight(h, 3 * h), weight(1, 3 * h, h)
+            self.gru, self.gru_bias = weight(h, 3 * h), weight(1, 3 * h, h)
+        self.second, self.second_bias = weight(h, h), weight(1, h, h)
+        if a.quantiles:
+            self.cosine, self.cosine_bias = weight(a.cosines, h), weight(1, h, a.cosines)
+        self.out, self.out_bias = zeros(h, d), zeros(1, d)
+
+    @property
+    def members(self) -> int:
+        """Number of networks, E."""
+        return len(self.first)
+
+    def start(self, rows: int) -> Tensor:
+        """Return the memory before the first observation: zeros of shape (E, rows, H)."""
+        return torch.zeros(self.members, rows, self.architecture.units)
+
+    def inputs(self, x: Tensor) -> Tensor:
+        """First layer: (E, B, W * D) to (E, B, H)."""
+        return torch.relu(torch.baddbmm(self.first_bias, x, self.first))
+
+    def step(self, f: Tensor, memory: Tensor) -> Tensor:
+        """One step of the GRU: (E, B, H) and (E, B, H) to the new memory (E, B, H)."""
+        return self.gate(torch.baddbmm(self.gru_in_bias, f, self.gru_in), memory)
+
+    def gate(self, projected: Tensor, memory: Tensor) -> Tensor:
+        """One step of the GRU from the projected input (E, B, 3H)."""
+        h = self.architecture.units
+        recurrent = torch.baddbmm(self.gru_bias, memory, self.gru)  # (E, B, 3H)
+        opened = torch.sigmoid(projected[..., : 2 * h] + recurrent[..., : 2 * h])
+        reset, update = opened[..., :h], opened[..., h:]
+        candidate = torch.tanh(
+            torch.addcmul(projected[..., 2 * h :], reset, recurrent[..., 2 * h :])
+        )
+        return torch.lerp(candidate, memory, update)
+
+    def run(self, f: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """GRU over time: (E, T, B, H) to memories (E, T, B, H) and the last one (E, B, H)."""
+        e, t, b, h = f.shape
+        projected = torch.baddbmm(self.gru_in_bias, f.reshape(e, t * b, h), self.gru_in)
+        outputs = []
+        for now in projected.reshape(e, t, b, 3 * h).unbind(1):
+            memory = self.gate(now, memory)
+            outputs.append(memory)
+        return torch.stack(outputs, dim=1), memory
+
+    def trunk(self, f: Tensor, g: Tensor) -> Tensor:
+        """Second layer and skip connection: (E, B, H) and (E, B, H) to (E, B, H)."""
+        return torch.relu(torch.baddbmm(self.second_bias, g, self.second)) + f
+
+    def embedding(self, tau: Tensor) -> Tensor:
+        """Cosine embedding of quantile levels: (E, N) to (E, N, H)."""
+        i = torch.arange(self.architecture.cosines, dtype=tau.dtype)
+        cosines = torch.cos(math.pi * i * tau[..., None])  # (E, N, cosines)
+        return torch.relu(torch.baddbmm(self.cosine_bias, cosines, self.cosine))
+
+    def table(self) -> Tensor:
+        """Embeddings of the whole grid of levels: (E, GRID, H)."""
+        tau = (torch.arange(GRID, dtype=torch.float32) + 0.5) / GRID
+        return self.embedding(tau.expand(self.members, -1))
+
+    def heads_at(self, tau: Tensor) -> Tensor:
+        """Output layers at levels (E, N) that all sensors share: (E, 1, H, N * D)."""
+        phi = self.embedding(tau)[:, None, :, None]  # (E, 1, N, 1, H)
+        return self._fold(phi)
+
+    def heads_from(self, index: Tensor, table: Tensor) -> Tensor:
+        """Output layers at grid levels per time and sensor: (E, G, N, D) to (E, G, H, N * D)."""
+        e, g, n, d = index.shape
+        flat = index.reshape(e, -1)
+        phi = torch.stack([table[i][flat[i]] for i in range(e)])
+        return self._fold(phi.reshape(e, g, n, d, -1))
+
+    def _fold(self, phi: Tensor) -> Tensor:
+        """Fold embeddings (E, G, N, D or 1, H) into the output layer.
+
+        ``(z * phi) v_d`` is ``z (phi * v_d)``, so that the outputs of all trajectories at the
+        levels of a time are one matrix product.
+        """
+        folded = phi * self.out.transpose(1, 2)[:, None, None]  # (E, G, N, D, H)
+        return folded.flatten(2, 3).transpose(2, 3)

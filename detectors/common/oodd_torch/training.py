@@ -1,0 +1,310 @@
+"""Training of an ensemble: truncated gradients through time, early stopping per member.
+
+Episodes are passed in chunks of consecutive steps; the memory is carried from chunk to chunk, its
+gradient is not. Members are independent networks: each has its own order of episodes, learning
+rate and stopping point, and they are trained side by side only because one batched matrix product
+is quicker than five small ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from oodd_eval.prediction import GRID
+from oodd_torch.network import Ensemble
+
+BETAS: Final = (0.9, 0.999)
+EPSILON: Final = 1e-8
+CLIP: Final = 1.0
+"""Largest norm of one member's gradient."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How long and how a training goes.
+
+    Attributes
+    ----------
+    updates
+        Gradient steps of every member, at most.
+    batch
+        Episodes in a batch.
+    chunk
+        Steps through which gradients flow.
+    levels
+        Quantile levels of an update.
+    rates
+        Largest learning rate of each member; warmed up and decayed to a hundredth by a cosine.
+    scheduled_sampling
+        Share of inputs replaced by samples at the end of training; rises linearly from 0.
+    evaluations
+        How often the loss on held-out episodes is looked at.
+    patience
+        Evaluations without a better held-out loss, after which training stops.
+    """
+
+    updates: int
+    batch: int
+    chunk: int
+    levels: int
+    rates: tuple[float, ...]
+    scheduled_sampling: float = 0.0
+    evaluations: int = 20
+    patience: int = 6
+
+
+def quantile_huber(error: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
+    """Quantile Huber loss of Dabney et al. (2018), elementwise.
+
+    ``rho = |tau - [u < 0]| L(u) / kappa``, ``L(u) = u^2 / 2`` for ``|u| <= kappa``, else
+    ``kappa (|u| - kappa / 2)``, with ``u = target - prediction`` and the level that was sampled.
+
+    Parameters
+    ----------
+    error : tensor
+        ``u``, target minus prediction.
+    tau : tensor
+        Level at which each prediction was made, broadcast against `error`.
+    """
+    size = error.abs()
+    huber = torch.where(size <= kappa, 0.5 * error * error, kappa * (size - 0.5 * kappa))
+    return torch.abs(tau - (error < 0).to(error.dtype)) * huber / kappa
+
+
+class Adam:
+    """Adam (Kingma & Ba 2015) with a learning rate and a gradient clip per member."""
+
+    def __init__(self, parameters: Sequence[Tensor]) -> None:
+        self.parameters = list(parameters)
+        self.mean = [torch.zeros_like(p) for p in self.parameters]
+        self.square = [torch.zeros_like(p) for p in self.parameters]
+        self.count = 0
+
+    @torch.no_grad()
+    def step(self, rates: Tensor) -> None:
+        """Take one step; `rates` has shape (E,)."""
+        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self.parameters]
+        norm = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()  # (E,)
+        shrink = (CLIP / norm.clamp(min=CLIP))[:, None, None]
+        self.count += 1
+        correction = (1 - BETAS[1] ** self.count) ** 0.5 / (1 - BETAS[0] ** self.count)
+        for p, g, m, v in zip(self.parameters, gradients, self.mean, self.square, strict=True):
+            clipped = g * shrink
+            m.lerp_(clipped, 1 - BETAS[0])
+            v.mul_(BETAS[1]).addcmul_(clipped, clipped, value=1 - BETAS[1])
+            p.sub_(rates[:, None, None] * correction * m / (v.sqrt() + EPSILON))
+            p.grad = None
+
+
+class Batches:
+    """Chunks of episodes for every member, memory carried along.
+
+    Parameters
+    ----------
+    episodes : list of float32 arrays of shape (T + 1, D)
+        Standardized observations.
+    rngs
+        One generator per member, for its order of episodes.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[NDArray[np.float32]],
+        rngs: Sequence[np.random.Generator],
+        window: int,
+        schedule: Schedule,
+    ) -> None:
+        self.episodes = [e for e in episodes if len(e) > 1]
+        self.rngs, self.window, self.schedule = rngs, window, schedule
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
+        """Yield inputs (E, T, B, W * D), targets (E, T, B, D), mask (E, T, B), whether new."""
+        size = min(self.schedule.batch, len(self.episodes))
+        while True:
+            orders = np.stack([rng.permutation(len(self.episodes)) for rng in self.rngs])
+            for start in range(0, len(self.episodes) - size + 1, size):
+                yield from self._chunks(orders[:, start : start + size])
+
+    def _chunks(self, chosen: NDArray[np.int64]) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
+        picked = [[self.episodes[i] for i in row] for row in chosen]
+        x, y, mask = arrange(picked, self.window)
+        for start in range(0, x.shape[1], self.schedule.chunk):
+            part = slice(start, start + self.schedule.chunk)
+            if mask[:, part].any():
+                yield x[:, part], y[:, part], mask[:, part], start == 0
+
+
+def arrange(
+    picked: Sequence[Sequence[NDArray[np.float32]]], window: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Lay out episodes of every member: inputs, targets and mask, time before batch.
+
+    Inputs hold the newest observation first; windows that reach before an episode's beginning
+    repeat its first observation.
+    """
+    members, size = len(picked), len(picked[0])
+    longest = max(len(e) for row in picked for e in row) - 1
+    d = picked[0][0].shape[1]
+    x = np.zeros((members, longest, size, window * d), np.float32)
+    y = np.zeros((members, longest, size, d), np.float32)
+    mask = np.zeros((members, longest, size), dtype=bool)
+    for e, row in enumerate(picked):
+        for b, episode in enumerate(row):
+            steps = len(episode) - 1
+            lags = np.maximum(np.arange(steps)[:, None] - np.arange(window), 0)
+            x[e, :steps, b] = episode[lags].reshape(steps, -1)
+            y[e, :steps, b] = episode[1:]
+            mask[e, :steps, b] = True
+    return torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(mask)
+
+
+def predict(
+    network: Ensemble, x: Tensor, memory: Tensor, heads: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """One pass over a chunk: predictions (E, T, B, N, D) of the next rows, and the last memory.
+
+    Parameters
+    ----------
+    x : (E, T, B, W * D)
+    memory : (E, B, H)
+    heads : (E, G, H, N * D)
+        Output layers at N levels, see `Ensemble.heads`: G = T for levels of every step, G = 1 for
+        levels that all steps share. None without quantiles.
+    """
+    e, t, b, _ = x.shape
+    d, h = network.architecture.features, network.architecture.units
+    f = network.inputs(x.reshape(e, t * b, -1))
+    g = f
+    if network.architecture.recurrent:
+        g, memory = network.run(f.reshape(e, t, b, h), memory)
+        g = g.reshape(e, t * b, h)
+    z = network.trunk(f, g)  # (E, T * B, H)
+    if heads is None:
+        change = torch.bmm(z, network.out)
+    else:
+        change = torch.matmul(z.reshape(e, heads.shape[1], -1, h), heads)
+    change = change.reshape(e, t, b, -1, d)
+    return x[..., None, :d] + change + network.out_bias[:, None, None], memory
+
+
+def loss_of(
+    network: Ensemble, x: Tensor, y: Tensor, mask: Tensor, memory: Tensor, tau: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Mean loss of every member (E,) over masked steps, levels and sensors; and the last memory.
+
+    ``tau`` (E, N) holds the levels of this update, shared by all steps, episodes and sensors: the
+    loss is a mean over them, and this way their embeddings cost next to nothing.
+    """
+    heads = None if tau is None else network.heads_at(tau)
+    predicted, memory = predict(network, x, memory, heads)
+    error = y[..., None, :] - predicted  # (E, T, B, N, D)
+    if tau is None:
+        each = 0.5 * error.square()
+    else:
+        each = quantile_huber(error, tau[:, None, None, :, None])
+    per_step = each.mean((3, 4))  # (E, T, B)
+    return (per_step * mask).sum((1, 2)) / mask.sum((1, 2)).clamp(min=1), memory
+
+
+def train(
+    network: Ensemble,
+    episodes: Sequence[NDArray[np.float32]],
+    held_out: Sequence[NDArray[np.float32]],
+    schedule: Schedule,
+    rngs: Sequence[np.random.Generator],
+) -> list[list[float]]:
+    """Train all members in place; each ends at its own best held-out loss.
+
+    Returns
+    -------
+    Held-out losses, one list of E values per evaluation.
+    """
+    a = network.architecture
+    optimiser = Adam(list(network.parameters()))
+    rates = torch.tensor(schedule.rates)
+    every = max(1, schedule.updates // schedule.evaluations)
+    best = torch.full((network.members,), torch.inf)
+    kept = [p.detach().clone() for p in network.parameters()]
+    history: list[list[float]] = []
+    stale, memory = 0, torch.zeros(0)
+    batches = iter(Batches(episodes, rngs, a.window, schedule))
+    for update in range(1, schedule.updates + 1):
+        x, y, mask, new = next(batches)
+        memory = network.start(x.shape[2]) if new else memory.detach()
+        tau = _stratified(rngs, schedule.levels) if a.quantiles else None
+        done = update / schedule.updates
+        share = schedule.scheduled_sampling * done
+        if share > 0:
+            x = _mix(network, x, memory, share, rngs)
+        losses, memory = loss_of(network, x, y, mask, memory, tau)
+        losses.sum().backward()  # type: ignore[no-untyped-call]
+        warm = min(1.0, update / 20)
+        decay = 0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done))
+        optimiser.step(rates * warm * float(decay))
+        if update % every == 0 or update == schedule.updates:
+            found = evaluate(network, held_out, schedule.levels)
+            history.append(found.tolist())
+            better = found < best
+            best = torch.where(better, found, best)
+            for keep, p in zip(kept, network.parameters(), strict=True):
+                keep[better] = p.detach()[better]
+            stale = 0 if bool(better.any()) else stale + 1
+            if stale >= schedule.patience:
+                break
+    with torch.no_grad():
+        for keep, p in zip(kept, network.parameters(), strict=True):
+            p.copy_(keep)
+    return history
+
+
+@torch.no_grad()
+def evaluate(network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int) -> Tensor:
+    """Return the held-out loss of every member, (E,), at evenly spaced levels."""
+    a = network.architecture
+    x, y, mask = arrange([list(episodes)], a.window)
+    even = ((torch.arange(levels) + 0.5) / levels).expand(network.members, -1)
+    x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
+    mask = mask.expand(network.members, -1, -1)
+    tau = even if a.quantiles else None
+    return loss_of(network, x, y, mask, network.start(x.shape[2]), tau)[0]
+
+
+def _stratified(rngs: Sequence[np.random.Generator], levels: int) -> Tensor:
+    """Draw one level uniformly from each of N equal parts of (0, 1): (E, N)."""
+    drawn = np.stack([(np.arange(levels) + rng.random(levels)) / levels for rng in rngs])
+    return torch.from_numpy(drawn.astype(np.float32))
+
+
+@torch.no_grad()
+def _mix(
+    network: Ensemble,
+    x: Tensor,
+    memory: Tensor,
+    share: float,
+    rngs: Sequence[np.random.Generator],
+) -> Tensor:
+    """Replace a share of the newest inputs by one-step samples: parallel scheduled sampling.
+
+    The samples are those of a pass over the true inputs, so that all steps are drawn at once
+    instead of one after the other.
+    """
+    a = network.architecture
+    heads = None
+    if a.quantiles:
+        shape = (x.shape[1], 1, a.features)
+        drawn = np.stack([rng.integers(GRID, size=shape) for rng in rngs])
+        heads = network.heads_from(torch.from_numpy(drawn), network.table())
+    sampled = predict(network, x, memory, heads)[0][..., 0, :]  # (E, T, B, D), of the next rows
+    replaced = np.stack([rng.random(x.shape[1:3]) < share for rng in rngs])
+    chosen = torch.from_numpy(replaced)[..., None]
+    mixed = x.clone()
+    d = a.features
+    mixed[:, 1:, :, :d] = torch.where(chosen[:, 1:], sampled[:, :-1], x[:, 1:, :, :d])
+    return mixed
