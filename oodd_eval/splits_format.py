@@ -206,6 +206,10 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     missing = {"name", "definition", "generator", "environments", "digest"} - set(manifest)
     if missing:
         raise SplitError(f"{file} lacks {', '.join(sorted(missing))}")
+    for field in ("environments", "definition"):
+        if not isinstance(manifest[field], dict):
+            found = type(manifest[field]).__name__
+            raise SplitError(f"{file}: {field} must be an object, got {found}")
     digests = {
         e: environment_digest(_hashes(file, e, m)) for e, m in manifest["environments"].items()
     }

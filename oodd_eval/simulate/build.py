@@ -15,12 +15,14 @@ import multiprocessing
 import os
 import platform
 import shutil
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +38,7 @@ from oodd_eval.simulate.record import (
 from oodd_eval.splits_format import (
     SCHEMA,
     TWINS,
+    content_digest,
     environment_digest,
     pack_parameters,
     read_manifest,
@@ -92,7 +95,8 @@ def build_split(
     definition
         Sizes, cap and seed base.
     directory
-        Where manifest and files go. Environments that are complete there are kept.
+        Where manifest and files go. Environments that are complete and intact there
+        are kept.
     environments
         Names; default all seven.
     policies
@@ -172,9 +176,18 @@ def _kept(
         e: entry
         for e, entry in manifest["environments"].items()
         if current
-        and (directory / entry["file"]).exists()
         and digests.get(e, entry["policy"]) == entry["policy"]
+        and _intact(directory / entry["file"], entry["groups"])
     }
+
+
+def _intact(file: Path, groups: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Return whether a file holds what its manifest names; a damaged one is built again."""
+    try:
+        with h5py.File(file, "r") as stored:
+            return all(content_digest(stored[g]) == f["sha256"] for g, f in groups.items())
+    except (OSError, KeyError, RuntimeError):
+        return False
 
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
@@ -216,10 +229,11 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
     """Record chunks in worker processes, yielding each when its file is there."""
     if not chunks:
         return
-    # Set for the children only through their own initializer: threads of a matrix library would
-    # fight over the cores, and sums could depend on their number.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_single_thread) as pool:
+    with (
+        _single_threaded_children(),
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=_watch_parent) as pool,
+    ):
         running: dict[Future[None], Chunk] = {}
         queue = iter(chunks)
         try:
@@ -239,9 +253,36 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _single_thread() -> None:
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+@contextlib.contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Let child processes start with one thread per matrix library.
+
+    Their threads would fight over the cores, and sums could depend on their number. The libraries
+    look at the environment when they are loaded, which is before any code of ours runs in a child.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _watch_parent() -> None:
+    """End this worker when the build is killed: it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+
+    def wait_for_parent() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
 def record_chunk(chunk: Chunk, work: Path) -> None:
