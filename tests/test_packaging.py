@@ -62,7 +62,7 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_riqn/py.typed",
         "oodd_eval/data/mini/manifest.json",
     } <= names
-    assert "oodd_eval/simulate/policies/ant.npz" in names
+    assert "oodd_eval/simulate/frozen/ant.npz" in names
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from oodd_eval.benchmark import ENVIRONMENTS, EnvironmentInfo
 from oodd_eval.errors import PolicyError, UnknownNameError
 
-FROZEN: Final = Path(__file__).with_name("policies")
+FROZEN: Final = Path(__file__).with_name("frozen")
 """Where the committed policies lie."""
 
 ACTION_GRID: Final = 2.0**16
