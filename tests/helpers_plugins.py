@@ -1,0 +1,44 @@
+"""Small plug-ins, made where a test wants them: a module and the metadata pip would write."""
+
+import sys
+import textwrap
+
+HEADER = """
+import json, os, signal, subprocess, sys, threading, time
+from pathlib import Path
+import numpy as np
+from oodd_eval import DetectorSpec, hookimpl
+
+
+class Good:
+    def __init__(self, *, seed=0, horizon=1, **parameters):
+        self.parameters = parameters
+    def fit(self, nominal):
+        self.fitted = len(nominal)
+    def score(self, x):
+        return np.abs(x.observations).sum(axis=1).astype(np.float64)
+
+
+def offer(**factories):
+    return [DetectorSpec(k.replace("_", "-"), v, "a test's") for k, v in factories.items()]
+"""
+
+
+def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", header=HEADER):
+    """Put a plug-in of one module ``oodd_<name>`` on the path, under the entry point `name`."""
+    module = f"oodd_{name}"
+    distribution = distribution or f"oodd-{name}"
+    path.mkdir(parents=True, exist_ok=True)
+    (path / f"{module}.py").write_text(header + textwrap.dedent(code))
+    info = path / f"{distribution.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(exist_ok=True)
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
+    )
+    (info / "entry_points.txt").write_text(f"[oodd_eval]\n{name} = {module}\n")
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.syspath_prepend(str(path))
+    # Imported by the test, it must not stay for the next one.
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, module)
+    return path / f"{module}.py"
