@@ -290,7 +290,7 @@ def test_an_edited_manifest_is_noticed(copy):
         manifest["environments"]["hopper"]["groups"]["train"]["sha256"] = "0" * 64
 
     edit_manifest(copy, change)
-    with pytest.raises(SplitError, match="names the digest .* it was edited"):
+    with pytest.raises(SplitError, match=r"names the digest .* it was edited"):
         _ = load_split(copy).digest
 
 
