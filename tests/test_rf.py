@@ -9,6 +9,7 @@ import pytest
 from oodd_eval import Trajectory
 from oodd_eval.detector import check_scores
 from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.prediction import FeatureScale
 
 pytest.importorskip("sklearn")
 from oodd_rf import make_rf, oodd_detectors
@@ -40,7 +41,7 @@ def rf():
 def test_windows_repeat_the_first_observation_of_their_own_trajectory():
     rows = Rows.stack(
         [Trajectory([[1.0], [2.0]], [[0.0]]), Trajectory([[3.0], [4.0]], [[0.0]])],
-        np.zeros(1), np.ones(1),
+        FeatureScale(np.zeros(1), np.ones(1)),
     )  # fmt: skip
     windows = rows.window(np.array([0, 1, 2, 3]), 3)[..., 0]
     assert windows.tolist() == [[1, 1, 1], [2, 1, 1], [3, 3, 3], [4, 3, 3]]
@@ -52,7 +53,7 @@ def test_windows_repeat_the_first_observation_of_their_own_trajectory():
 def test_scores_are_those_of_a_slow_loop(horizon):
     rf = fitted(horizon=horizon)
     x = episode(90, n=12)
-    z = (x.observations.astype(np.float64) - rf.mean_) / rf.std_
+    z = (x.observations.astype(np.float64) - rf.scale_.mean) / rf.scale_.std
     expected = np.full(len(x), np.nan)
     for t in range(horizon, len(x)):
         errors = []
@@ -123,7 +124,7 @@ def test_refit_forgets():
 def test_gross_anomaly_scores_higher(rf):
     rows = episode(50).observations.copy()
     before = rf.score(episode(50))
-    rows[30:] += 5 * rf.std_ * np.where(np.arange(30) % 2, 1, -1)[:, None]
+    rows[30:] += 5 * rf.scale_.std * np.where(np.arange(30) % 2, 1, -1)[:, None]
     after = rf.score(Trajectory(rows, np.zeros((59, 1))))
     np.testing.assert_array_equal(after[:30], before[:30])
     assert after[30:].min() > 3 * np.nanmax(before)
@@ -132,7 +133,7 @@ def test_gross_anomaly_scores_higher(rf):
 def test_forecasts_beat_persistence_on_held_out_trajectories():
     rf = make_rf(members=3).fit([episode(seed) for seed in range(100, 140)])
     x = episode(60)
-    moved = np.abs(np.diff(x.observations / rf.std_, axis=0)).mean()
+    moved = np.abs(np.diff(x.observations / rf.scale_.std, axis=0)).mean()
     assert np.nanmean(rf.score(x)) < 0.5 * moved
 
 

@@ -27,7 +27,7 @@ def oodd_detectors() -> list[DetectorSpec]:
                 "trees": 10,
                 "leaves": 2000,
                 "rows": 20_000,
-                "draws": 8000,
+                "draws": 6000,
             },
             requires=("sklearn",),
             extra="oodd-eval[reference]",

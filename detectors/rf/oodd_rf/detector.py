@@ -10,19 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.errors import NotFittedError, UsageError
+from oodd_eval.prediction import FeatureScale
 from oodd_rf.windows import Floats, Indices, Rows
 
 if TYPE_CHECKING:
     from sklearn.ensemble import RandomForestRegressor
 
-CONSTANT: Final = 1e-6
-"""A standard deviation below this is a sensor that does not vary; its scale is then 1."""
-
 BATCH: Final = 8192
 """Windows that are rolled out together: bounds the memory of scoring."""
 
-SETTINGS: Final = ((1 / 2, 2), (1 / 3, 1), (1 / 3, 2), (2 / 3, 3), (1 / 2, 1))
+SETTINGS: Final = ((1 / 3, 2), (1 / 3, 1), (1 / 2, 2), (2 / 3, 3), (1 / 4, 1))
 """``max_features`` and ``min_samples_leaf`` of the members, repeated after the last."""
 
 
@@ -112,7 +110,7 @@ class RandomForestDetector:
         trees: int = 10,
         leaves: int = 2000,
         rows: int = 20_000,
-        draws: int = 8000,
+        draws: int = 6000,
     ) -> None:
         self.seed = _integer("seed", seed, 0)
         self.horizon = _integer("horizon", horizon, 1)
@@ -123,8 +121,7 @@ class RandomForestDetector:
         self.rows = _integer("rows", rows, 1)
         self.draws = _integer("draws", draws, 1)
         self.members_: list[Member] = []
-        self.mean_: Floats
-        self.std_: Floats
+        self.scale_: FeatureScale
 
     def fit(self, nominal: Sequence[Trajectory]) -> RandomForestDetector:
         """Fit the forests to one-step transitions of nominal trajectories, whatever the horizon.
@@ -134,17 +131,8 @@ class RandomForestDetector:
         TrajectoryError
             When there is no transition, or the trajectories differ in their number of sensors.
         """
-        widths = sorted({x.observation_dim for x in nominal})
-        if len(widths) != 1 or not any(x.transitions for x in nominal):
-            raise TrajectoryError(
-                f"detector 'rf' cannot be fitted on {len(nominal)} trajectories with "
-                f"{sum(x.transitions for x in nominal)} transitions and {widths} sensors: expected "
-                "at least one transition and the same number of sensors everywhere"
-            )
-        observed = np.concatenate([x.observations for x in nominal]).astype(np.float64)
-        std = observed.std(axis=0)
-        self.mean_, self.std_ = observed.mean(axis=0), np.where(std < CONSTANT, 1.0, std)
-        stacked = Rows.stack(nominal, self.mean_, self.std_)
+        self.scale_ = FeatureScale.fit(nominal)
+        stacked = Rows.stack(nominal, self.scale_)
         self.members_ = [self._fit_member(stacked, i) for i in range(self.members)]
         return self
 
@@ -169,16 +157,9 @@ class RandomForestDetector:
             raise NotFittedError(
                 "detector 'rf' was asked for scores before fit: fit it on nominal trajectories"
             )
-        for x in trajectories:
-            if x.observation_dim != len(self.mean_):
-                raise TrajectoryError(
-                    f"detector 'rf' was fitted on {len(self.mean_)} sensors and asked to score a "
-                    f"trajectory of {x.observation_dim}: score trajectories of the environment "
-                    "that it was fitted on"
-                )
         if not trajectories:
             return []
-        stacked = Rows.stack(trajectories, self.mean_, self.std_)
+        stacked = Rows.stack(trajectories, self.scale_)
         scores = np.full(len(stacked.values), np.nan)
         defined = stacked.with_history(self.horizon)
         for start in range(0, len(defined), BATCH):

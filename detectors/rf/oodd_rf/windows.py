@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval import Trajectory
+from oodd_eval.prediction import FeatureScale
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -30,12 +31,10 @@ class Rows:
     first: Indices
 
     @classmethod
-    def stack(cls, trajectories: Sequence[Trajectory], mean: Floats, std: Floats) -> Rows:
+    def stack(cls, trajectories: Sequence[Trajectory], scale: FeatureScale) -> Rows:
         """Standardize the observations of the trajectories and stack them."""
         lengths = np.array([len(x) for x in trajectories], dtype=np.int64)
-        values = np.concatenate(
-            [((x.observations - mean) / std).astype(np.float32) for x in trajectories]
-        )
+        values = np.concatenate([scale(x) for x in trajectories])
         return cls(values, np.repeat(np.cumsum(lengths) - lengths, lengths))
 
     def with_history(self, horizon: int) -> Indices:
