@@ -1,6 +1,8 @@
 """Fixtures that more than one test module uses."""
 
+import contextlib
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from helpers_split import make_split
+
+# Box2D's extension module warns while it is set up and crashes when a warning is an error there.
+with warnings.catch_warnings(), contextlib.suppress(ImportError):
+    warnings.simplefilter("ignore")
+    import Box2D  # noqa: F401
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,204 @@
+"""Building: the same bytes however the work is divided, and no work lost to a killed process."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium")
+from oodd_eval.benchmark import SplitDefinition
+from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
+from oodd_eval.simulate import build
+from oodd_eval.simulate.build import Chunk, build_split
+from oodd_eval.simulate.policies import FROZEN, freeze_policy, load_policy
+from oodd_eval.simulate.record import TwinTooShortError, record_seed
+from oodd_eval.splits import load_split
+
+SMALL = SplitDefinition("small", 4, 2, 2, 60, 950)
+FEW = {"environments": ["cartpole"]}
+
+
+def digest(directory):
+    return load_split(directory).digest
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    return build_split(SMALL, tmp_path_factory.mktemp("build") / "small", jobs=1, **FEW)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Record in this process, so that a test can replace what a worker calls."""
+
+    def run(chunks, work, _jobs):
+        for chunk in chunks:
+            build.record_chunk(chunk, work)
+            yield chunk
+
+    monkeypatch.setattr(build, "_run", run)
+
+
+def test_two_workers_and_smaller_chunks_give_the_same_bytes(built, tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "CHUNK", {"train": 1, "calibration": 2, "test": 1})
+    build_split(SMALL, tmp_path / "again", jobs=2, **FEW)
+    assert digest(tmp_path / "again") == digest(built)
+
+
+def test_a_built_split_holds_what_recording_gives(built):
+    data = load_split(built).environment("cartpole")
+    assert data.train.seeds.tolist() == [950_000_000 + i for i in range(4)]
+    assert data.calibration.seeds.tolist() == [950_300_000, 950_300_001]
+    assert data.twins.seeds.tolist() == [950_600_000, 950_600_001]
+    episode = record_seed(
+        "cartpole", 950_600_001, ["gravity"], policy=load_policy("cartpole"), episode_cap=60
+    )["gravity"]
+    stored = data.anomalous("gravity")
+    np.testing.assert_array_equal(stored[1].observations, episode.trajectory.observations)
+    np.testing.assert_array_equal(stored[1].actions, episode.trajectory.actions)
+    assert (stored.onsets[1], stored.redraws[1]) == (episode.onset, episode.redraws)
+    assert stored.parameters[1] == episode.parameters
+    assert stored.returns[1] == episode.rewards.sum()
+
+
+def test_the_manifest_names_recipe_policy_and_versions(built):
+    manifest = load_split(built).manifest
+    assert manifest["definition"] == dataclasses.asdict(SMALL)
+    assert manifest["environments"]["cartpole"]["policy"] == load_policy("cartpole").digest
+    assert {"oodd-eval", "numpy", "gymnasium", "python"} <= set(manifest["versions"])
+
+
+def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
+    assert sorted(p.name for p in built.iterdir()) == ["cartpole.h5", "manifest.json"]
+    before = (built / "cartpole.h5").stat().st_mtime_ns
+    reports = []
+    build_split(SMALL, built, jobs=1, progress=lambda *a: reports.append(a), **FEW)
+    assert reports == []
+    assert (built / "cartpole.h5").stat().st_mtime_ns == before
+
+
+def test_a_damaged_file_is_built_again(built, tmp_path):
+    expected = digest(built)
+    copy = tmp_path / "small"
+    copy.mkdir()
+    for file in built.iterdir():
+        content = file.read_bytes()
+        (copy / file.name).write_bytes(content[:-200] if file.suffix == ".h5" else content)
+    build_split(SMALL, copy, jobs=1, **FEW)
+    assert all(check.ok for check in load_split(copy).verify())
+    assert digest(copy) == expected
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from oodd_eval.benchmark import SplitDefinition
+from oodd_eval.simulate import build
+
+if __name__ == "__main__":
+    build.CHUNK.update(train=1, calibration=1, test=1)
+    build.build_split(
+        SplitDefinition("small", 4, 2, 2, 60, 950), Path(sys.argv[1]), environments=["cartpole"],
+        jobs=1, progress=lambda done, total, what: print(done, total, flush=True),
+    )
+"""
+
+
+def children(pid):
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(child) for child in found]
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc")
+def test_a_killed_build_resumes_and_leaves_no_worker(built, tmp_path, monkeypatch):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    target = tmp_path / "small"
+    with subprocess.Popen(
+        [sys.executable, str(script), str(target)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "1 8\n"
+        workers = children(process.pid)
+        os.kill(process.pid, signal.SIGKILL)
+    assert workers
+    deadline = time.monotonic() + 10
+    while any(map(alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(alive, workers))
+
+    finished = len(list((target / "work").glob("*.npz")))
+    assert finished >= 1
+    assert not (target / "manifest.json").exists()
+    monkeypatch.setattr(build, "CHUNK", {"train": 1, "calibration": 1, "test": 1})
+    reports = []
+    build_split(SMALL, target, jobs=1, progress=lambda *a: reports.append(a), **FEW)
+    assert len(reports) == 8 - finished
+    assert digest(target) == digest(built)
+
+
+def test_a_chunk_is_named_by_everything_its_content_depends_on(monkeypatch):
+    chunk = Chunk("cartpole", "train", 7, 5, 60, "", "a" * 64)
+    changes = [
+        {"environment": "ant"}, {"part": "test"}, {"first_seed": 8}, {"count": 6},
+        {"episode_cap": None}, {"policy_digest": "b" * 64},
+    ]  # fmt: skip
+    names = {dataclasses.replace(chunk, **change).file_name for change in [{}, *changes]}
+    assert len(names) == 7
+    assert dataclasses.replace(chunk, policy="elsewhere.npz").file_name == chunk.file_name
+    monkeypatch.setattr(build, "GENERATOR_VERSION", 999)
+    assert chunk.file_name not in names
+
+
+def test_a_seed_with_a_short_twin_gives_way_to_the_next(in_process, tmp_path, monkeypatch):
+    def record(environment, seed, anomalies, **options):
+        if seed in {950_600_000, 950_600_002}:
+            raise TwinTooShortError(str(seed))
+        return record_seed(environment, seed, anomalies, **options)
+
+    monkeypatch.setattr(build, "record_seed", record)
+    split = load_split(build_split(SMALL, tmp_path / "small", **FEW))
+    data = split.environment("cartpole")
+    assert data.twins.seeds.tolist() == [950_600_001, 950_600_003]
+    assert data.anomalous("iid").seeds.tolist() == [950_600_001, 950_600_003]
+
+
+def test_a_policy_that_never_lasts_is_an_error(in_process, tmp_path):
+    with np.load(FROZEN / "cartpole.npz") as stored:
+        arrays = {k: stored[k] if k == "quantiles" else 0 * stored[k] for k in stored.files}
+    freeze_policy("cartpole", arrays, {}, tmp_path)
+    with pytest.raises(SimulationError, match="cartpole: of 20 test seeds only 0 had nominal"):
+        build_split(
+            SMALL, tmp_path / "small", policies={"cartpole": tmp_path / "cartpole.npz"}, **FEW
+        )
+
+
+def test_another_recipe_does_not_overwrite(built):
+    with pytest.raises(UsageError, match="choose another name or remove it"):
+        build_split(dataclasses.replace(SMALL, train=5), built, **FEW)
+
+
+def test_wrong_requests_fail_before_any_work(tmp_path):
+    target = tmp_path / "none"
+    with pytest.raises(UnknownNameError, match="did you mean 'hopper'"):
+        build_split(SMALL, target, environments=["hoper"])
+    for change, message in [
+        ({"test": 0}, "test must have 1 to 200000"),
+        ({"episode_cap": 59}, "cap must be at least 60, got 59"),
+        ({"seed_base": -1}, "must not be negative"),
+    ]:
+        with pytest.raises(UsageError, match=message):
+            build_split(dataclasses.replace(SMALL, **change), target, **FEW)
+    assert not target.exists()
