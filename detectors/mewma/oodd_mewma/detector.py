@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import add
 from typing import Final
 
 import numpy as np
@@ -122,10 +124,10 @@ class MewmaDetector:
         folds = [usable[i :: min(FOLDS, len(usable))] for i in range(min(FOLDS, len(usable)))]
 
         moments = [
-            _total([Moments.of(self._regressors(x), self._targets(x)) for x in fold])
+            reduce(add, (Moments.of(self._regressors(x), self._targets(x)) for x in fold))
             for fold in folds
         ]
-        every = _total(moments)
+        every = reduce(add, moments)
         self.coefficients_ = every.solve(self.ridge)
         # What scoring will see: residuals of forecasts that were fitted to other trajectories.
         unseen = [(every - own).solve(self.ridge) for own in moments]
@@ -141,10 +143,10 @@ class MewmaDetector:
         # One uncentred covariance per weight: residuals are zero on average, by the regression.
         sums, counts = [], []
         for fold, coefficients in zip(folds, unseen, strict=True):
-            charts = [self._smoothed(x, coefficients) for x in fold]
-            sums.append(sum((z.swapaxes(1, 2) @ z for z in charts), start=np.zeros(())))
-            counts.append(sum(z.shape[1] for z in charts))
-        total, count = sum(sums, start=np.zeros(())), sum(counts)
+            charts = (self._smoothed(x, coefficients) for x in fold)
+            sums.append(reduce(add, (z.swapaxes(1, 2) @ z for z in charts)))  # (W, D, D)
+            counts.append(sum(len(x) - self._first for x in fold))
+        total, count = reduce(add, sums), sum(counts)
         self.whitening_ = self._whitening(total / count)
 
         distances: list[Floats] = []
@@ -240,10 +242,3 @@ def _mean_and_std(arrays: Sequence[NDArray[np.float32]]) -> tuple[Floats, Floats
 
 def _scale(std: Floats) -> Floats:
     return np.where(std < CONSTANT, 1.0, std)
-
-
-def _total(moments: Sequence[Moments]) -> Moments:
-    total = moments[0]
-    for other in moments[1:]:
-        total = total + other
-    return total
