@@ -1,0 +1,201 @@
+"""Recorded episodes: twins, onsets, determinism, and what reaches the terminal."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_simulate import SEEDS, Reflex
+
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.errors import SimulationError, UnknownNameError
+from oodd_eval.simulate import record as recording
+from oodd_eval.simulate.anomalies import Draw
+from oodd_eval.simulate.record import TwinTooShortError, record, record_nominal, record_seed
+
+CAP = 120
+
+
+def digest(episode):
+    sha = hashlib.sha256()
+    for array in (episode.trajectory.observations, episode.trajectory.actions, episode.rewards):
+        sha.update(array.tobytes())
+    sha.update(json.dumps([episode.onset, episode.parameters, episode.redraws]).encode())
+    return sha.hexdigest()
+
+
+@pytest.fixture(scope="module", params=ENVIRONMENTS)
+def episodes(request):
+    """(environment, {None: twin, anomaly: episode}) of one seed."""
+    environment = request.param
+    policy = Reflex(environment)
+    found = record_seed(
+        environment, SEEDS[environment], ANOMALIES, policy=policy, episode_cap=CAP
+    )
+    return environment, found
+
+
+def test_episodes_equal_their_twin_bit_for_bit_before_the_onset_and_differ_after(episodes):
+    environment, found = episodes
+    twin = found[None].trajectory
+    assert set(found) == {None, *ANOMALIES}
+    for anomaly in ANOMALIES:
+        onset, x = found[anomaly].onset, found[anomaly].trajectory
+        assert 30 <= onset <= int(0.6 * twin.transitions), anomaly
+        assert x.transitions > onset + 5, anomaly
+        before = x.observations[:onset]
+        assert before.tobytes() == twin.observations[:onset].tobytes(), (environment, anomaly)
+        # The action onto the onset was chosen before anything could be seen.
+        assert x.actions[:onset].tobytes() == twin.actions[:onset].tobytes(), anomaly
+        n = min(len(x), len(twin))
+        assert (x.observations[onset:n] != twin.observations[onset:n]).any() or len(x) != len(twin)
+
+
+def test_sensor_anomalies_touch_their_sensors_alone_at_the_onset(episodes):
+    environment, found = episodes
+    twin = found[None].trajectory.observations
+    for anomaly in ("iid", "shutdown", "calibration", "drift"):
+        e = found[anomaly]
+        row, true, p = e.trajectory.observations[e.onset], twin[e.onset], e.parameters
+        chosen = np.array(p["sensors"])
+        others = np.setdiff1d(np.arange(len(row)), chosen)
+        assert (row[others] == true[others]).all(), (environment, anomaly)
+        expected = {
+            "iid": None,
+            "shutdown": np.zeros(len(chosen)),
+            "calibration": true[chosen].astype(float) * p.get("factor", 0),
+            "drift": true[chosen].astype(float) + p.get("slope", 0) * e.onset,
+        }[anomaly]
+        if expected is None:
+            assert (row[chosen] != true[chosen]).all()
+        else:
+            assert (row[chosen] == expected.astype(np.float32)).all(), (environment, anomaly)
+
+
+def test_the_policy_acts_on_the_stored_rows(episodes):
+    environment, found = episodes
+    policy, info = Reflex(environment), ENVIRONMENTS[environment]
+    for anomaly, episode in found.items():
+        x = episode.trajectory
+        acts = [policy.act(row) for row in x.observations[:-1]]
+        expected = np.eye(info.action_dim)[acts] if info.discrete else np.array(acts)
+        assert (x.actions == expected).all(), (environment, anomaly)
+        assert x.actions.dtype == x.observations.dtype == episode.rewards.dtype == np.float32
+
+
+def test_parameters_are_plain_json(episodes):
+    _, found = episodes
+    for episode in found.values():
+        assert json.loads(json.dumps(episode.parameters)) == episode.parameters
+
+
+def test_one_episode_alone_equals_the_one_recorded_among_others(episodes):
+    environment, found = episodes
+    for anomaly in (None, "components", "iid"):
+        alone = record(
+            environment, anomaly, SEEDS[environment], policy=Reflex(environment), episode_cap=CAP
+        )
+        assert digest(alone) == digest(found[anomaly]), (environment, anomaly)
+
+
+CHILD = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from helpers_simulate import SEEDS, Reflex
+from test_simulate_record import CAP, digest
+from oodd_eval.simulate.record import record
+for environment in ("hopper", "lunarlander", "acrobot"):  # another order than the table's
+    for anomaly in ("wind-r2l", "gravity"):
+        e = record(environment, anomaly, SEEDS[environment], policy=Reflex(environment),
+                   episode_cap=CAP)
+        print(environment, anomaly, digest(e))
+"""
+
+
+def test_another_process_gives_the_same_bytes_and_nothing_else_on_its_streams():
+    here = str(Path(__file__).parent)
+    child = subprocess.run([sys.executable, "-c", CHILD, here], capture_output=True, text=True)
+    assert child.returncode == 0, child.stderr
+    expected = [
+        f"{environment} {anomaly} " + digest(
+            record(
+                environment, anomaly, SEEDS[environment],
+                policy=Reflex(environment), episode_cap=CAP,
+            )
+        )
+        for environment in ("hopper", "lunarlander", "acrobot")
+        for anomaly in ("wind-r2l", "gravity")
+    ]  # fmt: skip
+    assert child.stdout.splitlines() == expected
+    assert child.stderr == ""
+
+
+def test_recording_prints_nothing(capfd):
+    record_nominal("hopper", 0, policy=Reflex("hopper"), episode_cap=5)
+    assert capfd.readouterr() == ("", "")
+    print("still connected")
+    assert capfd.readouterr().out == "still connected\n"
+
+
+def test_seeds_and_anomalies_have_streams_of_their_own():
+    names = [(e, a, s, k) for e in ("ant", "hopper") for a in ("iid", "drift")
+             for s in (1, 2) for k in (0, 1)]  # fmt: skip
+    firsts = {recording.generator(*n).integers(2**62) for n in names}
+    assert len(firsts) == len(names)
+
+
+def test_the_cap_ends_an_episode_without_terminating_it():
+    capped = record_nominal("halfcheetah", 1, policy=Reflex("halfcheetah"), episode_cap=40)
+    assert (capped.trajectory.transitions, capped.terminated) == (40, False)
+    longer = record_nominal("halfcheetah", 1, policy=Reflex("halfcheetah"), episode_cap=60)
+    assert (longer.trajectory.observations[:41] == capped.trajectory.observations).all()
+    assert record_nominal("cartpole", 1, policy=_Right()).terminated
+
+
+class _Right:
+    digest = "right"
+
+    def act(self, row):
+        return 1
+
+
+def test_a_twin_of_under_50_transitions_gives_way():
+    with pytest.raises(TwinTooShortError, match=r"cartpole with seed 1 .* at least 50"):
+        record("cartpole", "iid", 1, policy=_Right())
+    assert record("cartpole", None, 1, policy=_Right()).trajectory.transitions < 50
+
+
+def test_draws_that_change_nothing_are_redrawn_and_counted(monkeypatch):
+    true_draw, calls = recording.draw, []
+
+    def idle_twice(environment, anomaly, simulator, rng):
+        calls.append(anomaly)
+        drawn = true_draw(environment, anomaly, simulator, rng)
+        return drawn if len(calls) > 2 else Draw("drift", drawn.parameters)
+
+    monkeypatch.setattr(recording, "draw", idle_twice)
+    episode = record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
+    assert (episode.redraws, len(calls)) == (2, 3)
+
+
+def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeypatch):
+    calls = []
+
+    def idle(environment, anomaly, simulator, rng):
+        calls.append(anomaly)
+        return Draw("drift", {})
+
+    monkeypatch.setattr(recording, "draw", idle)
+    with pytest.raises(SimulationError, match="no acceptable drift episode of cartpole with seed"):
+        record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=50)
+    assert len(calls) == 101
+
+
+def test_unknown_names_are_refused_before_anything_runs():
+    with pytest.raises(UnknownNameError, match="gravity"):
+        record("cartpole", "gravitty", 1, policy=None)
+    with pytest.raises(UnknownNameError, match="cartpole"):
+        record("cartpol", None, 1, policy=None)
