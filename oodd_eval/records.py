@@ -93,9 +93,10 @@ class Record:
         return self.status == "ok"
 
     @property
-    def identity(self) -> tuple[str, str, str, int]:
+    def identity(self) -> tuple[str, ...]:
         """What makes two records results of the same cell, the later replacing the earlier."""
-        return self.cell, json.dumps(self.parameters), self.split_digest, self.protocol
+        settings = [self.protocol, self.parameters, self.provenance.get("limit")]
+        return self.cell, self.split_digest, json.dumps(settings, sort_keys=True)
 
     def value(self, metric: str) -> float:
         """Return a metric's value; NaN where the cell has none."""

@@ -138,10 +138,14 @@ def serve(channel: Channel) -> None:
         seconds_score += time.perf_counter() - start
         for one in scores:
             plain = isinstance(one, np.ndarray) and not one.dtype.hasobject
-            channel.send({"type": "array" if plain else type(one).__name__})
+            channel.send({"type": "array" if plain else _kind(one)})
             if plain:
                 channel.send_array(np.asarray(one))
     channel.send({"seconds_score": seconds_score, "peak_rss_mb": peak_rss_mb()})
+
+
+def _kind(scores: object) -> str:
+    return "ndarray of object" if isinstance(scores, np.ndarray) else type(scores).__name__
 
 
 def main(arguments: Sequence[str]) -> NoReturn:

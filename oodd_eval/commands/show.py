@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _recomputed(records: list[Record], results: ResultsDirectory, place: str) -> list[Record]:
     """Rescore each split's records, and keep the order of all."""
-    fresh: dict[tuple[str, str, str, int], Record] = {}
+    fresh: dict[tuple[str, ...], Record] = {}
     for name, digest in dict.fromkeys((r.split, r.split_digest) for r in records):
         # A split that is not the published one carries its digest behind its name.
         split = load_split(place or name.partition("@")[0])

@@ -1,0 +1,526 @@
+"""The runner: plan, isolation, resume, interruption; whatever a detector does, the others go on."""
+
+import dataclasses
+import json
+import os
+import re
+import time
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import evaluate, load_split
+from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
+from oodd_eval.evaluation import rescore
+from oodd_eval.hookspecs import hookimpl
+from oodd_eval.isolation import Limits, Request, _Sender
+from oodd_eval.plan import make_plan
+from oodd_eval.plugins import discover
+from oodd_eval.provenance import source_digest
+from oodd_eval.results import ResultsDirectory
+from oodd_eval.runner import Settings, run
+from oodd_eval.selection import expression, memory_bytes, seconds, select, whole_numbers
+from oodd_eval.trivial import Clock
+
+HOSTILE = """
+class WrongLength(Good):
+    def score(self, x): return super().score(x)[:-1]
+
+class LateNan(Good):
+    def score(self, x):
+        s = super().score(x); s[30] = np.nan; return s
+
+class Infinite(Good):
+    def score(self, x):
+        s = super().score(x); s[0] = np.inf; return s
+
+class WrongDimension(Good):
+    def score(self, x): return super().score(x)[:, None]
+
+class PlainList(Good):
+    def score(self, x): return super().score(x).tolist()
+
+class Objects(Good):
+    def score(self, x): return super().score(x).astype(object)
+
+class Huge(Good):
+    def score(self, x): return super().score(x) * 0 + 1.7e308
+
+class FewScores(Good):
+    def score_many(self, xs): return [self.score(x) for x in xs][1:]
+
+class BadWarmUp(Good):
+    warm_up = 50
+
+class RaisesInFit(Good):
+    def fit(self, nominal): raise RuntimeError("no mood")
+
+class RaisesInScore(Good):
+    def score(self, x): return 1 / 0
+
+class Exits(Good):
+    def score(self, x): sys.exit(0)
+
+class ExitsHard(Good):
+    def score(self, x): os._exit(0)
+
+class Crashes(Good):
+    def score(self, x): os.kill(os.getpid(), signal.SIGSEGV)
+
+class Hangs(Good):
+    def fit(self, nominal): time.sleep(600)
+
+class TooLarge(Good):
+    def fit(self, nominal): self.rows = np.ones(10**8); time.sleep(600)
+
+class OutOfMemory(Good):
+    def fit(self, nominal): raise MemoryError("no room")
+
+class Unsuited(Good):
+    def fit(self, nominal): raise NotImplementedError("continuous actions only")
+
+class Unequipped(Good):
+    def fit(self, nominal): import no_such_module
+
+class Prints(Good):
+    def score(self, x):
+        print("garbage " * 1000); os.write(1, bytes(range(256)) * 100); os.write(2, b"x" * 10**5)
+        return super().score(x)
+
+class LeavesThreads(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        subprocess.Popen(["sleep", "600"])
+
+def no_detector(**settings): return 42
+
+@hookimpl
+def oodd_detectors():
+    found = {k: v for k, v in globals().items() if isinstance(v, type) and issubclass(v, Good)}
+    unavailable = DetectorSpec("unavailable", Good, "", requires=("no_such",), extra="oodd-x[y]")
+    return [*offer(no_detector=no_detector), unavailable,
+            *(DetectorSpec(k.lower(), v, "") for k, v in found.items() if k != "Good")]
+"""
+
+STATES = {
+    "wronglength": ("invalid", r"returned \d+ scores for cartpole/\S+\[\d\], expected \d+ \(one p"),
+    "latenan": ("invalid", r"returned nan at t = 30 of cartpole/"),
+    "infinite": ("invalid", r"returned inf at t = 0 of cartpole/"),
+    "wrongdimension": ("invalid", r"returned an array of shape \(\d+, 1\) for cartpole/"),
+    "plainlist": ("invalid", "score returned list, expected a numpy array of float64"),
+    "objects": ("invalid", "score returned ndarray of object, expected a numpy array of float64"),
+    "huge": ("invalid", "too large"),
+    "fewscores": ("invalid", r"score_many returned \d+ score arrays, expected \d+"),
+    "badwarmup": ("invalid", "declares warm_up = 50, expected an int between 0 and 20"),
+    "raisesinfit": ("error", r"RuntimeError: no mood \(oodd_hostile.py:\d+\)"),
+    "raisesinscore": ("error", "ZeroDivisionError"),
+    "exits": ("error", r"called sys.exit\(0\)"),
+    "exitshard": ("error", "the worker ended with exit code 0 while scoring"),
+    "crashes": ("error", "the worker was killed by SIGSEGV while scoring"),
+    "hangs": ("timeout", r"not done after 10 s \(--timeout\)"),
+    "toolarge": ("oom", r"resident memory \d+ MB is over the limit of 300 MB"),
+    "outofmemory": ("oom", "MemoryError: no room"),
+    "unsuited": ("incompatible", "NotImplementedError: continuous actions only"),
+    "unequipped": ("unavailable", "No module named 'no_such_module'"),
+    "unavailable": ("unavailable", r'needs no_such: pip install "oodd-x\[y\]"'),
+    "no-detector": ("invalid", "the factory returned int, expected an object with the methods"),
+    "prints": ("ok", ""),
+    "leavesthreads": ("ok", ""),
+    "clock": ("ok", ""),
+}
+
+VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
+
+
+def stable(records):
+    """Everything of records but cost and provenance, as bytes."""
+    plain = [json.loads(record.to_json()) for record in records]
+    return json.dumps([{k: v for k, v in p.items() if k not in VOLATILE} for p in plain])
+
+
+def run_tiny(split, detectors=("clock",), output=None, *, environments=("cartpole",),
+             anomalies=("iid",), plugins=None, limit=None, observer=None, **settings):  # fmt: skip
+    opened = load_split(split)
+    plugins = plugins or discover()
+    if observer:
+        plugins.observe(observer, "observer")
+    plan = make_plan(
+        plugins, split=opened.name, split_digest=opened.digest, detectors=list(detectors),
+        environments=list(environments), anomalies=list(anomalies), limit=limit,
+    )  # fmt: skip
+    results = ResultsDirectory(output) if output else None
+    return run(plan, opened, plugins, Settings(**settings), results)
+
+
+@pytest.fixture(scope="module")
+def hostile(tiny_split, tmp_path_factory):
+    """Records of one run of all hostile detectors, and its output directory."""
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch, tmp_path_factory.mktemp("plugin"), "hostile", HOSTILE)
+        output = tmp_path_factory.mktemp("hostile")
+        limits = Limits(seconds=10, memory=300_000_000)
+        done = run_tiny(tiny_split, STATES, output, jobs=4, limits=limits)
+    return {record.detector: record for record in done.records}, output
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_every_way_to_fail_is_a_state_with_a_reason(hostile, name):
+    status, reason = STATES[name]
+    record = hostile[0][name]
+    assert record.status == status, record.reason
+    assert re.search(reason, record.reason)
+    assert bool(record.reason) == (status != "ok")
+    assert bool(record.metrics) == (status == "ok")
+
+
+def test_no_detector_is_left_out_and_the_order_is_the_plans(hostile):
+    assert list(hostile[0]) == list(STATES)
+
+
+def test_what_a_failing_detector_printed_is_kept(hostile):
+    records, output = hostile
+    log = output / "logs" / f"{records['raisesinfit'].provenance['scores']}.txt"
+    assert "Traceback" in log.read_text()
+    assert "no mood" in log.read_text()
+
+
+def test_results_do_not_depend_on_the_number_of_jobs(tiny_split, tmp_path):
+    settings = {"environments": ("cartpole", "hopper"), "anomalies": ("iid", "gravity")}
+    found = [
+        run_tiny(tiny_split, ["clock", "persistence"], tmp_path / str(jobs), jobs=jobs, **settings)
+        for jobs in (1, 4)
+    ]
+    assert stable(found[0].records) == stable(found[1].records)
+    first, second = (ResultsDirectory(tmp_path / jobs).records() for jobs in "14")
+    assert stable(first) == stable(second) == stable(found[0].records)
+
+
+def test_in_process_and_worker_agree(tiny_split):
+    one = evaluate("persistence", tiny_split, environments="hopper")
+    two = evaluate(discover().offer("persistence").spec.factory, tiny_split, environments="hopper")
+    assert [r.metrics for r in one] == [r.metrics for r in two]
+    assert [r.anomaly for r in one] == [r.anomaly for r in two]
+
+
+def test_evaluate_passes_on_what_a_factory_raises(tiny_split):
+    class Short(Clock):
+        def score(self, trajectory):
+            return super().score(trajectory)[1:]
+
+    with pytest.raises(ContractError, match=r"'short' returned 60 scores for cartpole/calibration"):
+        evaluate(Short, tiny_split)
+
+
+def test_evaluate_hands_parameters_seed_and_horizon_to_the_factory(tiny_split):
+    seen = []
+
+    def make(**settings):
+        seen.append(settings)
+        return Clock()
+
+    evaluate(make, tiny_split, environments="hopper", parameters={"size": 3}, seed=7, horizon=2)
+    assert seen == [{"seed": 7, "horizon": 2, "size": 3}]
+
+
+COUNTING = """
+class Counting(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        with open(LOG, "a") as file: file.write(f"{{len(nominal)}}\\n")
+
+@hookimpl
+def oodd_detectors(): return offer(counting=Counting)
+"""
+
+
+@pytest.fixture
+def counting(monkeypatch, tmp_path):
+    """A plug-in that writes a line per fit: the module, and a function that reads the lines."""
+    log = tmp_path / "fits"
+    code = f"LOG = {str(log)!r}\n{COUNTING.format()}"
+    module = install(monkeypatch, tmp_path / "plugin", "counting", code)
+    return module, lambda: log.read_text().split() if log.exists() else []
+
+
+def test_a_second_run_resumes_without_a_fit(tiny_split, tmp_path, counting):
+    first = run_tiny(tiny_split, ["counting"], tmp_path / "out")
+    second = run_tiny(tiny_split, ["counting"], tmp_path / "out")
+    assert counting[1]() == ["6"]
+    assert stable(first.records) == stable(second.records)
+
+
+def test_fresh_fits_again(tiny_split, tmp_path, counting):
+    run_tiny(tiny_split, ["counting"], tmp_path / "out")
+    run_tiny(tiny_split, ["counting"], tmp_path / "out", fresh=True)
+    assert len(counting[1]()) == 2
+
+
+def test_another_anomaly_is_scored_and_the_earlier_scores_stay(tiny_split, tmp_path, counting):
+    for anomaly in ("iid", "gravity", "iid", "gravity"):
+        run_tiny(tiny_split, ["counting"], tmp_path / "out", anomalies=[anomaly])
+    assert len(counting[1]()) == 2
+
+
+def test_changed_code_is_fitted_again(tiny_split, tmp_path, counting):
+    module, fits = counting
+    run_tiny(tiny_split, ["counting"], tmp_path / "out")
+    module.write_text(module.read_text() + "\n# changed\n")
+    source_digest.cache_clear()
+    run_tiny(tiny_split, ["counting"], tmp_path / "out")
+    assert len(fits()) == 2
+
+
+def test_a_limited_run_does_not_pass_for_a_whole_one(tiny_split, tmp_path, counting):
+    limited = run_tiny(tiny_split, ["counting"], tmp_path / "out", limit=2).records
+    whole = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
+    assert counting[1]() == ["2", "6"]
+    assert limited[0].counts == {"train": 2, "calibration": 2, "test": 2}
+    assert whole[0].counts == {"train": 6, "calibration": 4, "test": 3}
+    assert len(ResultsDirectory(tmp_path / "out").records()) == 2
+
+
+@pytest.mark.parametrize("damage", [b"", b"not HDF5 at all", None])
+def test_a_damaged_score_file_is_computed_again(tiny_split, tmp_path, counting, damage):
+    before = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
+    (file,) = (tmp_path / "out" / "scores").glob("*.h5")
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2] if damage is None else damage)
+    after = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
+    assert len(counting[1]()) == 2
+    assert stable(before) == stable(after)
+
+
+def test_shared_code_of_a_plugin_counts_as_its_source(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "a", "user", "import oodd_helper\n")
+    helper = install(monkeypatch, tmp_path / "b", "helper", "X = 1\n")
+    before = source_digest.__wrapped__("oodd_user")
+    helper.write_text("X = 2\n")
+    assert source_digest.__wrapped__("oodd_user") != before
+
+
+class Interrupting:
+    @hookimpl
+    def oodd_cell_finished(self, record):
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_run_keeps_what_was_finished(tiny_split, tmp_path, counting):
+    done = run_tiny(
+        tiny_split, ["counting", "clock"], tmp_path / "out", jobs=1, observer=Interrupting()
+    )
+    assert done.interrupted
+    assert [r.detector for r in done.records] == ["counting"]
+    assert [r.detector for r in ResultsDirectory(tmp_path / "out").records()] == ["counting"]
+    run_tiny(tiny_split, ["counting", "clock"], tmp_path / "out")
+    assert len(counting[1]()) == 1
+
+
+def test_a_worker_is_killed_when_the_run_is_interrupted(tiny_split, monkeypatch, tmp_path):
+    code = """
+    class Sleeps(Good):
+        def fit(self, nominal):
+            Path(PID).write_text(str(os.getpid()))
+            time.sleep(600)
+
+    @hookimpl
+    def oodd_detectors(): return offer(sleeps=Sleeps)
+    """
+    pid = tmp_path / "pid"
+    module = install(monkeypatch, tmp_path / "plugin", "sleeps", code)
+    module.write_text(f"PID = {str(pid)!r}\n" + module.read_text())
+
+    class Interrupt:
+        @hookimpl
+        def oodd_cell_finished(self, record):
+            while not (pid.exists() and pid.read_text()):
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    done = run_tiny(tiny_split, ["clock", "sleeps"], jobs=2, observer=Interrupt())
+    assert [r.detector for r in done.records] == ["clock"]
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
+
+
+def test_stop_on_failure_ends_the_run(tiny_split, monkeypatch, tmp_path):
+    code = "@hookimpl\ndef oodd_detectors(): return offer(fails=lambda **_: None)"
+    install(monkeypatch, tmp_path, "fails", code)
+    done = run_tiny(tiny_split, ["fails", "clock"], jobs=1, stop_on_failure=True)
+    assert [(r.detector, r.status) for r in done.records] == [("fails", "invalid")]
+
+
+def test_an_output_that_cannot_be_written_is_found_before_any_work(tiny_split, tmp_path, counting):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"cannot be written to.*--output"):
+        run_tiny(tiny_split, ["counting"], tmp_path / "file" / "out")
+    assert counting[1]() == []
+
+
+def test_rescoring_gives_the_same_records(tiny_split, tmp_path):
+    records = run_tiny(tiny_split, ["persistence"], tmp_path / "out").records
+    bare = [dataclasses.replace(r, metrics={}, per_trajectory={}) for r in records]
+    results = ResultsDirectory(tmp_path / "out")
+    again = rescore(bare, results, load_split(tiny_split))
+    assert stable(again) == stable(records)
+
+
+def test_rescoring_without_scores_names_the_file(tiny_split, tmp_path):
+    records = run_tiny(tiny_split, ["clock"], tmp_path / "out").records
+    for file in (tmp_path / "out" / "scores").iterdir():
+        file.unlink()
+    with pytest.raises(ResultsError, match=r"scores/clock-cartpole-\w+\.h5.*--stored"):
+        rescore(records, ResultsDirectory(tmp_path / "out"), load_split(tiny_split))
+
+
+def test_rescoring_with_another_split_is_refused(tiny_split, tmp_path):
+    records = run_tiny(tiny_split, ["clock"], tmp_path / "out").records
+    other = [dataclasses.replace(r, split_digest="0" * 64) for r in records]
+    with pytest.raises(ResultsError, match="digest 000000000000, but split 'tiny' here has"):
+        rescore(other, ResultsDirectory(tmp_path / "out"), load_split(tiny_split))
+
+
+def test_a_worker_is_told_no_names(tiny_split, tmp_path):
+    data = load_split(tiny_split).environment("cartpole")
+    request = Request("trivial", "clock", {}, 0, 1, len(data.train))
+    anomalous = data.anomalous("iid")
+    with (tmp_path / "sent").open("wb") as file:
+        sender = _Sender(os.dup(file.fileno()), request, data.train, [*anomalous, *data.twins])
+        sender.join()
+    sent = (tmp_path / "sent").read_bytes()
+    assert sender.error is None
+    assert anomalous[0].observations.tobytes() in sent
+    for word in ("cartpole", "iid", "nominal", "calib", "test", "onset", "anom", "tiny"):
+        assert word.encode() not in sent
+    data.close()
+
+
+def test_trajectories_to_score_come_shuffled_together(tiny_split, monkeypatch, tmp_path):
+    seen = tmp_path / "seen"
+    code = f"""
+    class Spy(Good):
+        def score(self, x):
+            with open({str(seen)!r}, "ab") as file: file.write(x.observations[:1].tobytes())
+            return super().score(x)
+
+    @hookimpl
+    def oodd_detectors(): return offer(spy=Spy)
+    """
+    install(monkeypatch, tmp_path / "plugin", "spy", code)
+    run_tiny(tiny_split, ["spy"])
+    with_names = load_split(tiny_split).environment("cartpole")
+    ordered = [*with_names.calibration, *with_names.twins, *with_names.anomalous("iid")]
+    firsts = [x.observations[0].tobytes() for x in ordered]
+    size = len(firsts[0])
+    content = seen.read_bytes()
+    order = [content[i : i + size] for i in range(0, len(content), size)]
+    assert sorted(order) == sorted(firsts)
+    assert order != firsts
+    with_names.close()
+
+
+def test_an_error_of_reading_data_is_kept_for_the_caller():
+    def broken():
+        yield from ()
+        raise OSError("disk gone")
+
+    reading, writing = os.pipe()
+    sender = _Sender(writing, Request("trivial", "clock", {}, 0, 1, 0), broken(), [])
+    sender.join()
+    os.close(reading)
+    assert isinstance(sender.error, OSError)
+
+
+# Selection
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        ("b", ["b"]),
+        ("c,a", ["c", "a"]),
+        ("all", ["a", "b", "c", "ab"]),
+        ("a*", ["a", "ab"]),
+        ("b, *b", ["b", "ab"]),
+    ],
+)
+def test_names_are_selected_in_the_order_asked_for(patterns, names):
+    assert select("thing", patterns, ["a", "b", "c", "ab"]) == names
+
+
+@pytest.mark.parametrize("patterns", ["", ",", "x", "x*", "a,x"])
+def test_selecting_nothing_is_an_error(patterns):
+    with pytest.raises(UsageError):
+        select("thing", patterns, ["a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("text", "cell", "wanted"),
+    [
+        ("iid", "mini/hopper/iid::rf[h=1,seed=0]", True),
+        ("HOPPER", "mini/hopper/iid::rf[h=1,seed=0]", True),
+        ("not iid", "mini/hopper/iid::rf[h=1,seed=0]", False),
+        ("ant or hopper and not rf", "mini/hopper/iid::rf[h=1,seed=0]", False),
+        ("(ant or hopper) and rf[h=1", "mini/hopper/iid::rf[h=1,seed=0]", True),
+        ("ant or hopper and not rf", "mini/ant/iid::rf[h=1,seed=0]", True),
+        ("not (ant or hopper)", "mini/ant/iid::rf[h=1,seed=0]", False),
+        ("not not ant", "mini/ant/iid::rf[h=1,seed=0]", True),
+    ],
+)
+def test_expressions_select_cells(text, cell, wanted):
+    assert expression(text)(cell) is wanted
+
+
+@pytest.mark.parametrize("text", ["", "and", "a and", "a b", "(a", "a)", "not", "()"])
+def test_broken_expressions_are_refused(text):
+    with pytest.raises(UsageError, match=r"-k .* cannot be read"):
+        expression(text)
+
+
+def test_numbers_times_and_amounts():
+    assert whole_numbers("--seed", "0,3,3", least=0) == [0, 3]
+    assert [seconds(t) for t in ("90", "1.5m", "2h")] == [90, 90, 7200]
+    assert [memory_bytes(t) for t in ("8GB", "1 GiB", "500mb")] == [8 * 10**9, 2**30, 5 * 10**8]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: whole_numbers("--horizon", "0", least=1),
+        lambda: whole_numbers("--seed", "x", least=0),
+        lambda: seconds("soon"),
+        lambda: seconds("0"),
+        lambda: memory_bytes("8 bananas"),
+    ],
+)
+def test_what_is_no_number_is_refused(call):
+    with pytest.raises(UsageError, match=r"expected whole numbers|is not an? "):
+        call()
+
+
+def test_cell_ids_name_what_is_not_a_default(monkeypatch, tmp_path, tiny_split):
+    code = """
+    @hookimpl
+    def oodd_detectors():
+        return [DetectorSpec("tuned", Good, "", parameters={"size": 5, "kind": "a"})]
+    """
+    install(monkeypatch, tmp_path, "tuned", code)
+    plan = make_plan(
+        discover(), split="mini", split_digest="", detectors=["tuned"], environments=["ant"],
+        anomalies=["iid"], horizons=[10], seeds=[3], parameters={"size": 7, "kind": "a"},
+    )  # fmt: skip
+    assert plan.cells == ["mini/ant/iid::tuned[h=10,seed=3,size=7]"]
+    assert plan.units[0].parameters == {"kind": "a", "size": 7}
+
+
+def test_filtering_a_plan_drops_units_without_cells():
+    plan = make_plan(
+        discover(), split="mini", split_digest="", detectors=["clock", "random"],
+        environments=["ant", "hopper"],
+    )  # fmt: skip
+    assert len(plan.cells) == 2 * 2 * 8
+    assert plan.matching(expression("clock and ant/ and wind")).cells == [
+        "mini/ant/wind-l2r::clock[h=1,seed=0]",
+        "mini/ant/wind-r2l::clock[h=1,seed=0]",
+    ]
+    assert plan.matching(expression("zzz")).units == ()
