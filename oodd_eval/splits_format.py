@@ -162,7 +162,7 @@ def write_environment(path: Path, groups: Groups) -> dict[str, dict[str, Any]]:
             group = file.create_group(name)
             for dataset, dtype in dtypes_of(name).items():
                 array = np.asarray(arrays[dataset])
-                array = array if dataset == "parameters" else array.astype(dtype)
+                array = array if dataset == "parameters" else array.astype(dtype, copy=False)
                 # Tiny datasets grow when compressed.
                 packed = array.nbytes > 512
                 group.create_dataset(
