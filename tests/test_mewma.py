@@ -296,6 +296,13 @@ def test_short_training_trajectories_are_left_out(chart):
     np.testing.assert_array_equal(with_short.score(NOMINAL[0]), chart.score(NOMINAL[0]))
 
 
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_few_trajectories_suffice(n):
+    detector = make_mewma().fit(NOMINAL[:n])
+    x = episode(30)
+    assert detector.score(shifted(x, 40, 5.0))[41:45].min() > detector.score(x)[41:45].max()
+
+
 def test_scoring_before_fit_is_refused():
     with pytest.raises(NotFittedError, match="'mewma-a' was asked for scores before fit"):
         make_mewma_a().score(NOMINAL[0])
@@ -311,7 +318,6 @@ def test_another_width_is_refused(chart):
     ("nominal", "message"),
     [
         ([], "0 trajectories, of which 0 have at least 3 transitions"),
-        (NOMINAL[:1], "1 trajectories, of which 1 have"),
         ([x[:1] for x in NOMINAL], "12 trajectories, of which 0 have"),
         ([NOMINAL[0], Trajectory(np.zeros((9, 2)), np.zeros((8, 1)))], r"\[\(2, 1\), \(4, 1\)\]"),
     ],

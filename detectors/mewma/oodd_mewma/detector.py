@@ -69,8 +69,9 @@ class MewmaDetector:
     -----
     Residuals, covariances, m and q come from nominal trajectories that the regression (and for m
     and q, the covariance) has not seen: five folds take turns, and scoring uses what all of them
-    give together. With autocorrelated residuals, as for h > 1, the variance of the first steps is
-    approximate.
+    give together. Fewer than five trajectories are as many folds; a single one judges itself,
+    which makes nominal scores of others too high. With autocorrelated residuals, as for h > 1, the
+    variance of the first steps is approximate.
 
     Source: Lowry, Woodall, Champ & Rigdon, "A multivariate exponentially weighted moving average
     control chart", Technometrics 34 (1992).
@@ -106,16 +107,16 @@ class MewmaDetector:
         Raises
         ------
         TrajectoryError
-            When fewer than two trajectories are long enough for a forecast, or they differ in
-            their number of sensors or the width of their actions.
+            When no trajectory is long enough for a forecast, or they differ in their number of
+            sensors or the width of their actions.
         """
         usable = [x for x in nominal if x.transitions >= self._first]
         widths = {(x.observation_dim, x.action_dim) for x in nominal}
-        if len(usable) < 2 or len(widths) != 1:
+        if not usable or len(widths) != 1:
             raise TrajectoryError(
                 f"detector {self._name!r} cannot be fitted on {len(nominal)} trajectories, of "
                 f"which {len(usable)} have at least {self._first} transitions, of (sensors, "
-                f"action columns) {sorted(widths)}: expected at least two that long, all of the "
+                f"action columns) {sorted(widths)}: expected at least one that long, all of the "
                 "same shape"
             )
         self._widths = widths.pop()
@@ -130,7 +131,9 @@ class MewmaDetector:
         every = reduce(add, moments)
         self.coefficients_ = every.solve(self.ridge)
         # What scoring will see: residuals of forecasts that were fitted to other trajectories.
-        unseen = [(every - own).solve(self.ridge) for own in moments]
+        # A single trajectory has no others, and judges itself.
+        alone = len(folds) == 1
+        unseen = [(every if alone else every - own).solve(self.ridge) for own in moments]
 
         squares, rows = np.zeros(self._widths[0]), 0
         for fold, coefficients in zip(folds, unseen, strict=True):
@@ -151,7 +154,8 @@ class MewmaDetector:
 
         distances: list[Floats] = []
         for fold, coefficients, own, n in zip(folds, unseen, sums, counts, strict=True):
-            root = self._whitening((total - own) / (count - n))
+            others = total / count if alone else (total - own) / (count - n)
+            root = self._whitening(others)
             distances += [self._distances(self._smoothed(x, coefficients), root) for x in fold]
         pooled = np.concatenate(distances, axis=1)  # (W, N)
         self.distance_mean_ = pooled.mean(axis=1, keepdims=True)
