@@ -1,0 +1,211 @@
+"""Records and results directories: what is written is what is read."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.records import SCHEMA, STATUSES, Metric, Record
+from oodd_eval.results import ResultsDirectory, ScoreFile, UnitKey
+
+NAN = float("nan")
+
+
+def record(**changes):
+    fields = {
+        "cell": "mini/hopper/iid::rf[h=1,seed=0]", "detector": "rf", "detector_version": "1.0",
+        "plugin": "oodd-eval:rf", "parameters": {"trees": 50}, "environment": "hopper",
+        "anomaly": "iid", "group": "sensor", "horizon": 1, "seed": 0, "split": "mini",
+        "split_digest": "ab" * 32, "status": "ok", "protocol": 1,
+        "metrics": {"auc": Metric(0.75, 0.5, 1.0, 2), "delay": Metric(NAN, NAN, NAN, 0)},
+        "counts": {"test": 2}, "per_trajectory": {"auc": ([1.0, 0.5], [1.0, 1.0])},
+        "seconds_fit": 1.5, "provenance": {"limit": None, "overrides": {}},
+    }  # fmt: skip
+    return Record(**{**fields, **changes})
+
+
+def same(one, two):
+    """Equality that takes NaN as equal to NaN."""
+    return repr(one) == repr(two)
+
+
+def test_json_round_trip():
+    assert same(Record.from_json(record().to_json()), record())
+
+
+@given(
+    value=st.floats(allow_infinity=False),
+    reason=st.text(max_size=40),
+    parameters=st.dictionaries(
+        st.text(max_size=5), st.integers() | st.text(max_size=5), max_size=3
+    ),
+    status=st.sampled_from(STATUSES),
+)
+def test_json_round_trip_of_anything(value, reason, parameters, status):
+    one = record(
+        metrics={"auc": Metric(value, value, NAN, 3)}, reason=reason, parameters=parameters,
+        status=status, per_trajectory={"auc": ([value], [1.0])},
+    )  # fmt: skip
+    line = one.to_json()
+    assert "\n" not in line
+    assert same(Record.from_json(line), one)
+
+
+def test_undefined_is_null():
+    plain = json.loads(record().to_json())
+    assert plain["metrics"]["delay"] == {"value": None, "low": None, "high": None, "n": 0}
+    assert plain["seconds_score"] is None
+    assert "NaN" not in record().to_json()
+
+
+def test_fields_are_those_of_the_specification():
+    assert set(json.loads(record().to_json())) == {
+        "schema", "protocol", "detector", "detector_version", "plugin", "parameters",
+        "environment", "anomaly", "group", "horizon", "seed", "split", "split_digest", "status",
+        "reason", "metrics", "counts", "seconds_fit", "seconds_score", "peak_rss_mb",
+        "provenance", "per_trajectory", "cell",
+    }  # fmt: skip
+
+
+def test_a_metric_that_a_record_lacks_is_nan():
+    assert record().value("auc") == 0.75
+    assert math.isnan(record().value("far"))
+
+
+def changed(**changes):
+    return json.dumps({**json.loads(record().to_json()), **changes})
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "r:1 is not JSON"),
+        ("[]", "r:1 is list, expected a JSON object"),
+        ("{}", f"has schema None, expected {SCHEMA}"),
+        (changed(schema=99), "has schema 99, expected 1: it was written by another version"),
+        (changed(more=1), r"unknown \['more'\]"),
+        (json.dumps({"schema": SCHEMA}), r"missing \['anomaly', 'cell'"),
+        (changed(status="fine"), "status is 'fine', expected one of ok, error"),
+        (changed(seed="0"), "seed is '0', expected"),
+        (changed(horizon=True), "horizon is True, expected"),
+        (changed(metrics={"auc": {"value": "x"}}), "metrics cannot be read"),
+        (changed(per_trajectory={"auc": [[1.0]]}), "metrics cannot be read"),
+    ],
+)
+def test_what_is_no_record_is_refused_by_name(line, message):
+    with pytest.raises(ResultsError, match=message):
+        Record.from_json(line, "r:1")
+
+
+def test_merging_replaces_the_same_cell_in_its_place(tmp_path):
+    results = ResultsDirectory(tmp_path)
+    first, other = record(), record(cell="mini/ant/iid::rf[h=1,seed=0]", environment="ant")
+    results.merge_records([first, other])
+    newer = record(status="error", reason="worse", metrics={})
+    merged = results.merge_records([newer])
+    assert [(r.cell, r.status) for r in merged] == [(first.cell, "error"), (other.cell, "ok")]
+    assert same(results.records(), merged)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"split_digest": "cd" * 32},
+        {"protocol": 2},
+        {"parameters": {"trees": 60}},
+        {"provenance": {"limit": 3, "overrides": {}}},
+    ],
+)
+def test_merging_keeps_what_is_not_the_same_cell(tmp_path, change):
+    results = ResultsDirectory(tmp_path)
+    results.merge_records([record()])
+    assert len(results.merge_records([record(**change)])) == 2
+
+
+def test_a_directory_without_records_says_so(tmp_path):
+    with pytest.raises(ResultsError, match=r"expected a file records\.jsonl"):
+        ResultsDirectory(tmp_path / "nowhere").records()
+
+
+def test_a_bad_line_is_named(tmp_path):
+    (tmp_path / "records.jsonl").write_text(record().to_json() + "\n{\n")
+    with pytest.raises(ResultsError, match=r"records\.jsonl:2 is not JSON"):
+        ResultsDirectory(tmp_path).records()
+
+
+SCORES = ScoreFile(
+    {"calibration": [np.array([np.nan, 1.0])], "test/iid": [np.array([0.1]), np.array([2.0, 3.0])]},
+    {"seconds_fit": 1.5},
+)
+LENGTHS = {"calibration": [2], "test/iid": [1, 2]}
+
+
+@pytest.fixture
+def results(tmp_path):
+    directory = ResultsDirectory(tmp_path)
+    directory.prepare()
+    directory.write_scores("key", SCORES)
+    return directory
+
+
+def test_scores_are_read_back_bit_for_bit(results):
+    read = results.scores("key", LENGTHS)
+    assert read.cost == SCORES.cost
+    for part, sequences in SCORES.parts.items():
+        for one, two in zip(sequences, read.parts[part], strict=True):
+            assert one.tobytes() == two.tobytes()
+
+
+def test_equal_scores_are_equal_files(results, tmp_path):
+    results.write_scores("again", SCORES)
+    one, two = ((tmp_path / "scores" / f"{k}.h5").read_bytes() for k in ("key", "again"))
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [{"test/drift": [1]}, {"test/iid": [1, 3]}, {"test/iid": [1]}, {"calibration": [2, 1]}],
+)
+def test_scores_that_do_not_fit_are_no_scores(results, lengths):
+    assert results.scores("key", lengths) is None
+    assert results.scores("nokey", LENGTHS) is None
+
+
+def test_further_parts_are_added_to_earlier_ones(results):
+    results.write_scores("key", ScoreFile({"test/drift": [np.array([5.0])]}, {}))
+    assert results.scores("key", {**LENGTHS, "test/drift": [1]}) is not None
+
+
+def test_a_failed_write_leaves_no_file_behind(results, tmp_path):
+    class Unwritable:
+        def __len__(self):
+            raise OSError("disk full")
+
+    with pytest.raises(OutputError, match="disk full"):
+        results.write_scores("new", ScoreFile({"x": [Unwritable()]}, {}))
+    assert [p.name for p in (tmp_path / "scores").iterdir()] == ["key.h5"]
+
+
+KEY = UnitKey("oodd-x", "1.0", "aa", "x", {"b": 1, "a": 2}, 0, 1, "hopper", "dd", None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"distribution": "oodd-y"}, {"version": "1.1"}, {"source": "bb"}, {"detector": "y"},
+        {"parameters": {"b": 2, "a": 2}}, {"seed": 1}, {"horizon": 2}, {"environment": "ant"},
+        {"split_digest": "ee"}, {"limit": 3}, {"protocol": 2},
+    ],
+)  # fmt: skip
+def test_everything_that_decides_scores_is_in_the_key(change):
+    assert {f.name for f in dataclasses.fields(KEY)} >= set(change)
+    assert dataclasses.replace(KEY, **change).text != KEY.text
+
+
+def test_the_order_of_parameters_is_not_in_the_key():
+    assert dataclasses.replace(KEY, parameters={"a": 2, "b": 1}).text == KEY.text
