@@ -306,7 +306,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
             arrays[f"{group}:{name}"] = array
     partial = work / f"{chunk.file_name}.{os.getpid()}.partial"
     with partial.open("wb") as out:
-        np.savez(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez(out, allow_pickle=False, **arrays)
     partial.replace(work / chunk.file_name)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import types
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -40,7 +41,6 @@ class Simulator(Protocol):
     ``wind`` is read every step: -1, 0 or +1, the direction into which a gust pushes in this step.
     """
 
-    attributes: ClassVar[tuple[str, ...]]
     wind: int
 
     def reset(self, seed: int) -> Row:
@@ -64,7 +64,7 @@ class Simulator(Protocol):
         ...
 
 
-class _Acrobot(AcrobotEnv):  # type: ignore[misc]
+class _Acrobot(AcrobotEnv):
     """Acrobot whose gravity can be changed.
 
     The stock equations hold gravity as a local constant. They stay in force until gravity is
@@ -75,7 +75,7 @@ class _Acrobot(AcrobotEnv):  # type: ignore[misc]
 
     def _dsdt(self, s_augmented: Any) -> Any:
         if self.gravity == _Acrobot.gravity:
-            return super()._dsdt(s_augmented)
+            return super()._dsdt(s_augmented)  # type: ignore[no-untyped-call]
         return self.derivative(s_augmented)
 
     def derivative(self, state: Any) -> tuple[float, float, float, float, float]:
@@ -105,10 +105,9 @@ class _Acrobot(AcrobotEnv):  # type: ignore[misc]
 class Acrobot:
     """Acrobot-v1: torque on the joint between two links; wind adds torque of its own sign."""
 
-    attributes = ("gravity", "link_length_1", "link_length_2", "link_mass_1", "link_mass_2")
-
     def __init__(self) -> None:
-        self.env, self.wind = _Acrobot(), 0
+        self.env: Any = _Acrobot()
+        self.wind = 0
 
     def reset(self, seed: int) -> Row:
         return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
@@ -144,10 +143,9 @@ class Acrobot:
 class CartPole:
     """CartPole-v1: a push of 10 N to the left or right; wind takes pushes away or doubles them."""
 
-    attributes = ("gravity", "pole_length", "pole_mass")
-
     def __init__(self) -> None:
-        self.env, self.wind = CartPoleEnv(), 0
+        self.env: Any = CartPoleEnv()
+        self.wind = 0
         self._force = self.env.force_mag
 
     def reset(self, seed: int) -> Row:
@@ -183,10 +181,9 @@ class CartPole:
 class LunarLander:
     """LunarLander-v3: engine 1 pushes to -x, engine 3 to +x, engine 2 upwards."""
 
-    attributes = ("gravity", "main_engine_power", "side_engine_power")
-
     def __init__(self) -> None:
-        self.env, self.wind = lunar_lander.LunarLander(), 0
+        self.env: Any = lunar_lander.LunarLander()
+        self.wind = 0
         # Engine powers are globals of the simulator's module. This instance's step gets a copy of
         # these globals, so that a changed power is seen by this episode alone.
         self._globals = dict(vars(lunar_lander))
@@ -232,11 +229,11 @@ class LunarLander:
 class Bullet:
     """One of the four PyBullet robots in a client of its own; wind adds to every motor command."""
 
-    attributes = ("gravity", "power")
     wind_strength: ClassVar[float] = 0.33
 
     def __init__(self, kind: type) -> None:
-        self.env, self.wind = kind(), 0
+        self.env: Any = kind()
+        self.wind = 0
 
     def reset(self, seed: int) -> Row:
         with quiet_streams():
@@ -272,7 +269,11 @@ _BULLET = {
     "hopper": bullet.HopperBulletEnv,
     "walker2d": bullet.Walker2DBulletEnv,
 }
-_CLASSIC = {"acrobot": Acrobot, "cartpole": CartPole, "lunarlander": LunarLander}
+_CLASSIC: dict[str, Callable[[], Simulator]] = {
+    "acrobot": Acrobot,
+    "cartpole": CartPole,
+    "lunarlander": LunarLander,
+}
 
 
 def make(environment: str) -> Simulator:

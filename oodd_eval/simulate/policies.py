@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -115,18 +116,23 @@ def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     info = ENVIRONMENTS[environment]
     file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        with file.open("rb") as source, np.load(source, allow_pickle=False) as stored:
+            arrays = {n: stored[n] for n in LAYERS[info.policy] if n in stored.files}
     except FileNotFoundError:
         raise PolicyError(
             f"no policy for {environment}: {file.name} does not exist; train one with "
             f"`oodd-eval policies train --env {environment}`"
         ) from None
-    except (BadZipFile, ValueError, OSError, EOFError) as error:
+    # TypeError: a single array instead of an npz, which cannot be entered.
+    except (BadZipFile, ValueError, TypeError, OSError, EOFError, zlib.error) as error:
         raise PolicyError(
             f"{file.name} is not a policy file (expected an npz of plain arrays): {error}"
         ) from error
     _check(file.name, info, arrays)
+    return _make(info, arrays)
+
+
+def _make(info: EnvironmentInfo, arrays: Arrays) -> Policy:
     return TD3Policy(arrays) if info.policy == "TD3" else IQNPolicy(arrays)
 
 
@@ -137,15 +143,24 @@ def _check(file: str, info: EnvironmentInfo, arrays: Arrays) -> None:
             f"{file} lacks the arrays {', '.join(missing)} of a {info.policy} policy for {info.id}"
         )
     last = arrays["b3"] if info.policy == "TD3" else arrays["b4"]
-    found = (arrays["W1"].shape[0], last.shape[-1])
+    found = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
     if found != (info.observation_dim, info.action_dim):
         raise PolicyError(
             f"{file} maps {found[0]} sensors to {found[1]} actions, expected "
             f"{info.observation_dim} and {info.action_dim} for {info.id}"
         )
+    if any(a.dtype.kind not in "fiu" for a in arrays.values()):
+        raise PolicyError(f"{file} holds arrays that are not numbers, expected float32 weights")
     bad = [name for name, a in arrays.items() if not np.isfinite(a).all()]
     if bad:
         raise PolicyError(f"{file} holds values that are not finite in {', '.join(bad)}")
+    try:
+        _make(info, arrays).act(np.zeros(info.observation_dim, np.float32))
+    except (ValueError, TypeError, IndexError) as error:
+        raise PolicyError(
+            f"{file} holds layers that do not fit one another, expected the {info.policy} policy's "
+            f"chain of matrices: {error}"
+        ) from error
 
 
 def provenance(environment: str) -> dict[str, Any]:
@@ -178,7 +193,7 @@ def freeze_policy(
     directory.mkdir(parents=True, exist_ok=True)
     partial = directory / f"{environment}.npz.partial"
     with partial.open("wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **packed)  # type: ignore[arg-type]
+        np.savez_compressed(out, allow_pickle=False, **packed)
     partial.replace(directory / f"{environment}.npz")
     text = json.dumps({"environment": environment, **facts, "digest": digest}, indent=1)
     (directory / f"{environment}.json").write_text(text + "\n", encoding="utf-8")

@@ -165,7 +165,9 @@ def _run(environment: str, seed: int, policy: Policy, episode_cap: int | None) -
     try:
         row = simulator.reset(seed)
         check_observation(environment, row)
-        rows, actions, rewards, over = [row], [], [], False
+        rows, over = [row], False
+        actions: list[Any] = []
+        rewards: list[float] = []
         while not over and len(rewards) < _cap(environment, episode_cap):
             actions.append(policy.act(rows[-1]))
             row, reward, over = simulator.step(actions[-1])

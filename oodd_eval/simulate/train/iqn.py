@@ -59,7 +59,7 @@ class Network(nn.Module):
         )
         self.embedding = nn.Linear(cosines, width)
         self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, actions))
-        self.register_buffer("frequencies", math.pi * torch.arange(cosines), persistent=False)
+        self.frequencies = math.pi * torch.arange(cosines)
 
     def forward(self, rows: Tensor, tau: Tensor) -> Tensor:
         """Return quantiles of the return of every action at levels `tau`."""
@@ -69,7 +69,7 @@ class Network(nn.Module):
 
     def arrays(self, quantiles: int) -> dict[str, np.ndarray[Any, Any]]:
         """Return the weights as a policy file holds them."""
-        layers = {"W1": self.state[0], "W2": self.state[2], "C": self.embedding,
+        layers: dict[str, Any] = {"W1": self.state[0], "W2": self.state[2], "C": self.embedding,
                   "W3": self.head[0], "W4": self.head[2]}  # fmt: skip
         biases = {"W1": "b1", "W2": "b2", "C": "c", "W3": "b3", "W4": "b4"}
         found: dict[str, np.ndarray[Any, Any]] = {"quantiles": np.array(quantiles)}
@@ -233,6 +233,6 @@ def _update(
     torch.nn.utils.clip_grad_norm_(online.parameters(), 10.0)
     optimiser.step()
     with torch.no_grad():
-        torch._foreach_lerp_(  # noqa: SLF001  # the fused form of the target update
+        torch._foreach_lerp_(  # the fused form of the target update
             list(target.parameters()), list(online.parameters()), p["target_rate"]
         )
