@@ -29,12 +29,11 @@ def render(records: Sequence[Record], *, intervals: bool = False) -> str:
 def table(one: Table) -> str:
     """Return a table as Markdown under its title."""
     escaped = [[_escape(cell) for cell in row] for row in one.rows]
-    align = ("left", *["right"] * (len(one.header) - 1))
     text = tabulate(
         escaped,
         headers=[_escape(h) for h in one.header],
         tablefmt="pipe",
-        colalign=align if escaped else None,
+        colalign=one.alignment if escaped else None,
         disable_numparse=True,
     )
     return f"### {one.title}\n\n{text}\n"
@@ -45,7 +44,7 @@ def _board(board: Board, *, intervals: bool) -> str:
     parts = [
         f"## Split {_escape(board.split)}",
         "",
-        f"{len(board.records)} cells, {ok} ok, {len(board.records) - ok} failed.",
+        f"Cells: {len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed.",
         "",
         *(f"**{_escape(sentence)}**\n" for sentence in tables.findings(board)),
         table(tables.ranking(board, intervals=intervals)),
@@ -57,7 +56,8 @@ def _board(board: Board, *, intervals: bool) -> str:
     parts += [table(tables.by_anomaly(board, e, intervals=intervals)) for e in board.entries]
     if failures := board.failures():
         rows = [[r.environment, r.cell.partition("::")[2], r.status, r.reason] for r in failures]
-        parts.append(table(Table("Failures", ["environment", "detector", "state", "reason"], rows)))
+        header = ["environment", "detector", "state", "reason"]
+        parts.append(table(Table("Failures", header, rows, labels=4)))
     parts += [f"- {_escape(line)}" for line in tables.notes(board)]
     return "\n".join(parts) + "\n"
 

@@ -36,11 +36,17 @@ SIMPLE: Final = ("random", "persistence", "clock", "rf")
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A titled table of texts."""
+    """A titled table of texts; the first `labels` columns are set to the left."""
 
     title: str
     header: list[str]
     rows: list[list[str]]
+    labels: int = 1
+
+    @property
+    def alignment(self) -> tuple[str, ...]:
+        """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
+        return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
 
     def transposed(self) -> Table:
         """Return the table with rows and columns exchanged."""
@@ -127,11 +133,16 @@ def anomaly_groups(
                     for e in entries
                 }  # fmt: skip
                 defined = [means[e].value for e in averaged if not math.isnan(means[e].value)]
-                average = Value(sum(defined) / len(defined), cells=1) if defined else Value(cells=1)
+                average = Value(
+                    sum(defined) / len(defined) if defined else math.nan,
+                    cells=1,
+                    partial=any(means[e].state or means[e].partial for e in averaged),
+                )
                 row += [show_value(v, metric) for v in [*means.values(), average]]
             rows.append(row)
-    of = f"{groups[0]}-injected anomalies" if len(groups) == 1 else "anomaly groups"
-    return Table(f"AUC (%), delay (steps) and false-alarm rate, {of}, Δ = {horizon}", header, rows)
+    of = f"{groups[0]}-injected anomalies" if len(groups) == 1 else "by anomaly group"
+    title = f"AUC (%), delay (steps), false-alarm rate, {of}, Δ = {horizon}"
+    return Table(title, header, rows, labels=2)
 
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:

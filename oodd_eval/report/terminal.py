@@ -170,12 +170,11 @@ def summary(records: Sequence[Record]) -> str:
 
 
 def _set(table: Table) -> str:
-    align = ("left", *["right"] * (len(table.header) - 1))
     text: str = tabulate(
         table.rows,
         headers=table.header,
         tablefmt="simple",
-        colalign=align if table.rows else None,
+        colalign=table.alignment if table.rows else None,
         disable_numparse=True,
     )
     return text

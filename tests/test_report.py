@@ -1,0 +1,245 @@
+"""Reports: golden Markdown, tables worked by hand, terminal output of 80 columns."""
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+from helpers_records import example, make_record
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from oodd_eval.intervals import bootstrap_weights, mean_interval
+from oodd_eval.report import markdown, tables
+from oodd_eval.report.board import Board, boards, contribution
+from oodd_eval.report.tables import Table
+from oodd_eval.report.terminal import TerminalReporter, summary
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+@pytest.mark.parametrize(
+    ("name", "records", "intervals"),
+    [
+        ("report", example(), False),
+        ("report-intervals", [r for r in example() if r.detector in ("riqn", "clock")], True),
+        ("report-nothing-ok", [make_record(status="error", reason="x | <b>y</b>")], False),
+    ],
+)
+def test_markdown_is_the_golden_file(name, records, intervals):
+    text = markdown.render(records, intervals=intervals)
+    file = GOLDEN / f"{name}.md"
+    if "OODD_EVAL_WRITE_GOLDEN" in os.environ:
+        file.write_text(text, encoding="utf-8")
+    assert text == file.read_text(encoding="utf-8")
+
+
+def test_no_records_are_said_so():
+    assert "No records" in markdown.render([])
+
+
+def cells(table, row):
+    return dict(zip(table.header, table.rows[row], strict=True))
+
+
+def test_ranking_is_by_mean_matched_auc_with_failures_last():
+    ranked = tables.ranking(Board(example()))
+    assert [row[0] for row in ranked.rows] == ["riqn", "persistence", "clock", "rf"]
+    # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
+    assert cells(ranked, 0) == {
+        "detector": "riqn", "mean": "67.5", "sensor": "70.0", "dynamics": "65.0", "ant": "67.5",
+        "hopper": "67.5",
+    }  # fmt: skip
+    # One environment failed: no mean over the other pretends to be one over all.
+    assert cells(ranked, 3)["mean"] == "timeout"
+    assert cells(ranked, 3)["hopper"] == "72.5"
+
+
+def test_table_five_has_the_papers_layout():
+    table = tables.anomaly_groups(Board(example()), 1)
+    detectors = ["riqn", "rf", "persistence", "clock", "AVG"]
+    assert table.header == [
+        "Environment", "Result",
+        *(f"sensor: {d}" for d in detectors), *(f"dynamics: {d}" for d in detectors),
+    ]  # fmt: skip
+    assert [row[:2] for row in table.rows] == [
+        ["Ant", "AUC"], ["Ant", "Delay"], ["Ant", "FAR"],
+        ["Hopper", "AUC"], ["Hopper", "Delay"], ["Hopper", "FAR"],
+    ]  # fmt: skip
+
+
+def test_average_is_over_detectors_without_trivial_rows():
+    row = cells(tables.anomaly_groups(Board(example()), 1), 3)
+    # Hopper, sensor, AUC: riqn 90, rf 80; persistence and clock do not count.
+    assert row["sensor: AVG"] == "85.0"
+    row = cells(tables.anomaly_groups(Board(example()), 1), 0)
+    assert row["sensor: rf"] == "timeout"
+    assert row["sensor: AVG"] == "90.0*"
+
+
+def test_delay_is_over_trajectories_with_an_alarm():
+    assert cells(tables.anomaly_groups(Board(example()), 1), 4)["dynamics: riqn"] == "4.0"
+
+
+def test_undefined_is_a_dash_and_not_run_is_empty():
+    values = {"delay": [None, None]}
+    board = Board([
+        make_record("riqn", values=values),
+        make_record("rf", anomaly="gravity"),
+    ])  # fmt: skip
+    row = cells(tables.anomaly_groups(board, 1), 1)
+    assert row["sensor: riqn"] == "\N{EN DASH}"
+    assert row["sensor: rf"] == ""
+
+
+def test_a_mean_over_fewer_cells_is_marked():
+    board = Board([
+        make_record("riqn"), make_record("riqn", anomaly="drift"), make_record("rf"),
+    ])  # fmt: skip
+    assert {row[0]: row[1] for row in tables.ranking(board).rows} == {"riqn": "50.0", "rf": "50.0*"}
+
+
+def test_seeds_are_averaged_into_one_row():
+    board = Board([
+        make_record(seed=0, values={"auc_matched": [0.4, 0.4]}),
+        make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
+    ])  # fmt: skip
+    assert [row[:2] for row in tables.ranking(board).rows] == [["riqn", "60.0"]]
+    # Trajectories agree within each seed, so that the interval is the seeds' alone.
+    value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
+    assert (value.low, value.high) == (0.4, 0.8)
+
+
+def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
+    records = [
+        make_record(anomaly=a, values={"auc_matched": v})
+        for a, v in (("iid", [0.1, 0.9]), ("drift", [0.2, 0.6]))
+    ]
+    board = Board(records)
+    value = board.mean(board.entries[0], ["hopper"], ["iid", "drift"], "auc_matched",
+                       intervals=True)  # fmt: skip
+    weights = bootstrap_weights(2, key="hopper")
+    expected = mean_interval([contribution(r, "auc_matched") for r in records], [weights, weights])
+    assert (value.low, value.high) == pytest.approx(expected)
+    assert value.value == pytest.approx((0.5 + 0.4) / 2)
+
+
+def test_settings_and_horizons_are_rows_of_their_own():
+    board = Board([
+        make_record(), make_record(horizon=10), make_record(overrides={"members": 1}),
+    ])  # fmt: skip
+    assert [e.label for e in board.entries] == ["riqn", "riqn[h=10]", "riqn[members=1]"]
+    assert board.horizons == [1, 10]
+    assert tables.anomaly_groups(board, 10).header[2:] == ["riqn", "AVG"]
+
+
+def test_no_table_mixes_digests_protocols_or_limits():
+    records = [make_record(), make_record(digest="cd" * 32), make_record(limit=3)]
+    assert [len(b.records) for b in boards(records)] == [1, 1, 1]
+
+
+def test_a_simple_row_that_wins_is_named():
+    assert tables.findings(Board(example())) == [
+        "rf beats riqn in mean matched AUC: 72.5 against 67.5 over 2 cells."
+    ]
+
+
+def test_persistence_that_wins_is_named_for_both_metrics():
+    board = Board([
+        make_record("riqn", values={"auc": [0.5, 0.5], "auc_matched": [0.5, 0.5]}),
+        make_record("persistence", values={"auc": [0.6, 0.6], "auc_matched": [0.7, 0.7]}),
+    ])  # fmt: skip
+    assert tables.findings(board) == [
+        "persistence beats riqn in mean matched AUC: 70.0 against 50.0 over 1 cell.",
+        "persistence beats riqn in mean AUC: 60.0 against 50.0 over 1 cell.",
+    ]
+
+
+def test_the_clocks_auc_is_no_finding():
+    board = Board([
+        make_record("riqn", values={"auc": [0.5, 0.5]}),
+        make_record("clock", values={"auc": [1.0, 1.0]}),
+    ])  # fmt: skip
+    assert tables.findings(board) == []
+
+
+def test_comparison_is_over_common_cells_only():
+    board = Board([
+        make_record("riqn", values={"auc_matched": [0.6, 0.6]}),
+        make_record("riqn", anomaly="drift", values={"auc_matched": [0.1, 0.1]}),
+        make_record("persistence", values={"auc_matched": [0.5, 0.5]}),
+    ])  # fmt: skip
+    assert tables.findings(board) == []
+
+
+def test_notes_name_split_digest_protocol_and_what_is_missing():
+    notes = " ".join(tables.notes(Board([make_record(limit=3)])))
+    assert "Split mini, digest abababababab, protocol 1, test seeds per environment: 2." in notes
+    assert "first 3 trajectories" in notes
+    assert "Means over sensor anomalies are without calibration, drift, shutdown." in notes
+
+
+@given(st.text(max_size=60))
+def test_no_text_breaks_a_markdown_table(text):
+    record = make_record(status="error", reason=text)
+    report = markdown.render([record])
+    (section,) = [s for s in report.split("### ") if s.startswith("Failures")]
+    rows = [line for line in section.splitlines() if line.startswith("|")]
+    assert len(rows) == 3
+    unescaped = rows[2].replace("\\\\", "").replace("\\|", "")
+    assert unescaped.count("|") == 5
+    assert "<" not in unescaped.replace("\\<", "")
+
+
+def test_a_transposed_table_exchanges_rows_and_columns():
+    table = Table("t", ["a", "b"], [["1", "2"], ["3", "4"], ["5", "6"]])
+    turned = table.transposed()
+    assert (turned.header, turned.rows) == (["a", "1", "3", "5"], [["b", "2", "4", "6"]])
+    assert turned.transposed() == table
+
+
+def reporter(*, width=80, terminal=False, **settings):
+    console = Console(
+        file=io.StringIO(), width=width, force_terminal=terminal, soft_wrap=True, highlight=False,
+        markup=False, _environ={},
+    )  # fmt: skip
+    return TerminalReporter(console, **settings)
+
+
+def printed(one):
+    return one.console.file.getvalue()
+
+
+def test_piped_output_has_no_escapes_and_fits_80_columns():
+    one = reporter()
+    one.tables(example())
+    one.failures(example())
+    text = printed(one)
+    assert "\x1b" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert "TIMEOUT ant/rf[h=1,seed=0]: not done after 5 s (--timeout)" in text
+
+
+def test_a_terminal_gets_colours():
+    one = reporter(terminal=True)
+    one.failures(example())
+    assert "\x1b[31m" in printed(one)
+
+
+def test_a_table_that_is_too_wide_is_turned():
+    one = reporter(width=40)
+    one.table(Table("t", [f"column {i}" for i in range(8)], [[str(i) for i in range(8)]]))
+    assert max(map(len, printed(one).splitlines())) <= 40
+
+
+def test_names_of_others_are_not_taken_for_markup():
+    one = reporter()
+    one.failures([make_record("[red]x", status="error", reason="[/b] oops")])
+    assert "[red]x" in printed(one)
+    assert "[/b] oops" in printed(one)
+
+
+def test_summary_counts_states():
+    assert summary(example()) == "14 ok, 2 timeout"
+    assert summary([]) == "no cells"
