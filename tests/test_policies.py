@@ -1,0 +1,166 @@
+"""Frozen policies: forward passes against second formulas, files and what damage says."""
+
+import json
+
+import numpy as np
+import pytest
+
+from oodd_eval.errors import PolicyError, UnknownNameError
+from oodd_eval.simulate import policies
+from oodd_eval.simulate.policies import content_digest, freeze_policy, load_policy
+
+
+def td3(observation_dim=15, action_dim=3, scale=1.0):
+    rng = np.random.default_rng(3)
+    sizes = [observation_dim, 7, 5, action_dim]
+    arrays = {}
+    for i in (1, 2, 3):
+        arrays[f"W{i}"] = (scale * rng.normal(size=(sizes[i - 1], sizes[i]))).astype("f4")
+        arrays[f"b{i}"] = rng.normal(size=sizes[i]).astype("f4")
+    return arrays
+
+
+def iqn():
+    rng = np.random.default_rng(4)
+    shapes = {"W1": (4, 6), "b1": (6,), "W2": (6, 5), "b2": (5,), "C": (8, 5), "c": (5,),
+              "W3": (5, 9), "b3": (9,), "W4": (9, 2), "b4": (2,)}  # fmt: skip
+    arrays = {name: rng.normal(size=shape).astype("f4") for name, shape in shapes.items()}
+    return arrays | {"quantiles": np.array(3)}
+
+
+@pytest.fixture
+def hopper(tmp_path):
+    freeze_policy("hopper", td3(), {"algorithm": "TD3", "seed": 5}, tmp_path)
+    return tmp_path / "hopper.npz"
+
+
+def test_td3_equals_the_layers_written_out_unit_by_unit(hopper):
+    p, row = td3(), np.linspace(-1, 1, 15, dtype="f4")
+    signal = [float(v) for v in row]
+    for layer in (1, 2, 3):
+        w, b = p[f"W{layer}"].astype(float), p[f"b{layer}"].astype(float)
+        signal = [sum(s * w[i, j] for i, s in enumerate(signal)) + b[j] for j in range(len(b))]
+        signal = np.tanh(signal) if layer == 3 else [max(s, 0.0) for s in signal]
+    found = load_policy("hopper", hopper).act(row)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, signal, rtol=0, atol=2.0**-17 + 1e-9)
+
+
+def test_continuous_actions_lie_on_the_grid_within_bounds(tmp_path):
+    freeze_policy("hopper", td3(scale=30.0), {}, tmp_path)
+    policy = load_policy("hopper", tmp_path / "hopper.npz")
+    rows = np.random.default_rng(0).normal(size=(200, 15)).astype("f4")
+    actions = np.array([policy.act(r) for r in rows], dtype=np.float64)
+    assert (np.abs(actions) <= 1).all()
+    assert np.abs(actions).max() == 1
+    assert (actions * 2**16 == np.round(actions * 2**16)).all()
+
+
+def test_iqn_equals_the_mean_over_quantile_midpoints_one_by_one(tmp_path):
+    p = iqn()
+    freeze_policy("cartpole", p, {}, tmp_path)
+    policy = load_policy("cartpole", tmp_path / "cartpole.npz")
+    for row in np.random.default_rng(1).normal(size=(20, 4)).astype("f4"):
+        psi = np.maximum(p["W1"].T.astype(float) @ row + p["b1"], 0)
+        psi = np.maximum(p["W2"].T.astype(float) @ psi + p["b2"], 0)
+        q = np.zeros(2)
+        for tau in (1 / 6, 3 / 6, 5 / 6):
+            cosines = [np.cos(np.pi * i * tau) for i in range(8)]
+            phi = np.maximum(p["C"].T.astype(float) @ cosines + p["c"], 0)
+            hidden = np.maximum(p["W3"].T.astype(float) @ (psi * phi) + p["b3"], 0)
+            q += (p["W4"].T.astype(float) @ hidden + p["b4"]) / 3
+        np.testing.assert_allclose(policy.values(row), q, rtol=1e-9, atol=1e-9)
+        assert policy.act(row) == int(np.argmax(q))
+
+
+def test_equal_values_go_to_the_first_action(tmp_path):
+    arrays = iqn() | {"W4": np.zeros((9, 2), "f4"), "b4": np.array([1.0, 1.0 + 1e-7], "f4")}
+    freeze_policy("cartpole", arrays, {}, tmp_path)
+    assert load_policy("cartpole", tmp_path / "cartpole.npz").act(np.ones(4, "f4")) == 0
+
+
+def test_freezing_writes_arrays_and_provenance_with_the_digest(hopper, monkeypatch):
+    stored = json.loads(hopper.with_suffix(".json").read_text())
+    assert stored == {
+        "environment": "hopper", "algorithm": "TD3", "seed": 5, "digest": content_digest(td3()),
+    }  # fmt: skip
+    assert load_policy("hopper", hopper).digest == stored["digest"]
+    assert sorted(f.name for f in hopper.parent.iterdir()) == ["hopper.json", "hopper.npz"]
+    monkeypatch.setattr(policies, "FROZEN", hopper.parent)
+    assert policies.provenance("hopper") == stored
+    with pytest.raises(PolicyError, match=r"ant\.json is missing"):
+        policies.provenance("ant")
+
+
+def test_digest_covers_every_weight_and_ignores_order_and_byte_order():
+    p = td3()
+    digest = content_digest(p)
+    assert content_digest(dict(reversed(p.items()))) == digest
+    assert content_digest({k: v.astype(">f4") for k, v in p.items()}) == digest
+    for name in p:
+        changed = p[name].copy()
+        changed.view("u4").flat[-1] ^= 1
+        assert content_digest(p | {name: changed}) != digest, name
+
+
+def test_environment_names_are_checked():
+    with pytest.raises(UnknownNameError, match="hopper"):
+        load_policy("hoper")
+
+
+def test_a_missing_file_says_how_to_train_one(tmp_path):
+    with pytest.raises(PolicyError, match="policies train --env ant"):
+        load_policy("ant", tmp_path / "ant.npz")
+
+
+def test_pickled_objects_are_not_opened(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return exec, ("raise SystemExit('unpickled')",)
+
+    file = tmp_path / "hopper.npz"
+    np.savez(file, W1=np.array([Trap()], dtype=object))
+    with pytest.raises(PolicyError, match="plain arrays"):
+        load_policy("hopper", file)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04broken"])
+def test_a_damaged_file_is_named(tmp_path, content):
+    file = tmp_path / "mine.npz"
+    file.write_bytes(content)
+    with pytest.raises(PolicyError, match=r"mine\.npz"):
+        load_policy("hopper", file)
+
+
+def test_a_policy_of_another_algorithm_environment_or_with_nan_is_refused(tmp_path, hopper):
+    with pytest.raises(PolicyError, match=r"15 sensors to 3 actions, expected 22 and 6"):
+        load_policy("walker2d", hopper)
+    with pytest.raises(PolicyError, match=r"lacks the arrays C, c, W4, b4, quantiles"):
+        load_policy("cartpole", hopper)
+    with pytest.raises(PolicyError, match="not finite in b2"):
+        freeze_policy("hopper", td3() | {"b2": np.full(5, np.nan)}, {}, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_layers_that_do_not_fit_one_another_are_refused(tmp_path):
+    np.savez(tmp_path / "hopper.npz", **(td3() | {"W2": np.zeros((8, 5), "f4")}))
+    with pytest.raises(PolicyError, match="do not fit"):
+        load_policy("hopper", tmp_path / "hopper.npz")
+
+
+def test_a_single_array_is_not_a_policy(tmp_path):
+    with (tmp_path / "hopper.npz").open("wb") as out:
+        np.save(out, np.zeros(3))
+    with pytest.raises(PolicyError, match=r"hopper\.npz is not a policy file"):
+        load_policy("hopper", tmp_path / "hopper.npz")
+
+
+def test_arrays_of_text_are_refused(tmp_path):
+    np.savez(tmp_path / "hopper.npz", **(td3() | {"b1": np.array(["1"] * 7)}))
+    with pytest.raises(PolicyError, match="not numbers"):
+        load_policy("hopper", tmp_path / "hopper.npz")
+
+
+def test_further_arrays_in_a_file_do_not_matter(tmp_path):
+    np.savez(tmp_path / "hopper.npz", **td3(), algorithm=np.array("TD3"))
+    assert load_policy("hopper", tmp_path / "hopper.npz").digest == content_digest(td3())
