@@ -23,7 +23,7 @@ from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 EXIT_CODES: Final = """exit codes:
   0  ok
   1  a cell or check failed, or a plug-in is broken
-  2  interrupted
+  2  interrupted, or nobody reads the output any more
   3  internal error
   4  the request cannot be carried out: unknown name, missing data, no place to write
   5  nothing was selected"""
@@ -222,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read the output has seen enough; nothing more can be written, not even at exit.
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return 2
     except OoddError as error:
         if "-v" in given:
             traceback.print_exc()

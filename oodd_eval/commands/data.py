@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.benchmark import ENVIRONMENTS, SPLITS, SplitDefinition
-from oodd_eval.commands.extras import extra
 from oodd_eval.errors import UsageError
 from oodd_eval.report.terminal import make_console
 from oodd_eval.selection import select
@@ -30,12 +29,11 @@ def build(options: argparse.Namespace) -> int:
         if options.verbosity >= 0:
             console.print(f"{done}/{total}  {what}")
 
-    with extra("sim", "recording"):
-        from oodd_eval.simulate.build import build_split  # noqa: PLC0415  an extra
+    from oodd_eval.simulate.build import build_split  # noqa: PLC0415  an extra
 
-        build_split(
-            definition, directory, environments=environments, jobs=options.jobs, progress=progress
-        )
+    build_split(
+        definition, directory, environments=environments, jobs=options.jobs, progress=progress
+    )
     split = load_split(directory)
     console.print(f"split {split.name}, digest {split.digest}, in {directory}")
     return 0

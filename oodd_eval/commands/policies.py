@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from oodd_eval.benchmark import ENVIRONMENTS
-from oodd_eval.commands.extras import extra
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.report.terminal import make_console
 
@@ -20,16 +19,15 @@ def train(options: argparse.Namespace) -> int:
         if options.verbosity >= 0:
             console.print(line)
 
-    with extra("train", "training"):
-        from oodd_eval.simulate.train import train_policy  # noqa: PLC0415  an extra
+    from oodd_eval.simulate.train import train_policy  # noqa: PLC0415  an extra
 
-        best = train_policy(
-            options.environment,
-            out=Path(options.output),
-            steps=options.steps,
-            seed=options.seed,
-            progress=progress,
-        )
+    best = train_policy(
+        options.environment,
+        out=Path(options.output),
+        steps=options.steps,
+        seed=options.seed,
+        progress=progress,
+    )
     console.print(f"best policy in {best}")
     return 0
 
@@ -39,12 +37,11 @@ def evaluate(options: argparse.Namespace) -> int:
     _check(options.environment)
     if options.episodes < 1:
         raise UsageError(f"--episodes is {options.episodes}, expected at least 1")
-    with extra("sim", "running a policy"):
-        from oodd_eval.simulate.policies import load_policy  # noqa: PLC0415  an extra
-        from oodd_eval.simulate.train import evaluate_policy  # noqa: PLC0415  an extra
+    from oodd_eval.simulate.policies import load_policy  # noqa: PLC0415  an extra
+    from oodd_eval.simulate.train import evaluate_policy  # noqa: PLC0415  an extra
 
-        policy = load_policy(options.environment, options.policy)
-        found = evaluate_policy(options.environment, policy, episodes=options.episodes)
+    policy = load_policy(options.environment, options.policy)
+    found = evaluate_policy(options.environment, policy, episodes=options.episodes)
     paper = ENVIRONMENTS[options.environment].paper_return
     make_console().print(
         f"{options.environment}: return {found.mean:.1f} ± {found.std:.1f} over "

@@ -23,9 +23,15 @@ from oodd_eval.report.tables import Table
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Let the program see the error; rich would end the process with a failure's code."""
+        raise BrokenPipeError
+
+
 def make_console() -> Console:
     """Return a console on standard output: coloured on a terminal, plain text in a pipe."""
-    return Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True)
+    return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True)
 
 
 class TerminalReporter:

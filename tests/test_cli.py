@@ -1,0 +1,409 @@
+"""The command line: answers, exit codes, and what is said where."""
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from helpers_plugins import install
+from helpers_split import make_split
+
+from oodd_eval import cli
+from oodd_eval.commands import listing
+from oodd_eval.results import ResultsDirectory
+
+
+@pytest.fixture
+def run(tiny_split, tmp_path, capsys, monkeypatch):
+    """Call the command line in an empty directory: exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tiny_split.parent))
+
+    def call(*arguments):
+        code = cli.main([str(a) for a in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+BUILD = ["data", "build", "dev", "--train=1", "--calibration=1", "--test=1", "--seed-base=9"]
+CLOCK = ("run", "--detector", "clock", "--env", "cartpole", "--split", "tiny", "--jobs", "1")
+
+
+def test_a_run_prints_and_writes_its_results(run, tmp_path):
+    code, out, err = run(*CLOCK)
+    assert (code, err) == (0, "")
+    assert "split tiny, digest" in out
+    assert re.search(r"^ok +cartpole/clock\[h=1,seed=0\]  matched AUC 50.0", out, re.MULTILINE)
+    assert re.search(r"^8 ok in \d+\.\d s$", out, re.MULTILINE)
+    assert len((tmp_path / "oodd-results" / "records.jsonl").read_text().splitlines()) == 8
+    assert "### Matched AUC" in (tmp_path / "oodd-results" / "report.md").read_text()
+
+
+def test_piped_output_is_plain_and_fits_80_columns(run):
+    _, out, _ = run(*CLOCK, "--output", "a/rather/deep/directory")
+    assert "\x1b" not in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_quiet_prints_the_summary_only(run):
+    assert re.fullmatch(r"8 ok in \d+\.\d s\n", run(*CLOCK, "-q")[1])
+
+
+def test_verbose_prints_a_line_per_cell(run):
+    out = run(*CLOCK, "-v")[1]
+    assert "ok           tiny/cartpole/iid::clock[h=1,seed=0]" in out
+
+
+def test_a_second_run_says_what_it_resumed(run):
+    run(*CLOCK)
+    assert "8 ok (8 from earlier runs) in" in run(*CLOCK)[1]
+
+
+def test_collect_only_prints_cells_and_does_nothing(run, tmp_path):
+    code, out, _ = run(*CLOCK, "--collect-only", "-k", "wind or iid")
+    assert code == 0
+    assert out.splitlines() == [
+        *(f"tiny/cartpole/{a}::clock[h=1,seed=0]" for a in ("iid", "wind-l2r", "wind-r2l")),
+        "3 cells in 1 fits",
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lists_of_horizons_and_seeds_multiply(run):
+    out = run(*CLOCK, "--collect-only", "--horizon", "1,10", "--seed", "0,1", "-q")[1]
+    assert out == "32 cells in 4 fits\n"
+
+
+FAILING = """
+class Fails(Good):
+    def score(self, x): raise RuntimeError("no")
+
+@hookimpl
+def oodd_detectors():
+    return [DetectorSpec("fails", Fails, "", parameters={"size": 5})]
+"""
+
+
+@pytest.fixture
+def failing(monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "fails", FAILING)
+
+
+def test_a_failing_cell_is_exit_code_1_and_the_others_go_on(run, failing):
+    code, out, _ = run("run", "--detector", "fails,clock", "--env", "cartpole", "--split", "tiny")
+    assert code == 1
+    assert "8 ok, 8 error in" in out
+    assert "ERROR cartpole/fails[h=1,seed=0]: RuntimeError: no" in out
+
+
+def test_x_stops_at_the_first_failure(run, failing):
+    code, out, _ = run(
+        "run", "--detector", "fails,clock", "--env", "all", "--split", "tiny", "--jobs", "1", "-x"
+    )
+    assert code == 1
+    assert re.search(r"^8 error in", out, re.MULTILINE)
+
+
+def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "bad", "import no_such")
+    code, out, err = run(*CLOCK)
+    assert code == 1
+    assert "8 ok in" in out
+    assert "plug-in 'bad' of oodd-bad is broken: ModuleNotFoundError: No module named" in err
+    code, out, _ = run("list", "detectors")
+    assert code == 1
+    assert re.search(r"^bad +oodd-bad +\[broken plug-in\] ModuleNotFoundError", out, re.MULTILINE)
+    assert run(*CLOCK, "-p", "no:bad")[0] == 0
+
+
+def test_an_unavailable_detector_is_listed_with_the_command_and_fails_when_run(
+    run, monkeypatch, tmp_path_factory
+):
+    code = """
+    @hookimpl
+    def oodd_detectors():
+        return [DetectorSpec("far", Good, "", requires=("no_such",), extra="oodd-far[all]")]
+    """
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "far", code)
+    assert (
+        '[unavailable: needs no_such: pip install "oodd-far[all]"]' in run("list", "detectors")[1]
+    )
+    code, out, _ = run("run", "--detector", "far", "--env", "cartpole", "--split", "tiny")
+    assert code == 1
+    assert "8 unavailable in" in out
+
+
+def test_parameters_reach_the_cell_id(run, failing):
+    out = run(
+        "run", "--detector", "fails", "--env", "cartpole", "--split", "tiny", "--anomaly", "iid",
+        "--param", "size=7", "--collect-only",
+    )[1]  # fmt: skip
+    assert out.startswith("tiny/cartpole/iid::fails[h=1,seed=0,size=7]\n")
+
+
+def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path):
+    (tmp_path / "run.toml").write_text(
+        'detector = ["clock", "random"]\nenv = "all"\nsplit = "tiny"\nhorizon = [1, 2]\n'
+        "collect-only = true\nfresh = false\n"
+    )
+    assert run("run", "--config", "run.toml", "-q")[1] == "64 cells in 8 fits\n"
+    assert run("run", "--config", "run.toml", "--env", "hopper", "-q")[1] == "32 cells in 4 fits\n"
+
+
+def test_parameters_come_from_a_file_too(run, tmp_path, failing):
+    (tmp_path / "run.toml").write_text(
+        'detector = "fails"\nenv = "cartpole"\nsplit = "tiny"\ncollect-only = true\n'
+        "[param]\nsize = 7\n"
+    )
+    assert "size=7" in run("run", "--config", "run.toml")[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rn"], "unknown command 'rn': did you mean 'run'?"),
+        (["data", "bild"], "unknown action of data 'bild': did you mean 'build'?"),
+        (["list", "detector"], "unknown thing to list 'detector': did you mean 'detectors'?"),
+        ([], "the following arguments are required: COMMAND"),
+        (
+            [*CLOCK, "--detectr", "x"],
+            "unrecognized arguments: --detectr x: did you mean --detector",
+        ),
+        (["run", "--env", "cartpole"], "--detector is missing"),
+        ([*CLOCK, "--env", "cartpol"], "'cartpol': did you mean 'cartpole'?"),
+        ([*CLOCK, "--detector", "clok"], "unknown detector 'clok': did you mean 'clock'?"),
+        ([*CLOCK, "--anomaly", "wind"], "unknown anomaly 'wind'"),
+        ([*CLOCK, "--split", "tny"], "unknown split 'tny': did you mean 'tiny'?"),
+        ([*CLOCK, "--param", "size=1"], "unknown parameter of clock 'size'"),
+        ([*CLOCK, "--param", "size"], "expected NAME=VALUE"),
+        ([*CLOCK, "--horizon", "0"], "--horizon is '0', expected whole numbers of at least 1"),
+        ([*CLOCK, "--timeout", "soon"], "'soon' is not a time such as"),
+        ([*CLOCK, "--memory", "much"], "'much' is not an amount of memory"),
+        ([*CLOCK, "--limit", "0"], "--limit is 0, expected at least 1"),
+        ([*CLOCK, "-k", "(iid"], "a bracket is not closed"),
+        ([*CLOCK, "-p", "no:such"], "unknown plug-in 'such'"),
+        ([*CLOCK, "-p", "such"], "expected -p no:NAME"),
+        ([*CLOCK, "--config", "nowhere.toml"], "'nowhere.toml' cannot be read"),
+        ([*CLOCK, "--output", "file/out"], "cannot be written to"),
+        (["show", "nowhere"], "no results in 'nowhere'"),
+        (["show", "nowhere", "--metric", "acc"], "unknown metric 'acc': did you mean 'auc'?"),
+        (["data", "build", "mini", "--train", "3"], "is published: --train would make another"),
+        (["data", "build", "dev"], "--train, --calibration, --test, --seed-base must be given"),
+        (
+            [*BUILD[:-1], "--seed-base=2"],
+            "--seed-base is 2, expected 4 to 899",
+        ),
+        (["policies", "train", "antt"], "unknown environment 'antt': did you mean 'ant'?"),
+        (["policies", "evaluate", "ant", "--episodes", "0"], "expected at least 1"),
+    ],
+)
+def test_a_wrong_request_is_exit_code_4_with_one_message(run, tmp_path, arguments, message):
+    (tmp_path / "file").write_text("")
+    code, out, err = run(*arguments)
+    assert code == 4, err
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+
+
+def test_verbose_shows_the_traceback_of_an_error(run):
+    err = run(*CLOCK, "-v", "--env", "nowhere")[2]
+    assert "Traceback" in err
+
+
+def test_nothing_selected_is_exit_code_5(run):
+    code, _, err = run(*CLOCK, "-k", "nothing-like-that")
+    assert (code, err) == (5, "oodd-eval: no cell matches -k 'nothing-like-that'\n")
+
+
+def test_an_unforeseen_error_is_exit_code_3_with_a_traceback(run, monkeypatch):
+    monkeypatch.setattr(listing, "run", lambda _: 1 / 0)
+    code, _, err = run("list", "envs")
+    assert code == 3
+    assert "ZeroDivisionError" in err
+    assert "internal error" in err
+
+
+def test_an_interrupt_is_exit_code_2_and_keeps_what_was_finished(
+    tiny_split, tmp_path, monkeypatch, tmp_path_factory
+):
+    plugin = tmp_path_factory.mktemp("plugin")
+    code = """
+    class Sleeps(Good):
+        def fit(self, nominal): time.sleep(600)
+
+    @hookimpl
+    def oodd_detectors(): return offer(sleeps=Sleeps)
+    """
+    install(monkeypatch, plugin, "sleeps", code)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "oodd_eval", "run", "--detector", "clock,sleeps", "--env",
+         "cartpole", "--split", tiny_split, "--output", "out", "--jobs", "2"],
+        cwd=tmp_path, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(plugin)},
+    )  # fmt: skip
+    for line in process.stdout:
+        if line.startswith("ok "):
+            break
+    process.send_signal(signal.SIGINT)
+    rest, _ = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert "8 ok in" in rest
+    assert "interrupted" in rest
+    assert {r.detector for r in ResultsDirectory(tmp_path / "out").records()} == {"clock"}
+
+
+def test_a_reader_that_leaves_ends_the_run_quietly(tiny_split, tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "oodd_eval", *CLOCK[:-4], "--split", tiny_split, "-v"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(30) == 2
+    assert err == ""
+
+
+@pytest.mark.parametrize("kind", ["detectors", "envs", "anomalies", "splits", "metrics"])
+def test_lists_have_one_line_each_name_first(run, kind):
+    code, out, _ = run("list", kind)
+    first = {line.split()[0] for line in out.splitlines()}
+    expected = {"detectors": "clock", "envs": "hopper", "anomalies": "wind-l2r", "splits": "tiny",
+                "metrics": "auc_matched"}  # fmt: skip
+    assert code == 0
+    assert expected[kind] in first
+
+
+def test_show_prints_what_the_run_printed(run):
+    printed = run(*CLOCK)[1]
+    code, shown, _ = run("show", "oodd-results")
+    assert code == 0
+    tables = shown[: shown.index("Split tiny")]
+    assert len(tables) > 500
+    assert tables in printed
+
+
+def test_show_recomputes_metrics_from_scores(run, tmp_path):
+    run(*CLOCK)
+    file = tmp_path / "oodd-results" / "records.jsonl"
+    before = file.read_text()
+    assert '"value": 0.5' in before
+    file.write_text(before.replace("0.5", "0.9"))
+    assert "90.0" in run("show", "oodd-results", "--stored", "--markdown")[1]
+    assert "90.0" not in run("show", "oodd-results", "--markdown")[1]
+
+
+def test_show_needs_no_detector(run, monkeypatch, tmp_path_factory):
+    with monkeypatch.context() as patch:
+        code = "@hookimpl\ndef oodd_detectors(): return offer(gone=Good)"
+        install(patch, tmp_path_factory.mktemp("plugin"), "gone", code)
+        assert run("run", "--detector", "gone", "--env", "cartpole", "--split", "tiny")[0] == 0
+    assert "gone" in run("show", "oodd-results")[1]
+
+
+def test_show_prints_one_detector_by_anomaly(run):
+    run(*CLOCK)
+    out = run("show", "oodd-results", "--detector", "clock", "--metric", "auc")[1]
+    assert "clock: AUC (%) by anomaly" in out
+    assert "100.0" in out
+
+
+def test_show_with_intervals(run):
+    run(*CLOCK)
+    assert "50.0 [50.0, 50.0]" in run("show", "oodd-results", "--intervals")[1]
+
+
+def test_results_of_two_runs_are_reported_together(run, tmp_path):
+    run(*CLOCK)
+    run(*CLOCK, "--detector", "random")
+    report = (tmp_path / "oodd-results" / "report.md").read_text()
+    assert "| clock " in report
+    assert "| random " in report
+
+
+def test_verify_tells_sound_data_from_changed_data(run, tiny_split, tmp_path):
+    code, out, _ = run("data", "verify", "tiny")
+    assert code == 0
+    assert "22 of 22 groups as they should be" in out
+    own = make_split(tmp_path / "own", ("cartpole",))
+    other = make_split(tmp_path / "other", ("cartpole",), seed_base=10)
+    (own / "cartpole.h5").write_bytes((other / "cartpole.h5").read_bytes())
+    code, out, _ = run("data", "verify", own)
+    assert code == 1
+    assert "0 of 11 groups" in out
+    code, _, err = run(*CLOCK, "--split", own)
+    assert code == 4
+    assert "does not match the manifest" in err
+
+
+def test_info_describes_a_split(run):
+    code, out, _ = run("data", "info", "tiny")
+    assert code == 0
+    assert "tiny" in out
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments", "extra"),
+    [
+        ("gymnasium", BUILD, "sim"),
+        ("pybullet", ["policies", "evaluate", "hopper"], "sim"),
+        ("torch", ["policies", "train", "hopper"], "train"),
+    ],
+)
+def test_a_missing_extra_is_named_with_the_command(tmp_path, missing, arguments, extra):
+    code = (
+        f"import sys; sys.modules[{missing!r}] = None\n"
+        f"from oodd_eval.cli import main; sys.exit(main({arguments!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "OODD_EVAL_DATA": str(tmp_path)},
+    )  # fmt: skip
+    assert done.returncode == 4, done.stderr
+    assert f"pip install 'oodd-eval[{extra}]'" in done.stderr
+
+
+def test_every_command_has_help(capsys):
+    for command, actions in cli._ACTIONS.items():
+        for action in actions or ("",):
+            assert cli.main([command, *([action] if action else []), "--help"]) == 0
+            assert "usage: oodd-eval" in capsys.readouterr().out
+
+
+def test_commands_of_the_parser_are_those_that_suggestions_know():
+    parser = cli.build_parser()
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    assert set(commands.choices) == set(cli._ACTIONS)
+    for name, actions in cli._ACTIONS.items():
+        found = [a for a in commands.choices[name]._actions
+                 if isinstance(a, argparse._SubParsersAction)]  # fmt: skip
+        assert {c for a in found for c in a.choices} == set(actions)
+
+
+def test_help_names_every_exit_code(capsys):
+    cli.main(["--help"])
+    out = capsys.readouterr().out
+    assert [int(n) for n in re.findall(r"^  (\d)  ", out, re.MULTILINE)] == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_version_is_printed(capsys):
+    assert cli.main(["--version"]) == 0
+    assert re.fullmatch(r"oodd-eval \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+def test_records_say_where_they_are_from(run, tmp_path):
+    run(*CLOCK)
+    (line, *_) = (tmp_path / "oodd-results" / "records.jsonl").read_text().splitlines()
+    provenance = json.loads(line)["provenance"]
+    assert {"oodd_eval", "git_commit", "git_dirty", "python", "numpy", "platform", "cpu", "time",
+            "plugin_source", "scores"} <= set(provenance)  # fmt: skip
+    assert time.strptime(provenance["time"][:10], "%Y-%m-%d")
