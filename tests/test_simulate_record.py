@@ -73,6 +73,12 @@ def test_sensor_anomalies_touch_their_sensors_alone_at_the_onset(episodes):
             assert (row[chosen] == expected.astype(np.float32)).all(), (environment, anomaly)
 
 
+def test_gravity_acts_on_the_very_transition_onto_the_onset(episodes):
+    environment, found = episodes
+    e, twin = found["gravity"], found[None].trajectory.observations
+    assert (e.trajectory.observations[e.onset] != twin[e.onset]).any(), environment
+
+
 def test_the_policy_acts_on_the_stored_rows(episodes):
     environment, found = episodes
     policy, info = Reflex(environment), ENVIRONMENTS[environment]
