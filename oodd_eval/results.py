@@ -111,12 +111,14 @@ class ResultsDirectory:
         self.path = Path(path)
 
     def prepare(self) -> None:
-        """Make the directory and find out whether it can be written to.
+        """Make the directory and find out, before any work is done, whether it can be used.
 
         Raises
         ------
         OutputError
-            When it cannot. Called before any work is done.
+            When it cannot be written to.
+        ResultsError
+            When it has records already that cannot be read, and so not be added to.
         """
         try:
             for part in ("scores", "logs"):
@@ -128,6 +130,8 @@ class ResultsDirectory:
                 f"results directory {str(self.path)!r} cannot be written to: {error.strerror}; "
                 "name another with --output"
             ) from None
+        if (self.path / RECORDS).exists():
+            self.records()
 
     def records(self) -> list[Record]:
         """Read all records.

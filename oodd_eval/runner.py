@@ -10,6 +10,7 @@ import os
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from typing import Any
 
 from oodd_eval import provenance
 from oodd_eval.evaluation import make_records
@@ -106,10 +107,11 @@ def run(
     try:
         for index, unit in enumerate(plan.units):
             job = UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
-            future = pool.submit(job, settings.limits, stop, results, fresh=settings.fresh)
+            submit = _now if job.offer.plugin == LOCAL else pool.submit
+            future = submit(job, settings.limits, stop, results, fresh=settings.fresh)
             futures[future] = index
         for future in as_completed(futures):
-            index = futures[future]
+            index = futures.pop(future)  # with it go its scores, once they are kept
             unit = plan.units[index]
             offer = plugins.offer(unit.detector)
             scored = future.result()
@@ -133,6 +135,13 @@ def run(
             environment.close()
     plugins.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
     return Run(records, interrupted)
+
+
+def _now(job: UnitJob, *arguments: Any, **settings: Any) -> Future[Scored]:
+    """Do a job in this thread, so that it can be interrupted and may raise, as a finished future."""
+    future: Future[Scored] = Future()
+    future.set_result(job(*arguments, **settings))
+    return future
 
 
 def _keep(

@@ -227,10 +227,25 @@ def test_a_terminal_gets_colours():
     assert "\x1b[31m" in printed(one)
 
 
+WIDE = Table("t", [f"column {i}" for i in range(8)], [[str(i) for i in range(8)]])
+
+
 def test_a_table_that_is_too_wide_is_turned():
     one = reporter(width=40)
-    one.table(Table("t", [f"column {i}" for i in range(8)], [[str(i) for i in range(8)]]))
+    one.table(WIDE)
     assert max(map(len, printed(one).splitlines())) <= 40
+    assert len(printed(one).splitlines()) == 11
+
+
+def test_a_table_that_is_too_wide_both_ways_comes_in_parts_with_its_labels():
+    rows = [[f"row {i}", *map(str, range(7))] for i in range(9)]
+    one = reporter(width=40)
+    one.table(Table("t", WIDE.header, rows))
+    lines = printed(one).splitlines()
+    assert max(map(len, lines)) <= 40
+    headers = [line.split("  ") for line in lines if line.startswith("column 0")]
+    assert len(headers) > 1
+    assert [w.strip() for h in headers for w in h[1:] if w] == WIDE.header[1:]
 
 
 def test_names_of_others_are_not_taken_for_markup():

@@ -357,6 +357,15 @@ def test_an_output_that_cannot_be_written_is_found_before_any_work(tiny_split, t
     assert counting[1]() == []
 
 
+def test_earlier_records_that_cannot_be_read_are_found_before_any_work(
+    tiny_split, tmp_path, counting
+):
+    (tmp_path / "records.jsonl").write_text("{")
+    with pytest.raises(ResultsError, match=r"records\.jsonl:1 is not JSON"):
+        run_tiny(tiny_split, ["counting"], tmp_path)
+    assert counting[1]() == []
+
+
 def test_rescoring_gives_the_same_records(tiny_split, tmp_path):
     records = run_tiny(tiny_split, ["persistence"], tmp_path / "out").records
     bare = [dataclasses.replace(r, metrics={}, per_trajectory={}) for r in records]

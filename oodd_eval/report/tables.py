@@ -48,6 +48,11 @@ class Table:
         """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
         return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
 
+    def columns(self, indices: Sequence[int]) -> Table:
+        """Return the table with these columns only."""
+        rows = [[row[i] for i in indices] for row in self.rows]
+        return Table(self.title, [self.header[i] for i in indices], rows, self.labels)
+
     def transposed(self) -> Table:
         """Return the table with rows and columns exchanged."""
         whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]

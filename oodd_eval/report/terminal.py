@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
 from tabulate import tabulate
 
 from oodd_eval._version import __version__
@@ -124,14 +125,10 @@ class TerminalReporter:
                 self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
 
     def table(self, table: Table) -> None:
-        """Print one table, turned by 90 degrees if it is too wide only the way it is."""
-        text = _set(table)
-        if _width(text) > self.console.width and _width(turned := _set(table.transposed())) < (
-            _width(text)
-        ):
-            text = turned
+        """Print one table within the console's width: as it is, turned, or in parts."""
         self._print(table.title, "bold")
-        self._print(text + "\n")
+        for part in _fitting(table, self.console.width):
+            self._print(_set(part) + "\n")
 
     def _board(self, board: Board) -> None:
         self.table(tables.ranking(board, intervals=self.intervals))
@@ -163,10 +160,10 @@ class TerminalReporter:
 
     def _prose(self, text: str, style: str) -> None:
         """Print a sentence, wrapped between words."""
-        self.console.print(text, style=style, soft_wrap=False)
+        self.console.print(Text(text, style), soft_wrap=False)
 
     def _print(self, text: str, style: str = "") -> None:
-        self.console.print(text, style=style or None)
+        self.console.print(Text(text, style))
 
 
 def summary(records: Sequence[Record]) -> str:
@@ -186,5 +183,20 @@ def _set(table: Table) -> str:
     return text
 
 
-def _width(text: str) -> int:
-    return max(map(len, text.splitlines()), default=0)
+def _fitting(table: Table, width: int) -> list[Table]:
+    """Return the table, the table turned, or parts of its columns, whichever first fits."""
+    for whole in (table, table.transposed()):
+        if _width(whole) <= width:
+            return [whole]
+    labels = list(range(table.labels))
+    parts: list[list[int]] = []
+    for column in range(table.labels, len(table.header)):
+        if parts and _width(table.columns([*labels, *parts[-1], column])) <= width:
+            parts[-1].append(column)
+        else:
+            parts.append([column])
+    return [table.columns([*labels, *part]) for part in parts]
+
+
+def _width(table: Table) -> int:
+    return max(map(len, _set(table).splitlines()), default=0)
