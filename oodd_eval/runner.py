@@ -138,7 +138,7 @@ def run(
 
 
 def _now(job: UnitJob, *arguments: Any, **settings: Any) -> Future[Scored]:
-    """Do a job in this thread, so that it can be interrupted and may raise, as a finished future."""
+    """Do a job in this thread, where it can be interrupted; return it as a finished future."""
     future: Future[Scored] = Future()
     future.set_result(job(*arguments, **settings))
     return future
