@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, UsageError
-from oodd_eval.prediction import FeatureScale, anomaly_scores
+from oodd_eval.prediction import CONSTANT, FeatureScale, anomaly_scores
 from oodd_torch.forecast import forecast_errors
 from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.training import Schedule, train
@@ -19,7 +19,7 @@ from oodd_torch.training import Schedule, train
 HELD_OUT = 0.15
 """Share of the nominal trajectories that decides when to stop training; at least one."""
 
-RATES = (1e-3, 1e-2)
+RATES = (1e-2,)
 """Largest learning rates, in turn over the members: the paper's two (appendix B)."""
 
 BATCH = 64
@@ -60,7 +60,7 @@ class Settings:
     quantiles: bool = True
     mean_sampling: bool = False
     updates: int = 800
-    batch: int = 16
+    batch: int = 32
     chunk: int = 50
     levels: int = 8
     scheduled_sampling: float = 0.0
@@ -80,6 +80,13 @@ class Settings:
                 f"parameter scheduled_sampling of detector {name!r}: expected a number between 0 "
                 f"and 1, got {share!r}"
             )
+
+
+def change_scale(episodes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the standard deviation of one-step changes, (D,); 1 for sensors that stand still."""
+    changes = np.concatenate([np.diff(e, axis=0) for e in episodes])
+    std = changes.std(axis=0, dtype=np.float64)
+    return np.where(std < CONSTANT, 1.0, std).astype(np.float32)
 
 
 class ForecastDetector:
@@ -149,6 +156,7 @@ class ForecastDetector:
                 quantiles=s.quantiles,
             ),
             generators,
+            change_scale(training),
         )
         self.history_ = train(
             network,

@@ -70,7 +70,9 @@ def forecast_errors(
             heads = None
             if levels is not None and table is not None:
                 heads = network.heads_from(levels[0], table)
-            predicted, memory = predict(network, x[:, start:stop], memory, heads)
+            change, memory = predict(network, x[:, start:stop], memory, heads)
+            newest = x[:, start:stop, :, None, : network.architecture.features]
+            predicted = newest + network.unit * change
         else:
             predicted, memory = rollouts(
                 network, x[:, start:stop], memory, levels, table,
@@ -171,4 +173,4 @@ def _sample(
         change = torch.matmul(z.reshape(e, c * width, b, -1), heads)  # (E, C * R, B, M / R * D)
         change = change.reshape(e, c, width, b, -1, d).transpose(2, 3).flatten(3, 4)
     newest = window[..., :d].reshape(e, c, width, b, d).transpose(2, 3)
-    return newest + change + network.out_bias[:, None, None]
+    return newest + network.unit * (change + network.out_bias[:, None, None])

@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from oodd_eval.prediction import GRID
@@ -46,14 +48,23 @@ class Ensemble(torch.nn.Module):
 
     ``f = relu(x W1 + b1)``, ``g = GRU(f)``, ``z = relu(g W2 + b2) + f`` (the skip connection),
     ``phi(tau) = relu(cos(pi i tau) C + c)``, and for sensor d
-    ``q_d(tau) = o_d + (z * phi(tau)) v_d + u_d``: the output is the difference from the newest
-    observation, so that an untrained network predicts no change. Without memory ``g = f``; without
-    quantiles ``phi = 1``.
+    ``q_d(tau) = o_d + s_d [(z * phi(tau)) v_d + u_d]``: the output is the change from the newest
+    observation in units of the training standard deviation ``s_d`` of that change, so that an
+    untrained network predicts no change and all sensors weigh alike in the loss. Without memory
+    ``g = f``; without quantiles ``phi = 1``.
     """
 
-    def __init__(self, architecture: Architecture, generators: list[torch.Generator]) -> None:
+    unit: Tensor
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        generators: list[torch.Generator],
+        unit: NDArray[np.float32],
+    ) -> None:
         super().__init__()
         a = self.architecture = architecture
+        self.register_buffer("unit", torch.from_numpy(unit))
         h, d = a.units, a.features
 
         def weight(rows: int, columns: int, fan_in: int | None = None) -> torch.nn.Parameter:

@@ -22,6 +22,13 @@ from oodd_torch.network import Ensemble
 
 BETAS: Final = (0.9, 0.999)
 EPSILON: Final = 1e-8
+KAPPA: Final = 0.05
+"""Width of the quadratic part of the loss, in standard deviations of a sensor's change.
+
+With the usual 1 nearly all errors of a good forecast would fall into the quadratic part, and the
+minimizer would be an expectile instead of a quantile.
+"""
+
 CLIP: Final = 1.0
 """Largest norm of one member's gradient."""
 
@@ -168,15 +175,19 @@ def arrange(
 def predict(
     network: Ensemble, x: Tensor, memory: Tensor, heads: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """One pass over a chunk: predictions (E, T, B, N, D) of the next rows, and the last memory.
+    """One pass over a chunk: changes (E, T, B, N, D) to the next rows, and the last memory.
 
     Parameters
     ----------
     x : (E, T, B, W * D)
     memory : (E, B, H)
     heads : (E, G, H, N * D)
-        Output layers at N levels, see `Ensemble.heads`: G = T for levels of every step, G = 1 for
-        levels that all steps share. None without quantiles.
+        Output layers at N levels, see `Ensemble.heads_at`: G = T for levels of every step, G = 1
+        for levels that all steps share. None without quantiles.
+
+    Returns
+    -------
+    Changes in the network's units: the prediction is ``o + unit * change``.
     """
     e, t, b, _ = x.shape
     d, h = network.architecture.features, network.architecture.units
@@ -190,27 +201,62 @@ def predict(
         change = torch.bmm(z, network.out)
     else:
         change = torch.matmul(z.reshape(e, heads.shape[1], -1, h), heads)
-    change = change.reshape(e, t, b, -1, d)
-    return x[..., None, :d] + change + network.out_bias[:, None, None], memory
+    return change.reshape(e, t, b, -1, d) + network.out_bias[:, None, None], memory
 
 
-def loss_of(
+def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
+    """Return the derivative of `quantile_huber` by the error.
+
+    ``|tau - [u < 0]| clip(u / kappa, -1, 1)``
+    """
+    return torch.where(error < 0, 1 - tau, tau) * (error / kappa).clamp_(-1, 1)
+
+
+def _error(network: Ensemble, x: Tensor, y: Tensor, change: Tensor) -> Tensor:
+    """Return target minus prediction in the network's units: (E, T, B, N, D)."""
+    target = (y - x[..., : network.architecture.features]) / network.unit
+    return target[..., None, :] - change
+
+
+def descend(
     network: Ensemble, x: Tensor, y: Tensor, mask: Tensor, memory: Tensor, tau: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Mean loss of every member (E,) over masked steps, levels and sensors; and the last memory.
+) -> Tensor:
+    """Add the gradients of every member's mean loss; return the last memory.
 
-    ``tau`` (E, N) holds the levels of this update, shared by all steps, episodes and sensors: the
-    loss is a mean over them, and this way their embeddings cost next to nothing.
+    The loss is the mean over masked steps, levels and sensors. ``tau`` (E, N) holds the levels of
+    this update, shared by all steps, episodes and sensors, so that their embeddings cost next to
+    nothing. The slope of the loss is handed to the backward pass directly: the loss itself, a
+    dozen passes over the largest array of a training step, is only needed when it is looked at.
     """
     heads = None if tau is None else network.heads_at(tau)
-    predicted, memory = predict(network, x, memory, heads)
-    error = y[..., None, :] - predicted  # (E, T, B, N, D)
-    if tau is None:
-        each = 0.5 * error.square()
+    change, memory = predict(network, x, memory, heads)
+    with torch.no_grad():
+        error = _error(network, x, y, change)
+        if tau is not None:
+            error = quantile_huber_slope(error, tau[:, None, None, :, None], KAPPA)
+        steps = mask.sum((1, 2)).clamp(min=1) * error.shape[3] * error.shape[4]  # (E,)
+        share = mask / steps[:, None, None]
+        slope = error.mul_(-share[..., None, None])
+    change.backward(slope)  # type: ignore[no-untyped-call]
+    return memory
+
+
+@torch.no_grad()
+def evaluate(network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int) -> Tensor:
+    """Return the held-out loss of every member, (E,), at evenly spaced levels."""
+    a = network.architecture
+    x, y, mask = arrange([list(episodes)], a.window)
+    x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
+    mask = mask.expand(network.members, -1, -1)
+    tau = ((torch.arange(levels) + 0.5) / levels).expand(network.members, -1)
+    heads = network.heads_at(tau) if a.quantiles else None
+    change, _ = predict(network, x, network.start(x.shape[2]), heads)
+    error = _error(network, x, y, change)
+    if a.quantiles:
+        each = quantile_huber(error, tau[:, None, None, :, None], KAPPA)
     else:
-        each = quantile_huber(error, tau[:, None, None, :, None])
-    per_step = each.mean((3, 4))  # (E, T, B)
-    return (per_step * mask).sum((1, 2)) / mask.sum((1, 2)).clamp(min=1), memory
+        each = 0.5 * error.square()
+    return (each.mean((3, 4)) * mask).sum((1, 2)) / mask.sum((1, 2))
 
 
 def train(
@@ -243,8 +289,7 @@ def train(
         share = schedule.scheduled_sampling * done
         if share > 0:
             x = _mix(network, x, memory, share, rngs)
-        losses, memory = loss_of(network, x, y, mask, memory, tau)
-        losses.sum().backward()  # type: ignore[no-untyped-call]
+        memory = descend(network, x, y, mask, memory, tau)
         warm = min(1.0, update / 20)
         decay = 0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done))
         optimiser.step(rates * warm * float(decay))
@@ -262,18 +307,6 @@ def train(
         for keep, p in zip(kept, network.parameters(), strict=True):
             p.copy_(keep)
     return history
-
-
-@torch.no_grad()
-def evaluate(network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int) -> Tensor:
-    """Return the held-out loss of every member, (E,), at evenly spaced levels."""
-    a = network.architecture
-    x, y, mask = arrange([list(episodes)], a.window)
-    even = ((torch.arange(levels) + 0.5) / levels).expand(network.members, -1)
-    x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
-    mask = mask.expand(network.members, -1, -1)
-    tau = even if a.quantiles else None
-    return loss_of(network, x, y, mask, network.start(x.shape[2]), tau)[0]
 
 
 def _stratified(rngs: Sequence[np.random.Generator], levels: int) -> Tensor:
@@ -301,7 +334,8 @@ def _mix(
         shape = (x.shape[1], 1, a.features)
         drawn = np.stack([rng.integers(GRID, size=shape) for rng in rngs])
         heads = network.heads_from(torch.from_numpy(drawn), network.table())
-    sampled = predict(network, x, memory, heads)[0][..., 0, :]  # (E, T, B, D), of the next rows
+    change = predict(network, x, memory, heads)[0][..., 0, :]  # (E, T, B, D)
+    sampled = x[..., : a.features] + network.unit * change  # of the next rows
     replaced = np.stack([rng.random(x.shape[1:3]) < share for rng in rngs])
     chosen = torch.from_numpy(replaced)[..., None]
     mixed = x.clone()

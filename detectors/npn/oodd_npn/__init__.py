@@ -9,7 +9,7 @@ from oodd_eval import DetectorSpec, hookimpl
 PARAMETERS: dict[str, Any] = {
     "members": 5,
     "updates": 800,
-    "batch": 16,
+    "batch": 32,
     "chunk": 50,
     "scheduled_sampling": 0.0,
 }

@@ -12,7 +12,7 @@ PARAMETERS: dict[str, Any] = {
     "members": 5,
     "samples": 8,
     "updates": 800,
-    "batch": 16,
+    "batch": 32,
     "chunk": 50,
     "levels": 8,
     "scheduled_sampling": 0.0,
