@@ -1,0 +1,58 @@
+"""Calibrated thresholds: exact, and the smallest that meet the target."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from oodd_eval.alarms import MIN_STEPS, calibrate, calibrated_contributions, false_alarm_rate
+from oodd_eval.cusum import Standardization, cusum
+from oodd_eval.metrics import AlarmRule
+
+
+def rule(threshold=0.0, drift=0.0018):
+    return AlarmRule(Standardization(mean=0.0, std=1.0), drift=drift, threshold=threshold)
+
+
+def rate(scores, threshold, drift=0.0018):
+    return false_alarm_rate(scores, rule(threshold, drift))
+
+
+@pytest.mark.parametrize("target", [0.01, 0.1])
+def test_the_rate_at_the_threshold_meets_the_target_and_just_below_does_not(target):
+    scores = list(np.random.default_rng(0).normal(size=(5, 400)))
+    found = calibrate(scores, rule(), target)
+    assert rate(scores, found) <= target
+    assert rate(scores, np.nextafter(found, 0)) > target
+
+
+@given(st.lists(st.lists(st.integers(-3, 3), min_size=1, max_size=12), min_size=1, max_size=3))
+def test_alarms_never_grow_with_the_threshold(values):
+    runs = [np.array(v, float) for v in values]
+    counts = [
+        sum(int(cusum(x, drift=0.5, threshold=h)[1].sum()) for x in runs)
+        for h in np.arange(0, 12, 0.25)
+    ]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_quiet_scores_need_no_threshold():
+    assert calibrate([np.array([-1.0, -2.0])], rule(), 0.01) == 0
+
+
+def test_without_defined_scores_there_is_no_threshold():
+    assert math.isnan(calibrate([np.array([math.nan])], rule(), 0.01))
+
+
+def test_a_target_is_offered_only_where_the_calibration_part_can_support_it():
+    noise = np.random.default_rng(1)
+    calibration = list(noise.normal(size=(5, 400)))
+    test, twins = list(noise.normal(size=(2, 100))), list(noise.normal(size=(2, 100)))
+    thresholds, found = calibrated_contributions(calibration, test, twins, [40, 50], rule())
+    assert MIN_STEPS["at_1pct"] <= 2000
+    assert list(thresholds) == ["threshold_at_1pct"]
+    assert set(found) == {
+        f"{m}_at_1pct" for m in ("far", "far_twin", "delay", "delay_censored", "missed")
+    }
