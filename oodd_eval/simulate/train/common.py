@@ -55,8 +55,10 @@ class Journal:
             self.curve, self.best = [list(x) for x in state["curve"]], float(state["best"])
             self._first_step = int(state["step"])
         except Exception as error:
+            # Without torch's own message: it recommends loading the file with pickle.
             raise PolicyError(
-                f"{self.checkpoint.name} is not a checkpoint of this trainer ({error}): "
+                f"{self.checkpoint.name} is not a checkpoint of this trainer "
+                f"({type(error).__name__}), expected one that `policies train` wrote: "
                 "move it away to start anew"
             ) from error
         self.progress(f"{self.environment}: resumed at step {self._first_step}")
@@ -83,7 +85,9 @@ class Journal:
         torch.save(state | {"step": step, "best": float(self.best), "curve": self.curve}, partial)
         partial.replace(self.checkpoint)
         log = json.dumps({"environment": self.environment, **self.facts, "curve": self.curve})
-        (self.out / f"{self.environment}.curve.json").write_text(log + "\n", encoding="utf-8")
+        partial = self.out / f"{self.environment}.curve.json.partial"
+        partial.write_text(log + "\n", encoding="utf-8")
+        partial.replace(self.out / f"{self.environment}.curve.json")
         rate = (step - self._first_step) / (time.perf_counter() - self._started)
         self.progress(
             f"{self.environment}: step {step}, return {result.mean:.1f} ± {result.std:.1f}, "

@@ -202,13 +202,15 @@ def train(environment: str, *, out: Path, steps: int, seed: int, progress: Progr
         if replay.count >= p["warm_up"]:
             for _ in range(len(actors) // p["steps_per_update"]):
                 _update(online, target, optimiser, replay.sample(p["batch"], rng), p)
-        if before // p["evaluate_every"] != step // p["evaluate_every"]:
+        if before // p["evaluate_every"] != step // p["evaluate_every"] or step >= steps:
             journal.evaluate(
                 step,
                 online.arrays(p["quantiles_acting"]),
                 {"online": online.state_dict(), "target": target.state_dict(),
                  "optimiser": optimiser.state_dict()},
             )  # fmt: skip
+    for actor in actors:
+        actor.simulator.close()
 
 
 def _update(

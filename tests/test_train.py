@@ -1,0 +1,212 @@
+"""Training and evaluating policies: files, resuming, kills, provenance and the table."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from oodd_eval.benchmark import ENVIRONMENTS, SPLITS
+from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError
+from oodd_eval.simulate import train
+from oodd_eval.simulate.policies import FROZEN, load_policy, provenance
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("gymnasium")
+common, iqn, td3 = (
+    pytest.importorskip(f"oodd_eval.simulate.train.{name}") for name in ("common", "iqn", "td3")
+)
+
+QUICK = {
+    "td3": {"layers": [8, 6], "batch": 4, "warm_up": 20, "evaluate_every": 40, "replay": 50},
+    "iqn": {"width": 8, "cosines": 4, "batch": 4, "quantiles_loss": 2, "quantiles_acting": 4,
+            "warm_up": 20, "evaluate_every": 40, "replay": 50, "environments": 2},
+}  # fmt: skip
+
+BOTH = pytest.mark.parametrize("environment", ["cartpole", "hopper"])
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """A training of small networks that lasts moments; threads as they were."""
+    for module, values in ((td3, QUICK["td3"]), (iqn, QUICK["iqn"])):
+        for name, value in values.items():
+            monkeypatch.setitem(module.HYPER_PARAMETERS, name, value)
+    monkeypatch.setattr(common, "SELECTION_EPISODES", 2)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def checkpoint(out, environment):
+    return torch.load(out / f"{environment}.ckpt", weights_only=True)
+
+
+@BOTH
+def test_training_leaves_policy_provenance_curve_and_checkpoint(tmp_path, environment, capfd):
+    lines = []
+    best = train.train_policy(environment, out=tmp_path, steps=120, seed=3, progress=lines.append)
+    load_policy(environment, best)
+    facts = json.loads(best.with_suffix(".json").read_text())
+    assert facts["algorithm"] == ENVIRONMENTS[environment].policy
+    assert facts["seed"] == 3
+    assert facts["hyper_parameters"]["batch"] == 4
+    curve = json.loads((tmp_path / f"{environment}.curve.json").read_text())["curve"]
+    assert [step for step, _, _ in curve] == [40, 80, 120]
+    assert facts["curve"] == curve[: len(facts["curve"])]
+    assert facts["curve"][-1][0] == facts["steps"]
+    assert checkpoint(tmp_path, environment)["step"] == 120
+    assert len(lines) == 3
+    assert all(line.startswith(f"{environment}: step ") for line in lines)
+    assert not list(tmp_path.rglob("*.partial"))
+    assert capfd.readouterr() == ("", "")
+
+
+@BOTH
+def test_a_resumed_training_counts_like_one_in_one_go(tmp_path, environment):
+    train.train_policy(environment, out=tmp_path / "two", steps=80)
+    again = []
+    train.train_policy(environment, out=tmp_path / "two", steps=160, progress=again.append)
+    train.train_policy(environment, out=tmp_path / "one", steps=160)
+    assert again[0] == f"{environment}: resumed at step 80"
+    one, two = (checkpoint(tmp_path / d, environment) for d in ("one", "two"))
+    assert one["step"] == two["step"] == 160
+    assert [c[0] for c in one["curve"]] == [c[0] for c in two["curve"]] == [40, 80, 120, 160]
+
+
+def test_a_finished_training_is_not_taken_further(tmp_path):
+    best = train.train_policy("cartpole", out=tmp_path, steps=80)
+    before = best.read_bytes()
+    assert train.train_policy("cartpole", out=tmp_path, steps=80) == best
+    assert best.read_bytes() == before
+    assert checkpoint(tmp_path, "cartpole")["step"] == 80
+
+
+@BOTH
+def test_the_last_steps_are_evaluated_too(tmp_path, environment):
+    train.train_policy(environment, out=tmp_path, steps=50)
+    assert [c[0] for c in checkpoint(tmp_path, environment)["curve"]] == [40, 50]
+
+
+def test_the_best_actor_has_the_largest_mean_less_one_deviation(tmp_path, monkeypatch):
+    returns = iter([[10.0, 10.0], [0.0, 40.0], [11.0, 11.0], [10.9, 10.9]])
+    found = []
+
+    def scripted(*_, **__):
+        found.append(train.Evaluation(np.array(next(returns))))
+        return found[-1]
+
+    monkeypatch.setattr(common, "evaluate_policy", scripted)
+    train.train_policy("cartpole", out=tmp_path, steps=160)
+    assert json.loads((tmp_path / "cartpole.json").read_text())["steps"] == 120
+    assert checkpoint(tmp_path, "cartpole")["best"] == 11.0
+
+
+def test_a_kill_while_writing_leaves_the_last_checkpoint(tmp_path, monkeypatch):
+    best = train.train_policy("cartpole", out=tmp_path, steps=40)
+    before = (tmp_path / "cartpole.ckpt").read_bytes()
+
+    def half(state, file):
+        file.write_bytes(before[: len(before) // 2])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(common.torch, "save", half)
+    with pytest.raises(KeyboardInterrupt):
+        train.train_policy("cartpole", out=tmp_path, steps=80)
+    assert (tmp_path / "cartpole.ckpt").read_bytes() == before
+    load_policy("cartpole", best)
+    monkeypatch.undo()
+    for name, value in QUICK["iqn"].items():
+        monkeypatch.setitem(iqn.HYPER_PARAMETERS, name, value)
+    train.train_policy("cartpole", out=tmp_path, steps=80)
+    assert [c[0] for c in checkpoint(tmp_path, "cartpole")["curve"]] == [40, 80]
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path):
+    (tmp_path / "cartpole.ckpt").write_bytes(b"not a checkpoint")
+    with pytest.raises(PolicyError, match=r"cartpole\.ckpt is not a checkpoint.*move it away") as e:
+        train.train_policy("cartpole", out=tmp_path, steps=40)
+    assert "weights_only" not in str(e.value)
+
+
+def test_too_few_steps_for_an_evaluation_say_so(tmp_path):
+    with pytest.raises(PolicyError, match="0 steps gave no evaluation of cartpole"):
+        train.train_policy("cartpole", out=tmp_path, steps=0)
+
+
+def test_training_without_torch_names_the_extra(tmp_path, monkeypatch):
+    for name in ("iqn", "td3"):
+        monkeypatch.delattr(train, name)
+        monkeypatch.delitem(sys.modules, f"oodd_eval.simulate.train.{name}")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingExtraError, match=r"oodd-eval\[train\]"):
+        train.train_policy("cartpole", out=tmp_path, steps=40)
+
+
+def test_environment_names_are_checked(tmp_path):
+    with pytest.raises(UnknownNameError, match="cartpole"):
+        train.train_policy("cartpol", out=tmp_path)
+
+
+class Leftward:
+    digest = "leftward"
+
+    def act(self, row):
+        return 0
+
+
+def test_evaluation_takes_one_return_from_each_seed():
+    found = train.evaluate_policy("cartpole", Leftward(), episodes=4, seed=7)
+    later = train.evaluate_policy("cartpole", Leftward(), episodes=2, seed=9)
+    assert found.returns.shape == (4,)
+    np.testing.assert_array_equal(found.returns[2:], later.returns)
+    assert found.mean == np.mean(found.returns)
+    assert found.std == np.std(found.returns)
+    assert 8 <= found.mean <= 11  # pushed one way all the time, CartPole falls after 8 to 11 steps
+
+
+def test_seeds_of_evaluation_and_selection_are_in_no_published_split():
+    for first in (train.EVALUATION_SEED, train.SELECTION_SEED):
+        assert first // 10**6 not in {s.seed_base for s in SPLITS.values()}
+    assert train.EVALUATION_SEED // 10**6 != train.SELECTION_SEED // 10**6
+
+
+def test_freezing_adds_the_evaluation_to_the_provenance(tmp_path):
+    trained = train.train_policy("cartpole", out=tmp_path / "run", steps=40)
+    found = train.freeze_trained("cartpole", trained, episodes=3, directory=tmp_path / "frozen")
+    facts = json.loads((tmp_path / "frozen" / "cartpole.json").read_text())
+    assert facts["mean_return"] == found.mean
+    assert facts["std_return"] == found.std
+    assert facts["episodes"] == 3
+    assert facts["share_of_paper"] == found.mean / 500
+    assert not facts["finished"]
+    assert facts["flagged"]
+    frozen = load_policy("cartpole", tmp_path / "frozen" / "cartpole.npz")
+    assert frozen.digest == facts["digest"] == load_policy("cartpole", trained).digest
+
+
+@pytest.mark.parametrize(
+    ("environment", "mean", "share"),
+    [("cartpole", 475.0, 0.95), ("acrobot", -85.0, 0.95), ("acrobot", -100.0, 0.8075)],
+)
+def test_share_of_the_papers_return(environment, mean, share):
+    assert train.share_of_paper(environment, mean) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("file", sorted(FROZEN.glob("*.npz")), ids=lambda f: f.stem)
+def test_frozen_policies_carry_their_provenance(file):
+    facts = provenance(file.stem)
+    info = ENVIRONMENTS[file.stem]
+    assert facts["digest"] == load_policy(file.stem).digest
+    assert facts["algorithm"] == info.policy
+    assert facts["episodes"] >= 100
+    assert facts["paper_return"] == info.paper_return
+    assert facts["share_of_paper"] == train.share_of_paper(file.stem, facts["mean_return"])
+    assert facts["finished"] == (facts["share_of_paper"] >= 0.95)
+    assert facts["flagged"] == (facts["share_of_paper"] < 0.8)
+    assert facts["steps"] in [c[0] for c in facts["curve"]]
+    assert {"seed", "hyper_parameters", "selection", "std_return"} <= facts.keys()
+
+
+def test_every_environment_has_a_frozen_policy():
+    assert {f.stem for f in FROZEN.glob("*.npz")} == set(ENVIRONMENTS)
