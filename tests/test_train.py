@@ -10,6 +10,7 @@ from oodd_eval.benchmark import ENVIRONMENTS, SPLITS
 from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError
 from oodd_eval.simulate import train
 from oodd_eval.simulate.policies import FROZEN, load_policy, provenance
+from oodd_eval.simulate.train.table import policy_table
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
@@ -210,3 +211,17 @@ def test_frozen_policies_carry_their_provenance(file):
 
 def test_every_environment_has_a_frozen_policy():
     assert {f.stem for f in FROZEN.glob("*.npz")} == set(ENVIRONMENTS)
+
+
+@pytest.mark.parametrize(
+    ("mean", "share", "flag"),
+    [(475.0, "95.0 %", ""), (474.0, "94.8 %", "below target"), (399.0, "79.8 %", "below 80 %")],
+)
+def test_the_table_flags_policies_below_their_target(tmp_path, monkeypatch, mean, share, flag):
+    trained = train.train_policy("cartpole", out=tmp_path / "run", steps=40)
+    returns = np.array([mean - 1.5, mean + 1.5])
+    monkeypatch.setattr(train, "evaluate_policy", lambda *_, **__: train.Evaluation(returns))
+    train.freeze_trained("cartpole", trained, episodes=2, directory=tmp_path / "frozen")
+    facts = json.loads((tmp_path / "frozen" / "cartpole.json").read_text())
+    row = policy_table({"cartpole": facts}).rows[0]
+    assert row == ["CartPole", "IQN", "40", f"{mean} ± 1.5", "2", "500.0", share, flag]
