@@ -1,4 +1,4 @@
-"""Standardization, the CUSUM and the detecta mode, each against a second way to the same numbers."""
+"""Standardization, the CUSUM and the detecta mode, each against a second formula."""
 
 import math
 

@@ -113,7 +113,9 @@ def test_each_detector_directory_lifts_out(name, tmp_path):
 def test_tutorial_detector_installs_and_runs(tmp_path):
     project, target = tmp_path / "project", tmp_path / "target"
     project.mkdir()
-    code = re.search(r"```python\n(.*?)```", (ROOT / "detectors/README.md").read_text(), re.DOTALL)[1]
+    code = re.search(r"```python\n(.*?)```", (ROOT / "detectors/README.md").read_text(), re.DOTALL)[
+        1
+    ]
     (project / "oodd_range.py").write_text(code)
     text = readme_pyproject() + '\n[tool.hatch.build.targets.wheel]\ninclude = ["oodd_range.py"]\n'
     (project / "pyproject.toml").write_text(text)

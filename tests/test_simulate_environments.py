@@ -12,8 +12,8 @@ from oodd_eval.benchmark import ENVIRONMENTS
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.simulate.anomalies import COMPONENTS, VARYING_SENSORS
 from oodd_eval.simulate.environments import _Acrobot, make
-from oodd_eval.simulate.policies import FROZEN, load_policy
 from oodd_eval.simulate.record import record_nominal
+from oodd_eval.splits import load_split
 
 NOMINAL = {
     ("acrobot", "gravity"): 9.8, ("acrobot", "link_length_1"): 1.0,
@@ -258,22 +258,14 @@ def test_bullet_clients_are_closed():
 # Sensors that vary
 
 
-@pytest.mark.parametrize("environment", ["halfcheetah", "hopper", "walker2d"])
-def test_sensors_left_out_of_the_list_are_constant(environment):
-    rows = roll(environment, 45)
-    left_out = sorted(set(range(rows.shape[1])) - set(VARYING_SENSORS[environment]))
-    assert (np.ptp(rows[:, left_out], axis=0) < 1e-6).all()
-
-
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
-def test_listed_sensors_are_those_that_vary_under_the_frozen_policy(environment):
-    if not (FROZEN / f"{environment}.npz").exists():
-        pytest.skip(f"no frozen policy of {environment}")
-    policy = load_policy(environment)
-    twins = [record_nominal(environment, seed, policy=policy) for seed in (5, 6)]
-    rows = np.concatenate([t.trajectory.observations for t in twins])
+def test_listed_sensors_are_those_that_vary_in_nominal_operation(environment):
+    rows = np.concatenate(
+        [x.observations for x in load_split("mini").environment(environment).train]
+    )
     # Bullet's angle to the target is constant up to rounding only.
-    assert tuple(np.flatnonzero(np.ptp(rows, axis=0) > 1e-6)) == VARYING_SENSORS[environment]
+    share = (np.abs(rows - np.median(rows, axis=0)) > 1e-6).mean(axis=0)
+    assert tuple(np.flatnonzero(share >= 0.01)) == VARYING_SENSORS[environment]
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import types
+import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar, Protocol
 
@@ -21,7 +22,9 @@ from oodd_eval.errors import MissingExtraError, SimulationError, UnknownNameErro
 from oodd_eval.simulate.quiet import quiet_streams
 
 try:
-    with quiet_streams():
+    # Box2D's C module warns while it is imported, and crashes where warnings are errors.
+    with quiet_streams(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         import pybullet_envs_gymnasium.gym_locomotion_envs as bullet
         from gymnasium.envs.box2d import lunar_lander
         from gymnasium.envs.classic_control.acrobot import AcrobotEnv
@@ -188,12 +191,10 @@ class LunarLander:
         # these globals, so that a changed power is seen by this episode alone.
         self._globals = dict(vars(lunar_lander))
         step = lunar_lander.LunarLander.step
-        self.env.step = types.MethodType(
-            types.FunctionType(
-                step.__code__, self._globals, step.__name__, step.__defaults__, step.__closure__
-            ),
-            self.env,
+        own_step = types.FunctionType(
+            step.__code__, self._globals, step.__name__, step.__defaults__, step.__closure__
         )
+        setattr(self.env, "step", types.MethodType(own_step, self.env))  # noqa: B010  # for mypy
         self._side_power = float(self._globals["SIDE_ENGINE_POWER"])
 
     def reset(self, seed: int) -> Row:

@@ -59,9 +59,9 @@ class Settings:
     recurrent: bool = True
     quantiles: bool = True
     mean_sampling: bool = False
-    updates: int = 800
-    batch: int = 32
-    chunk: int = 50
+    updates: int = 600
+    batch: int = 16
+    chunk: int = 100
     levels: int = 8
     scheduled_sampling: float = 0.0
 

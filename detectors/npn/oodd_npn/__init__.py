@@ -8,9 +8,9 @@ from oodd_eval import DetectorSpec, hookimpl
 
 PARAMETERS: dict[str, Any] = {
     "members": 5,
-    "updates": 800,
-    "batch": 32,
-    "chunk": 50,
+    "updates": 600,
+    "batch": 16,
+    "chunk": 100,
     "scheduled_sampling": 0.0,
 }
 

@@ -11,9 +11,9 @@ REFERENCE = "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, secti
 PARAMETERS: dict[str, Any] = {
     "members": 5,
     "samples": 8,
-    "updates": 800,
-    "batch": 32,
-    "chunk": 50,
+    "updates": 600,
+    "batch": 16,
+    "chunk": 100,
     "levels": 8,
     "scheduled_sampling": 0.0,
 }

@@ -1,0 +1,325 @@
+"""riqn, riqn-ms, n-riqn and npn: loss, learned distributions, rollouts, and the score contract."""
+
+import numpy as np
+import pytest
+import torch
+from oodd_npn import npn
+from oodd_riqn import n_riqn, riqn, riqn_ms
+from oodd_torch.forecast import forecast_errors, rollouts
+from oodd_torch.network import Architecture, Ensemble
+from oodd_torch.training import (
+    Schedule,
+    arrange,
+    predict,
+    quantile_huber,
+    quantile_huber_slope,
+    train,
+)
+from scipy.stats import ks_2samp
+
+from oodd_eval import Trajectory
+from oodd_eval.detector import check_scores
+from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.prediction import GRID, FeatureScale, quantile_levels
+
+FACTORIES = {"riqn": riqn, "riqn-ms": riqn_ms, "n-riqn": n_riqn, "npn": npn}
+SMALL = {"members": 2, "updates": 15, "chunk": 20}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def waves(count=6, length=60, sensors=3, seed=0, noise=0.05):
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0, 2 * np.pi, (count, 1, sensors))
+    t = np.arange(length)[None, :, None]
+    rows = np.sin(0.3 * t + phases) + rng.normal(0, noise, (count, length, sensors))
+    return [Trajectory(r, np.zeros((length - 1, 1))) for r in rows]
+
+
+def heteroscedastic(count, length, seed):
+    """o' = 0.8 o + (0.1 + 0.3 |o|) e, so that the spread depends on the state."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((count, length, 1), np.float32)
+    for t in range(1, length):
+        rows[:, t] = step(rows[:, t - 1], rng)
+    return list(rows)
+
+
+def step(o, rng):
+    return 0.8 * o + (0.1 + 0.3 * np.abs(o)) * rng.normal(size=o.shape)
+
+
+def network(members=1, *, seed=0, random_head=False, **architecture):
+    generators = [torch.Generator().manual_seed(seed + i) for i in range(members)]
+    a = Architecture(**architecture)
+    made = Ensemble(a, generators, np.full(a.features, 0.5, np.float32))
+    if random_head:
+        with torch.no_grad():
+            made.out.normal_(0, 0.3, generator=generators[0])
+            made.out_bias.normal_(0, 0.1, generator=generators[0])
+    return made.requires_grad_(requires_grad=False)
+
+
+@pytest.mark.parametrize(
+    ("error", "tau", "kappa", "expected"),
+    [
+        (2.0, 0.25, 1.0, 0.25 * 1.5),  # outside: kappa (|u| - kappa / 2) = 1.5
+        (-2.0, 0.25, 1.0, 0.75 * 1.5),
+        (0.5, 0.25, 1.0, 0.25 * 0.125),  # inside: u^2 / 2
+        (-0.5, 0.9, 1.0, 0.1 * 0.125),
+        (2.0, 0.5, 4.0, 0.5 * 2 / 4),
+    ],
+)
+def test_quantile_huber_loss_by_hand(error, tau, kappa, expected):
+    assert quantile_huber(torch.tensor(error), torch.tensor(tau), kappa).item() == pytest.approx(
+        expected
+    )
+
+
+def test_slope_is_the_derivative_of_the_loss():
+    error = torch.linspace(-3, 3, 41).requires_grad_()
+    tau = torch.full_like(error, 0.3)
+    quantile_huber(error, tau, 0.7).sum().backward()
+    assert torch.allclose(quantile_huber_slope(error.detach(), tau, 0.7), error.grad)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    torch.set_num_threads(1)
+    episodes = heteroscedastic(120, 100, seed=1)
+    made = Ensemble(
+        Architecture(features=1), [torch.Generator().manual_seed(0)], np.full(1, 0.2, np.float32)
+    )
+    schedule = Schedule(updates=500, batch=60, chunk=50, levels=16, rates=(5e-3,))
+    train(made, episodes[:108], episodes[108:], schedule, [np.random.default_rng(0)])
+    return made.requires_grad_(requires_grad=False)
+
+
+@pytest.mark.parametrize("level", [0.1, 0.5, 0.9])
+def test_learned_quantiles_cover_within_two_points(learned, level):
+    x, y, mask = arrange([heteroscedastic(200, 100, seed=2)], 1)
+    heads = learned.heads_at(torch.full((1, 1), level))
+    change, _ = predict(learned, x, learned.start(200), heads)
+    below = y <= x + learned.unit * change[..., 0, :]
+    assert below[mask].float().mean().item() == pytest.approx(level, abs=0.02)
+
+
+def sampled_after(learned, history, horizon, samples, width):
+    rng = np.random.default_rng(5)
+    levels = torch.from_numpy(rng.integers(GRID, size=(horizon, 1, len(history), samples, 1)))
+    x, _, _ = arrange([[np.append(history, history[-1:], axis=0)]], 1)
+    out, _ = rollouts(
+        learned, x, learned.start(1), levels, learned.table(), horizon=horizon, width=width
+    )
+    return out[0, -1, 0, :, 0].numpy()
+
+
+def test_sampled_rollouts_have_the_distribution_of_the_process(learned):
+    history = heteroscedastic(1, 40, seed=3)[0]
+    found = sampled_after(learned, history, horizon=5, samples=600, width=600)
+    rng = np.random.default_rng(6)
+    exact = np.repeat(history[-1:], 600, axis=0)
+    for _ in range(5):
+        exact = step(exact, rng)
+    assert ks_2samp(found, exact[:, 0]).pvalue > 0.001
+
+
+def test_mean_sampling_collapses_towards_the_mean(learned):
+    history = heteroscedastic(1, 40, seed=3)[0]
+    free = sampled_after(learned, history, horizon=5, samples=600, width=600)
+    mean = sampled_after(learned, history, horizon=5, samples=600, width=1)
+    assert mean.std() < 0.85 * free.std()
+
+
+def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):
+    """The obvious way: one trajectory, one time, one member, one sample after the other."""
+    a = made.architecture
+    errors = []
+    for t in range(horizon, len(rows)):
+        levels = quantile_levels(seed, range(t, t + 1), horizon, made.members, samples, a.features)
+        total = 0.0
+        for e in range(made.members):
+            pick = {n: p[e] for n, p in made.named_parameters()}
+            streams = [list(rows[: t - horizon + 1]) for _ in range(samples)]
+            for k in range(horizon):
+                following = []
+                for m in range(samples):
+                    index = levels[0, k, e, m] if a.quantiles else None
+                    following.append(one_step(made, pick, streams[m], index))
+                if mean_sampling and k < horizon - 1:
+                    following = [np.mean(following, axis=0)] * samples
+                for stream, row in zip(streams, following, strict=True):
+                    stream.append(row)
+            total += np.mean([np.abs(rows[t] - s[-1]) for s in streams])
+        errors.append(total / made.members)
+    return np.array(errors)
+
+
+def one_step(made, p, stream, index):
+    a, h = made.architecture, made.architecture.units
+
+    def dense(x, name):
+        return x @ p[name] + p[f"{name}_bias"][0]
+
+    memory = torch.zeros(h)
+    for t in range(len(stream)):
+        past = [stream[max(t - w, 0)] for w in range(a.window)]
+        f = torch.relu(dense(torch.tensor(np.concatenate(past)), "first"))
+        if not a.recurrent:
+            memory = f
+            continue
+        gates, recurrent = dense(f, "gru_in"), dense(memory, "gru")
+        reset = torch.sigmoid(gates[:h] + recurrent[:h])
+        update = torch.sigmoid(gates[h : 2 * h] + recurrent[h : 2 * h])
+        candidate = torch.tanh(gates[2 * h :] + reset * recurrent[2 * h :])
+        memory = (1 - update) * candidate + update * memory
+    z = torch.relu(dense(memory, "second")) + f
+    out = np.zeros(a.features, np.float32)
+    for d in range(a.features):
+        phi = torch.ones(h)
+        if index is not None:
+            tau = (index[d] + 0.5) / GRID
+            phi = torch.relu(dense(torch.cos(torch.pi * torch.arange(a.cosines) * tau), "cosine"))
+        out[d] = (z * phi) @ p["out"][:, d] + p["out_bias"][0, d]
+    return stream[-1] + made.unit.numpy() * out
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+@pytest.mark.parametrize(
+    ("architecture", "mean_sampling"),
+    [
+        ({}, False),
+        ({}, True),
+        ({"recurrent": False, "window": 3}, False),
+        ({"quantiles": False}, False),
+    ],
+    ids=["riqn", "riqn-ms", "n-riqn", "npn"],
+)
+def test_rollouts_equal_a_slow_loop_sample_for_sample(architecture, mean_sampling, horizon):
+    made = network(2, features=2, random_head=True, units=8, cosines=5, **architecture)
+    rows = [w.observations for w in waves(2, 9, 2)]
+    samples = 1 if not made.architecture.quantiles else 3
+    options = {"horizon": horizon, "samples": samples, "mean_sampling": mean_sampling, "seed": 7}
+    fast = forecast_errors(made, rows, **options)
+    for found, episode in zip(fast, rows, strict=True):
+        assert np.allclose(found, slow_errors(made, episode, **options), atol=1e-5)
+
+
+@pytest.fixture(scope="module", params=[(n, h) for n in FACTORIES for h in (1, 3)], ids=str)
+def fitted(request):
+    name, horizon = request.param
+    torch.set_num_threads(1)
+    return FACTORIES[name](seed=3, horizon=horizon, **SMALL).fit(waves())
+
+
+def test_scores_honour_the_contract(fitted):
+    episode = waves(1, 40, seed=9)[0]
+    scores = fitted.score(episode)
+    check_scores(
+        scores, episode, horizon=fitted.horizon, warm_up=0, detector=fitted.name, where="test"
+    )
+    assert np.isnan(scores).sum() == fitted.horizon
+
+
+@pytest.mark.parametrize("cut", [1, 2, 5, 17, 39])
+def test_scores_of_a_prefix_are_the_prefix_of_the_scores(fitted, cut):
+    episode = waves(1, 40, seed=9)[0]
+    part = fitted.score(episode[:cut])
+    assert np.allclose(part, fitted.score(episode)[:cut], rtol=1e-5, equal_nan=True)
+
+
+def test_scores_do_not_depend_on_what_is_scored_beside(fitted):
+    episodes = [e[:n] for e, n in zip(waves(4, 50, seed=4), (50, 7, 33, 2), strict=True)]
+    together = fitted.score_many(episodes)
+    for episode, scores in zip(episodes, together, strict=True):
+        assert np.allclose(scores, fitted.score(episode), rtol=1e-5, equal_nan=True)
+
+
+def test_the_future_leaves_the_past_alone(fitted):
+    episode = waves(1, 40, seed=9)[0]
+    changed = episode.observations.copy()
+    changed[20:] += 5
+    before = fitted.score(episode)[:20]
+    after = fitted.score(Trajectory(changed, episode.actions))
+    assert np.allclose(after[:20], before, rtol=1e-5, equal_nan=True)
+    assert after[20] > 3 * np.nanmax(before)
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_same_seed_same_bytes_and_refit_forgets(name):
+    episode = waves(1, 30, seed=9)[0]
+    first = FACTORIES[name](seed=1, horizon=1, **SMALL).fit(waves())
+    second = FACTORIES[name](seed=1, horizon=1, **SMALL).fit(waves(seed=5)).fit(waves())
+    other = FACTORIES[name](seed=2, horizon=1, **SMALL).fit(waves())
+    assert np.array_equal(first.score(episode), second.score(episode), equal_nan=True)
+    assert not np.array_equal(first.score(episode), other.score(episode), equal_nan=True)
+
+
+def test_training_lowers_the_held_out_loss():
+    detector = riqn(seed=0, horizon=1, members=2, updates=60, chunk=20).fit(waves(20))
+    assert np.min(detector.history_, axis=0).max() < 0.7 * max(detector.history_[0])
+
+
+def test_members_differ():
+    detector = riqn(seed=0, horizon=1, **SMALL).fit(waves())
+    assert not torch.equal(detector.network_.first[0], detector.network_.first[1])
+
+
+def test_padding_does_not_enter_the_loss():
+    x, y, mask = arrange([[waves(1, 30)[0].observations, waves(1, 10)[0].observations]], 2)
+    assert mask.sum().item() == 29 + 9
+    assert not x[0, 9:, 1].any()
+    assert not y[0, 9:, 1].any()
+
+
+def test_scheduled_sampling_trains():
+    made = riqn(seed=0, horizon=2, scheduled_sampling=0.5, **SMALL).fit(waves())
+    assert np.isfinite(made.score(waves(1, 20, seed=9)[0])[2:]).all()
+
+
+def test_constant_sensors_have_scale_one():
+    rows = np.random.default_rng(0).normal(size=(30, 2))
+    rows[:, 1] = 4.0
+    scale = FeatureScale.fit([Trajectory(rows, np.zeros((29, 1)))])
+    assert scale.std[1] == 1
+    made = npn(seed=0, horizon=1, **SMALL).fit([Trajectory(rows, np.zeros((29, 1)))] * 3)
+    assert np.isfinite(made.score(Trajectory(rows, np.zeros((29, 1))))[1:]).all()
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_scores_before_fit_are_refused(name):
+    with pytest.raises(NotFittedError, match=f"'{name}' was asked for scores before fit"):
+        FACTORIES[name](seed=0, horizon=1).score(waves(1)[0])
+
+
+def test_another_number_of_sensors_is_refused():
+    made = npn(seed=0, horizon=1, **SMALL).fit(waves())
+    with pytest.raises(TrajectoryError, match=r"fitted on 3 sensors and asked to score .* of 2"):
+        made.score(waves(1, sensors=2)[0])
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{"members": 0}, {"samples": 1.5}, {"updates": True}, {"scheduled_sampling": 2}],
+)
+def test_parameters_out_of_range_are_named(parameters):
+    with pytest.raises(UsageError, match=next(iter(parameters))):
+        riqn(seed=0, horizon=1, **parameters)
+
+
+@pytest.mark.parametrize("horizon", [0, True, 1.0])
+def test_a_horizon_is_a_positive_integer(horizon):
+    with pytest.raises(UsageError, match="horizon of detector 'npn'"):
+        npn(seed=0, horizon=horizon)
+
+
+def test_levels_depend_on_seed_and_time_alone():
+    whole = quantile_levels(3, range(10), 2, 2, 4, 3)
+    assert np.array_equal(whole[4:6], quantile_levels(3, range(4, 6), 2, 2, 4, 3))
+    assert not np.array_equal(whole, quantile_levels(4, range(10), 2, 2, 4, 3))
