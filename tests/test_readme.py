@@ -53,5 +53,6 @@ def test_relative_links_lead_somewhere(path):
 def test_commands_in_documents_parse(path, capsys):
     from oodd_eval.cli import build_parser
 
-    for line in re.findall(r"^(?:\$ )?oodd-eval ([^\n|`]*)$", path.read_text(), re.MULTILINE):
+    blocks = "\n".join(re.findall(r"```(?:sh|console)\n(.*?)```", path.read_text(), re.DOTALL))
+    for line in re.findall(r"^(?:\$ )?oodd-eval ([^\n|`]*)$", blocks, re.MULTILINE):
         build_parser().parse_args(line.split("#")[0].split())
