@@ -148,8 +148,9 @@ def auc_contributions(
 
     Notes
     -----
-    Matched comparisons use the times from the onset to the end of the shorter of the two; the
-    placebo compares twin i with twin i + 1 (the last with the first) at those times of twin i.
+    Matched comparisons use the times from the onset to the end of the shorter of the two. The
+    placebo compares twin i with twin i + 1 (the last with the first) at those of these times that
+    both have: with more times of one than of the other, their phase would be compared.
     """
     n = len(anomalous)
     spans = [
@@ -163,11 +164,15 @@ def auc_contributions(
         "auc_matched": mean_of([auc_same_times(a, b, *span) for a, b, span in pairs]),
         "auc_placebo": mean_of(
             [
-                auc_same_times(b, twins[(i + 1) % n], *span) if n > 1 else float("nan")
+                _placebo(b, twins[(i + 1) % n], *span) if n > 1 else float("nan")
                 for i, (_, b, span) in enumerate(pairs)
             ]
         ),
     }
+
+
+def _placebo(twin: Floats, other: Floats, start: int, stop: int) -> float:
+    return auc_same_times(twin, other, start, min(stop, len(other)))
 
 
 def alarm_contributions(

@@ -8,21 +8,22 @@ chance gives, `Persistence` what plain change gives.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from hashlib import blake2b
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oodd_eval.detector import DetectorSpec, Scores
 from oodd_eval.errors import NotFittedError
 from oodd_eval.hookspecs import hookimpl
+from oodd_eval.prediction import FeatureScale
 from oodd_eval.trajectory import Trajectory
 
 
 class Random:
-    """Scores without meaning: ``s_t`` uniform on [0, 1), a function of seed and t alone.
+    """Scores without meaning: ``s_t`` uniform on [0, 1), keyed by seed, t and the observation.
 
-    A twin and its anomalous trajectory get the same scores, as from `Clock`; the paper's AUC is
-    0.5 on average over seeds.
+    Keyed by the observation too, so that trajectories get draws of their own: with draws that all
+    trajectories share, one unlucky sequence would tilt a whole environment.
     """
 
     def __init__(self, *, seed: int = 0, horizon: int = 1) -> None:
@@ -33,8 +34,12 @@ class Random:
         return self
 
     def score(self, trajectory: Trajectory) -> Scores:
-        """Return uniform draws; a shorter trajectory gets a prefix of the same sequence."""
-        return np.random.default_rng(self.seed).random(len(trajectory))
+        """Return uniform draws; a prefix of the trajectory gets the prefix of the draws."""
+        rows = trajectory.observations.astype("<f4")
+        keys = (f"{self.seed}|{t}|".encode() + row.tobytes() for t, row in enumerate(rows))
+        drawn = [int.from_bytes(blake2b(key, digest_size=8).digest()) for key in keys]
+        # The upper 53 bits are what a double holds.
+        return np.array([(x >> 11) / 2**53 for x in drawn])
 
 
 class Persistence:
@@ -46,20 +51,18 @@ class Persistence:
 
     def __init__(self, *, seed: int = 0, horizon: int = 1) -> None:
         self.seed, self.horizon = seed, horizon
-        self.std_: NDArray[np.float64] | None = None
+        self.scale_: FeatureScale | None = None
 
     def fit(self, nominal: Sequence[Trajectory]) -> Persistence:
         """Learn the scale of every feature."""
-        rows = np.concatenate([x.observations for x in nominal]).astype(np.float64)
-        std = rows.std(axis=0)
-        self.std_ = np.where(std < 1e-6, 1.0, std)
+        self.scale_ = FeatureScale.fit(nominal)
         return self
 
     def score(self, trajectory: Trajectory) -> Scores:
         """Return the standardized size of the change over one horizon."""
-        if self.std_ is None:
+        if self.scale_ is None:
             raise NotFittedError("detector 'persistence' was asked for scores before fit")
-        z = trajectory.observations / self.std_
+        z = self.scale_(trajectory).astype(np.float64)
         scores = np.full(len(trajectory), np.nan)
         scores[self.horizon :] = np.abs(z[self.horizon :] - z[: -self.horizon]).mean(axis=1)
         return scores

@@ -72,6 +72,11 @@ def test_placebo_compares_each_twin_with_the_next():
     assert found["auc_placebo"].numerator.tolist() == [0.5, 0.75, 0.0]
 
 
+def test_placebo_of_a_clock_is_one_half_although_twins_differ_in_length():
+    clock = [np.arange(n, dtype=float) for n in (60, 90, 75)]
+    assert auc_contributions(clock, clock, [30, 40, 50])["auc_placebo"].value == 0.5
+
+
 def test_placebo_of_a_single_twin_is_undefined():
     assert math.isnan(auc_contributions(arrays([0, 1]), arrays([0, 1]), [1])["auc_placebo"].value)
 

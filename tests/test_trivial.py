@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.stats import binom, kstest
 
 from oodd_eval.detector import Detector
 from oodd_eval.errors import NotFittedError
-from oodd_eval.metrics import auc_onset, auc_same_times
+from oodd_eval.intervals import bootstrap_weights, interval, mean_interval
+from oodd_eval.metrics import auc_contributions, auc_onset, auc_same_times
+from oodd_eval.splits import load_split
 from oodd_eval.trajectory import Trajectory
 from oodd_eval.trivial import Clock, Persistence, Random, oodd_detectors
 
@@ -32,10 +35,41 @@ def test_clock_has_paper_auc_one_and_matched_auc_one_half():
     assert auc_same_times(scores, scores, 20, 50) == 0.5
 
 
-def test_random_differs_between_seeds_and_not_between_trajectories():
-    other = episode(np.zeros((50, 3)))
-    assert np.array_equal(Random(seed=1).score(WALK), Random(seed=1).score(other))
-    assert not np.array_equal(Random(seed=1).score(WALK), Random(seed=2).score(WALK))
+def test_random_differs_between_seeds_and_between_trajectories():
+    first, other = Random(seed=0).score(WALK), Random(seed=1).score(WALK)
+    moved = episode(WALK.observations + 1)
+    assert not np.array_equal(first, other)
+    assert not np.isin(Random(seed=0).score(moved), first).any()
+
+
+def test_random_is_uniform():
+    rows = np.random.default_rng(1).normal(size=(4000, 2))
+    scores = Random(seed=0).score(episode(rows))
+    assert kstest(scores, "uniform").pvalue > 0.001
+
+
+@pytest.mark.slow
+def test_on_mini_clock_and_random_give_what_theory_says():
+    split = load_split("mini")
+    cells = []
+    for environment in split.environments:
+        data = split.environment(environment)
+        twins = [Random(seed=0).score(x) for x in data.twins]
+        clocks = [Clock().score(x) for x in data.twins]
+        weights = bootstrap_weights(len(twins), key=environment)
+        for anomaly in data.anomalies:
+            part = data.anomalous(anomaly)
+            clock = auc_contributions([Clock().score(x) for x in part], clocks, part.onsets)
+            assert clock["auc"].value == 1
+            assert clock["auc_matched"].value == clock["auc_placebo"].value == 0.5
+            found = auc_contributions([Random(seed=0).score(x) for x in part], twins, part.onsets)
+            cells.append((found, weights))
+    for metric in ("auc", "auc_matched", "auc_placebo"):
+        low, high = mean_interval([c[metric] for c, _ in cells], [w for _, w in cells])
+        assert low <= 0.5 <= high
+        # With ten seeds a percentile interval of 95 % covers about 90 %.
+        outside = sum(not x <= 0.5 <= y for x, y in (interval(c[metric], w) for c, w in cells))
+        assert outside <= binom.ppf(0.999, len(cells), 0.1)
 
 
 def test_persistence_is_the_mean_change_in_training_deviations():
