@@ -22,7 +22,7 @@ from oodd_torch.network import Ensemble
 
 BETAS: Final = (0.9, 0.999)
 EPSILON: Final = 1e-8
-KAPPA: Final = 0.05
+KAPPA: Final = 0.2
 """Width of the quadratic part of the loss, in standard deviations of a sensor's change.
 
 With the usual 1 nearly all errors of a good forecast would fall into the quadratic part, and the
