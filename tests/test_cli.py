@@ -1,6 +1,5 @@
 """The command line: answers, exit codes, and what is said where."""
 
-import argparse
 import json
 import os
 import re
@@ -15,6 +14,7 @@ from helpers_split import make_split
 
 from oodd_eval import cli
 from oodd_eval.commands import listing
+from oodd_eval.options import choices
 from oodd_eval.results import ResultsDirectory
 
 
@@ -373,20 +373,17 @@ def test_a_missing_extra_is_named_with_the_command(tmp_path, missing, arguments,
 
 
 def test_every_command_has_help(capsys):
-    for command, actions in cli._ACTIONS.items():
-        for action in actions or ("",):
+    for command, parser in choices(cli.build_parser()).items():
+        for action in choices(parser) or ("",):
             assert cli.main([command, *([action] if action else []), "--help"]) == 0
             assert "usage: oodd-eval" in capsys.readouterr().out
 
 
-def test_commands_of_the_parser_are_those_that_suggestions_know():
-    parser = cli.build_parser()
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    assert set(commands.choices) == set(cli._ACTIONS)
-    for name, actions in cli._ACTIONS.items():
-        found = [a for a in commands.choices[name]._actions
-                 if isinstance(a, argparse._SubParsersAction)]  # fmt: skip
-        assert {c for a in found for c in a.choices} == set(actions)
+def test_every_handler_exists():
+    for parser in choices(cli.build_parser()).values():
+        for command in choices(parser).values() or [parser]:
+            module, _, function = command.get_default("handler").partition(":")
+            assert callable(getattr(cli._module(module), function))
 
 
 def test_help_names_every_exit_code(capsys):
