@@ -1,0 +1,1 @@
+"""``oodd-eval leaderboard submit`` and ``verify``."""
