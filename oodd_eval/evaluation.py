@@ -15,7 +15,13 @@ from oodd_eval.cusum import Standardization
 from oodd_eval.detector import Scores
 from oodd_eval.errors import ResultsError
 from oodd_eval.intervals import bootstrap_weights, interval
-from oodd_eval.metrics import AlarmRule, Contribution, alarm_contributions, cell_contributions
+from oodd_eval.metrics import (
+    AlarmRule,
+    Contribution,
+    alarm_contributions,
+    cell_contributions,
+    pooled_metrics,
+)
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.plugins import Offer
 from oodd_eval.records import NAN, Metric, Record
@@ -82,7 +88,8 @@ def cell_metrics(
     Returns
     -------
     metrics
-        By name: those of `oodd_eval.metrics.METRICS`, then those under each calibrated rule.
+        By name: those of `oodd_eval.metrics.METRICS`, those under each calibrated rule, and the
+        pooled ones, which have no interval: every resample would need their whole curve again.
     contributions
         Numerators and denominators of those that are ratios of sums.
     """
@@ -93,7 +100,9 @@ def cell_metrics(
     weights = _weights(len(anomalous), key=environment)
     metrics = {name: Metric(c.value, *interval(c, weights), n=c.n) for name, c in found.items()}
     thresholds = {f"threshold_{s}": Metric(r.threshold) for s, r in rules.calibrated.items()}
-    return metrics | thresholds, found
+    defined = sum(not np.isnan(scores).all() for scores in anomalous)
+    pooled = pooled_metrics(anomalous, onsets)
+    return metrics | thresholds | {k: Metric(v, n=defined) for k, v in pooled.items()}, found
 
 
 def make_records(
@@ -133,7 +142,12 @@ def make_records(
         seconds_fit=cost.get("seconds_fit", NAN),
         seconds_score=cost.get("seconds_score", NAN),
         peak_rss_mb=cost.get("peak_rss_mb", NAN),
-        provenance={**provenance, "limit": plan.limit, "overrides": dict(unit.overrides)},
+        provenance={
+            **provenance,
+            "limit": plan.limit,
+            "overrides": dict(unit.overrides),
+            "inputs": offer.spec.inputs,
+        },
     )
     records = [
         replace(blank, cell=plan.cell(unit, a), anomaly=a, group=ANOMALIES[a].group)

@@ -34,7 +34,15 @@ METRICS: Final[dict[str, str]] = {
 }
 """Names and meanings, in the order of records and tables."""
 
-HIGHER_IS_BETTER: Final = frozenset({"auc", "auc_matched"})
+POOLED: Final[dict[str, str]] = {
+    "auc_pooled": "AUC of all trajectories' scores in one pool, labelled by the onset",
+    "average_precision": "area under the precision-recall curve of that pool",
+    "fpr95": "false-positive rate of that pool where 95 % of its anomalous steps are found",
+}
+"""The words of the neighbouring field: single numbers of pooled steps, not ratios of sums."""
+
+HIGHER_IS_BETTER: Final = frozenset({"auc", "auc_matched", "auc_pooled", "average_precision"})
+"""Of the others, null, placebo and threshold have no better side; the rest are better lower."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,6 +222,63 @@ def cell_contributions(
     found = auc_contributions(anomalous, twins, onsets)
     found |= alarm_contributions(anomalous, twins, onsets, rule)
     return {name: found[name] for name in METRICS}
+
+
+def pooled_metrics(anomalous: Sequence[Floats], onsets: Sequence[int]) -> dict[str, float]:
+    """Pooled AUC, average precision and FPR95 of one cell, in the order of `POOLED`.
+
+    All defined scores of all anomalous trajectories form one pool, positive where t >= onset, as
+    is usual where anomalies are searched in single images or time steps. With TP and FP the
+    positives and negatives at or above a threshold, P and N their totals, and the thresholds
+    descending over the distinct scores:
+
+    - ``auc_pooled`` is the area under TP / P over FP / N, ties one half;
+    - ``average_precision`` is the sum of (increase of TP / P) * TP / (TP + FP), without
+      interpolation;
+    - ``fpr95`` is FP / N at the highest threshold with TP / P >= 0.95.
+
+    Parameters
+    ----------
+    anomalous : sequence of n arrays
+        Scores; NaN is left out.
+    onsets : sequence of n ints
+
+    Returns
+    -------
+    dict
+        NaN where a class is empty.
+
+    Notes
+    -----
+    A pool compares scores of different episodes and phases, and its average precision moves with
+    the share of positives, which the onsets decide: for reading beside other work, not for ranking.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pooled_metrics([np.array([0.0, 2.0, 3.0]), np.array([0.0, 1.0, 0.0, 1.0])], [1, 3])
+    {'auc_pooled': 0.9583333333333334, 'average_precision': 0.9166666666666666, 'fpr95': 0.25}
+    """
+    scores = np.concatenate(anomalous)
+    times = np.concatenate(
+        [np.arange(len(a)) - onset for a, onset in zip(anomalous, onsets, strict=True)]
+    )
+    defined = ~np.isnan(scores)
+    scores, positive = scores[defined], times[defined] >= 0
+    if not positive.any() or positive.all():
+        return dict.fromkeys(POOLED, float("nan"))
+    order = np.argsort(-scores, kind="stable")
+    scores, positive = scores[order], positive[order]
+    # Equal scores pass a threshold together: only the last of each run of them counts.
+    last = np.append(scores[1:] != scores[:-1], True)
+    tp, fp = np.cumsum(positive)[last], np.cumsum(~positive)[last]
+    # Twenty times the counts, so that 95 % is exact.
+    found = int(np.argmax(20 * tp >= 19 * tp[-1]))
+    return {
+        "auc_pooled": auc(scores[positive], scores[~positive]),
+        "average_precision": float(np.sum(np.diff(tp, prepend=0) * (tp / (tp + fp))) / tp[-1]),
+        "fpr95": float(fp[found] / fp[-1]),
+    }
 
 
 def _rate(pairs: Sequence[tuple[NDArray[np.bool_], Floats]]) -> Contribution:

@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.metrics import roc_auc_score
+from sklearn.metrics import average_precision_score, roc_auc_score, roc_curve
 
 from oodd_eval.cusum import Standardization
 from oodd_eval.metrics import (
     METRICS,
+    POOLED,
     AlarmRule,
     Contribution,
     alarm_contributions,
     auc,
     auc_contributions,
     cell_contributions,
+    pooled_metrics,
 )
 
 NAN = math.nan
@@ -161,3 +163,49 @@ def test_a_ratio_without_denominator_is_undefined():
     empty = Contribution(np.zeros(2), np.zeros(2))
     assert math.isnan(empty.value)
     assert empty.n == 0
+
+
+POOLS = st.lists(
+    st.tuples(st.lists(st.integers(0, 6), min_size=2, max_size=30), st.integers(0, 30)),
+    min_size=1,
+    max_size=5,
+)
+
+
+@given(POOLS)
+def test_pooled_metrics_are_scikit_learns(trajectories):
+    scores = [np.array(values, float) for values, _ in trajectories]
+    onsets = [min(onset, len(values)) for values, onset in trajectories]
+    pool = np.concatenate(scores)
+    labels = np.concatenate([np.arange(len(s)) >= t for s, t in zip(scores, onsets, strict=True)])
+    found = pooled_metrics(scores, onsets)
+    assert list(found) == list(POOLED)
+    if labels.all() or not labels.any():
+        assert all(map(math.isnan, found.values()))
+        return
+    fpr, tpr, _ = roc_curve(labels, pool, drop_intermediate=False)
+    assert found["auc_pooled"] == pytest.approx(roc_auc_score(labels, pool))
+    assert found["average_precision"] == pytest.approx(average_precision_score(labels, pool))
+    assert found["fpr95"] == pytest.approx(fpr[np.argmax(tpr >= 0.95)])
+
+
+def test_pooled_metrics_by_hand():
+    # Positives 3, 1 | 2; negatives 2 | 0: at or above 3, 2, 1 there are 1, 2, 3 positives and
+    # 0, 1, 1 negatives.
+    found = pooled_metrics(arrays([NAN, 2, 3, 1], [0, 2]), [2, 1])
+    assert found["auc_pooled"] == (2 + 1 + 1.5) / 6
+    assert found["average_precision"] == pytest.approx((1 + 2 / 3 + 3 / 4) / 3)
+    assert found["fpr95"] == 1 / 2
+
+
+def test_95_percent_of_the_positives_are_enough_and_fewer_are_not():
+    # Twenty positives, the lowest below all negatives: nineteen are 95 %, eighteen are not.
+    negatives = [5.0, 4.0]
+    assert pooled_metrics(arrays([*negatives, *[9.0] * 19, 1.0]), [2])["fpr95"] == 0
+    assert pooled_metrics(arrays([*negatives, *[9.0] * 18, 4.5, 1.0]), [2])["fpr95"] == 1 / 2
+
+
+def test_pooled_metrics_without_a_class_are_undefined():
+    assert all(map(math.isnan, pooled_metrics(arrays([NAN, 1, 2]), [1]).values()))
+    assert all(map(math.isnan, pooled_metrics(arrays([1, 2, NAN]), [2]).values()))
+    assert all(map(math.isnan, pooled_metrics(arrays([NAN, NAN]), [1]).values()))
