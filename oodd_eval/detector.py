@@ -65,11 +65,16 @@ class DetectorSpec:
         What the scores depend on: observations alone, or commanded actions too.
     parameters
         Names and defaults of the parameters that ``--param`` may set.
+    other_parameters
+        Whether ``--param`` may set others than those, whose names only the factory knows.
     requires
         Importable modules that the detector needs beyond oodd-eval's core, checked without
         importing them; without them it is listed as unavailable.
     extra
         What to install when one of `requires` is missing, such as ``"oodd-eval[reference]"``.
+    version
+        Version of the library that does the work, where that is not the plug-in itself, such as
+        ``"scikit-learn.1.9.1"``: scores of another version are not taken for these.
     """
 
     name: str
@@ -78,8 +83,10 @@ class DetectorSpec:
     reference: str = ""
     inputs: Literal["observations", "observations+actions"] = "observations"
     parameters: dict[str, Any] = field(default_factory=dict)
+    other_parameters: bool = False
     requires: tuple[str, ...] = ()
     extra: str = ""
+    version: str = ""
 
 
 def check_scores(

@@ -31,6 +31,19 @@ def oodd_detectors() -> list[DetectorSpec] | None:
     """
 
 
+@hookspec(firstresult=True)
+def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
+    """Make a detector from a name with a colon, such as ``pyod:IForest``.
+
+    Called when a user names such a detector, and again in the worker that runs it, until a plug-in
+    answers; those of oodd-eval itself are asked first. Return None for a name of another's making.
+    For a name of your own that leads nowhere, raise `oodd_eval.errors.UsageError` or
+    `UnknownNameError`. The name of the spec has a colon too, may be tidier than `spec`, and makes
+    the same detector. The first line of the implementation's docstring says which names it knows:
+    ``oodd-eval list detectors`` prints it. Names in results are never resolved.
+    """
+
+
 @hookspec
 def oodd_run_started(plan: Plan) -> None:
     """Observe that a run is about to start.

@@ -109,7 +109,11 @@ def make_plan(
             seed=seed,
             environment=environment,
             parameters=resolved,
-            overrides={k: v for k, v in resolved.items() if v != spec.parameters[k]},
+            overrides={
+                k: v
+                for k, v in resolved.items()
+                if k not in spec.parameters or v != spec.parameters[k]
+            },
             anomalies=tuple(anomalies),
         )
         for environment in environments

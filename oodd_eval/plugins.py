@@ -9,8 +9,9 @@ for the exit code.
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
@@ -21,7 +22,14 @@ import pluggy
 from oodd_eval import hookspecs, trivial
 from oodd_eval._version import __version__
 from oodd_eval.detector import DetectorSpec
-from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
+from oodd_eval.errors import (
+    MissingExtraError,
+    OoddError,
+    PluginError,
+    UnknownNameError,
+    UsageError,
+)
+from oodd_eval.selection import select
 
 BUILT_IN: Final = "trivial"
 """Name of the plug-in that is part of the harness."""
@@ -101,20 +109,81 @@ class Plugins:
     manager: pluggy.PluginManager
     offers: dict[str, Offer] = field(default_factory=dict)
     broken: list[Broken] = field(default_factory=list)
+    points: dict[str, EntryPoint] = field(default_factory=dict)
     foreign: dict[str, str] = field(default_factory=dict)
 
     def offer(self, name: str) -> Offer:
-        """Return the offered detector of this name.
+        """Return the offered detector of this name; one with a colon is made when first named.
 
         Raises
         ------
         UnknownNameError
             When no working plug-in offers it.
+        UsageError
+            When it has a colon and no plug-in can make a detector of it.
         """
+        if name not in self.offers and ":" in name:
+            made = self._from_spec(name)
+            return self.offers.setdefault(made.spec.name, made)
         try:
             return self.offers[name]
         except KeyError:
             raise UnknownNameError("detector", name, self.offers) from None
+
+    def select(self, patterns: str) -> list[str]:
+        """Return the names of the detectors that a comma list of names and globs selects.
+
+        Raises
+        ------
+        UsageError
+            When a name does not exist or a glob matches nothing.
+        """
+        parts = [part.strip() for part in patterns.split(",")]
+        known = [self.offer(part).spec.name if ":" in part else part for part in parts]
+        return select("detector", ",".join(known), self.offers)
+
+    def spec_forms(self) -> list[tuple[str, str, str]]:
+        """Return who makes detectors of names with a colon: plug-in, origin, and which names."""
+        return [
+            (name, f"{_distribution(point)} {_version(point)}", first_line(call))
+            for name, point, call in self._makers()
+        ]
+
+    def _makers(self) -> list[tuple[str, EntryPoint, Callable[..., object]]]:
+        """Return plug-ins that make detectors of names with a colon, this distribution's first."""
+        hook = self.manager.hook.oodd_detector_from_spec
+        return [
+            (made.plugin_name, self.points[made.plugin_name], made.function)
+            for made in hook.get_hookimpls()
+            if made.plugin_name in self.points
+        ]
+
+    def _from_spec(self, text: str) -> Offer:
+        """Ask one plug-in after the other; a failure is told as that plug-in's."""
+        asked = []
+        for name, point, call in self._makers():
+            try:
+                spec = call(spec=text)
+            except OoddError:
+                raise
+            except (Exception, SystemExit) as error:
+                raise PluginError(
+                    f"plug-in {name!r} of {_distribution(point)} failed to make detector {text!r}: "
+                    f"{describe(error)}"
+                ) from error
+            if isinstance(spec, DetectorSpec) and ":" in spec.name:
+                return _offer(spec, point, self.manager.get_plugin(name).__name__)
+            if spec is not None:
+                raise PluginError(
+                    f"plug-in {name!r} of {_distribution(point)} made {spec!r:.80} of {text!r}, "
+                    "expected None or a DetectorSpec whose name has a colon"
+                )
+            asked.append(name)
+        raise UsageError(
+            f"no plug-in makes a detector of {text!r}: "
+            + (f"asked {', '.join(asked)}" if asked else "none that is loaded knows such names")
+            + " (oodd-eval list detectors says which names there are)"
+        )
 
     def observe(self, observer: object, name: str) -> None:
         """Register an observer of runs that is part of the program, such as a reporter."""
@@ -188,6 +257,11 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
+def first_line(documented: object) -> str:
+    """Return the first line of an object's docstring; empty without one."""
+    return (inspect.getdoc(documented) or "").partition("\n")[0]
+
+
 def _own_first(point: EntryPoint) -> tuple[bool, str, str]:
     """Order entry points so that no other distribution can take a name from this one."""
     distribution = _distribution(point)
@@ -196,6 +270,16 @@ def _own_first(point: EntryPoint) -> tuple[bool, str, str]:
 
 def _distribution(point: EntryPoint) -> str:
     return point.dist.name if point.dist else "unknown distribution"
+
+
+def _version(point: EntryPoint) -> str:
+    return point.dist.version if point.dist else ""
+
+
+def _offer(spec: DetectorSpec, point: EntryPoint, module: str) -> Offer:
+    """Return a plug-in's spec as an offer; its version names the library that does the work."""
+    version = "+".join(part for part in (_version(point), spec.version) if part)
+    return Offer(spec, point.name, module, _distribution(point), version)
 
 
 def _load(plugins: Plugins, point: EntryPoint) -> None:
@@ -217,6 +301,7 @@ def _load(plugins: Plugins, point: EntryPoint) -> None:
         plugins.broken.append(Broken(name, distribution, describe(error)))
     else:
         plugins.foreign[name] = distribution
+        plugins.points[name] = point
 
 
 def _add_offers(plugins: Plugins, module: ModuleType, point: EntryPoint) -> None:
@@ -231,8 +316,7 @@ def _add_offers(plugins: Plugins, module: ModuleType, point: EntryPoint) -> None
                 f"{previous.plugin!r}) and by {distribution} (plug-in {point.name!r}): uninstall "
                 f"one of them, or leave it out with -p no:{point.name}"
             )
-        version = point.dist.version if point.dist else ""
-        mine[spec.name] = Offer(spec, point.name, module.__name__, distribution, version)
+        mine[spec.name] = _offer(spec, point, module.__name__)
     plugins.offers.update(mine)
 
 
@@ -273,6 +357,8 @@ def resolve_parameters(spec: DetectorSpec, given: Mapping[str, Any]) -> dict[str
         When a value is of another kind than a default that is a number, a text or a truth value.
     """
     for name, value in given.items():
+        if name not in spec.parameters and spec.other_parameters:
+            continue
         if name not in spec.parameters:
             raise UnknownNameError(f"parameter of {spec.name}", name, spec.parameters)
         default = spec.parameters[name]

@@ -68,7 +68,8 @@ class UnitKey:
         """Return the key as a short file name: detector, environment and a digest of it all."""
         canonical = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"), default=str)
         digest = hashlib.sha256(canonical.encode()).hexdigest()
-        return f"{self.detector}-{self.environment}-{digest[:20]}"
+        detector = self.detector.replace(":", "-")  # which some file systems do not take
+        return f"{detector}-{self.environment}-{digest[:20]}"
 
 
 def unit_key(plan: Plan, unit: Unit, offer: Offer) -> UnitKey:

@@ -1,14 +1,18 @@
 """Every hook has a test of its name; observers cannot stop a run."""
 
 import inspect
+from dataclasses import replace
 
 import pytest
 from helpers_plugins import install
 
 from oodd_eval import hookspecs, load_split
+from oodd_eval.cli import main
+from oodd_eval.errors import PluginError, UsageError
 from oodd_eval.hookspecs import hookimpl
 from oodd_eval.plan import make_plan
 from oodd_eval.plugins import discover
+from oodd_eval.results import ResultsDirectory
 from oodd_eval.runner import Settings, run
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("oodd_")]
@@ -52,7 +56,7 @@ def watched(tiny_split):
 
 
 def test_every_hook_has_a_test_of_its_name():
-    assert len(HOOKS) == 4
+    assert len(HOOKS) == 5
     assert {f"test_{name}" for name in HOOKS} <= set(globals())
 
 
@@ -73,6 +77,93 @@ def test_oodd_detectors(monkeypatch, tmp_path):
 def test_oodd_detectors_may_return_none(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "none", "@hookimpl\ndef oodd_detectors(): return None")
     assert discover().broken == []
+
+
+MAKER = """
+    class Made(Good):
+        pass
+
+    @hookimpl
+    def oodd_detector_from_spec(spec):
+        \"\"\"mine:N: a detector of the number N.
+
+        More of it.
+        \"\"\"
+        kind, _, number = spec.partition(":")
+        if kind != "mine":
+            return None
+        return DetectorSpec(f"mine:{int(number)}", Made, "a test's", version="lib.2")
+    """
+
+
+def test_oodd_detector_from_spec(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    plugins = discover()
+    assert "mine:7" not in plugins.offers
+    offer = plugins.offer("mine:07")
+    assert (offer.spec.name, offer.plugin, offer.module) == ("mine:7", "maker", "oodd_maker")
+    assert (offer.distribution, offer.version) == ("oodd-maker", "1.0+lib.2")
+    assert plugins.offer("mine:7") is offer
+    assert plugins.select("clock, mine:8,mine:07") == ["clock", "mine:8", "mine:7"]
+
+
+def test_a_detector_from_a_spec_runs_in_a_worker(watched, monkeypatch, tmp_path, tiny_split):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    split = load_split(tiny_split)
+    plugins = discover()
+    plan = make_plan(
+        plugins, split=split.name, split_digest=split.digest, detectors=plugins.select("mine:07"),
+        environments=["cartpole"], anomalies=["iid"],
+    )  # fmt: skip
+    results = ResultsDirectory(tmp_path / "out")
+    done = run(plan, split, plugins, Settings(jobs=1), results)
+    assert [(r.status, r.detector) for r in done.records] == [("ok", "mine:7")]
+    assert done.records[0].cell == f"{split.name}/cartpole/iid::mine:7[h=1,seed=0]"
+    (kept,) = (tmp_path / "out" / "scores").iterdir()
+    assert kept.name.startswith("mine-7-cartpole-")
+    again = run(plan, split, discover(), Settings(jobs=1), results)
+    assert [r.status for r in again.records] == ["ok"]
+
+
+def test_list_tells_which_names_with_a_colon_there_are(monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    assert main(["list", "detectors"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if line.startswith("(maker)")]
+    assert " ".join(line.split()) == "(maker) oodd-maker 1.0 mine:N: a detector of the number N."
+
+
+def test_a_name_with_a_colon_that_nobody_knows_is_an_error(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    with pytest.raises(UsageError, match=r"no plug-in makes a detector of 'yours:1': .*maker"):
+        discover().offer("yours:1")
+
+
+def test_a_plugin_that_fails_to_make_a_detector_is_named(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    with pytest.raises(PluginError, match=r"'maker' of oodd-maker failed to make .*'mine:x': Val"):
+        discover().offer("mine:x")
+
+
+@pytest.mark.parametrize("made", ['"text"', 'DetectorSpec("rf", Good, "")'])
+def test_a_plugin_may_not_make_something_else(monkeypatch, tmp_path, made):
+    code = f"@hookimpl\ndef oodd_detector_from_spec(spec): return {made} if 'odd' in spec else None"
+    install(monkeypatch, tmp_path, "odd", code)
+    with pytest.raises(PluginError, match="expected None or a DetectorSpec whose name has a colon"):
+        discover().offer("odd:1")
+
+
+def test_a_name_with_a_colon_in_results_causes_no_import(watched, monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "maker", MAKER)
+    _, _, done = watched()
+    record = replace(done.records[0], detector="mine:7", plugin="oodd-maker:maker")
+    results = ResultsDirectory(tmp_path / "out")
+    results.prepare()
+    results.merge_records([record])
+    # The plug-in is on the path, where importing it would now fail.
+    (tmp_path / "oodd_maker.py").write_text("raise SystemExit('imported')")
+    assert main(["show", str(tmp_path / "out"), "--stored"]) == 0
+    assert "mine:7" in capsys.readouterr().out
 
 
 def test_oodd_run_started(watched):
@@ -104,7 +195,7 @@ def test_an_observer_may_take_fewer_arguments(watched):
     assert terse.heard == 2
 
 
-@pytest.mark.parametrize("hook", [name for name in HOOKS if name != "oodd_detectors"])
+@pytest.mark.parametrize("hook", [name for name in HOOKS if "detector" not in name])
 def test_an_installed_observer_that_raises_is_noted_and_the_run_goes_on(
     watched, monkeypatch, tmp_path, hook
 ):

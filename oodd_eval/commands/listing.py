@@ -29,6 +29,8 @@ def _detectors(plugins: Plugins) -> Iterable[tuple[str, ...]]:
         reason = offer.unavailable()
         note = f"[unavailable: {reason}] " if reason else ""
         yield name, offer.origin, note + offer.spec.summary
+    for plugin, origin, forms in plugins.spec_forms():
+        yield f"({plugin})", origin, forms
     for broken in plugins.broken:
         yield broken.plugin, broken.distribution, f"[broken plug-in] {broken.reason}"
 

@@ -77,7 +77,7 @@ def _plan(options: argparse.Namespace, plugins: Plugins, split: Split) -> Plan:
         plugins,
         split=split.name,
         split_digest=split.digest,
-        detectors=select("detector", options.detector, plugins.offers),
+        detectors=plugins.select(options.detector),
         environments=select("environment", options.env, split.environments),
         anomalies=select("anomaly", options.anomaly, ANOMALIES),
         horizons=whole_numbers("--horizon", options.horizon, least=1),
