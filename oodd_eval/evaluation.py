@@ -203,7 +203,7 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
             if record.environment not in data:
                 data[record.environment] = split.environment(record.environment)
             environment = data[record.environment]
-            scores = _stored(record, results, environment)
+            scores = stored_scores(record, results, environment)
             key = str(record.provenance["scores"])
             if key not in rules:
                 rules[key] = Rules.fit(scores.parts[CALIBRATION])
@@ -214,7 +214,14 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
     return rescored
 
 
-def _stored(record: Record, results: ResultsDirectory, data: EnvironmentData) -> ScoreFile:
+def stored_scores(record: Record, results: ResultsDirectory, data: EnvironmentData) -> ScoreFile:
+    """Return the stored scores that a record was computed from.
+
+    Raises
+    ------
+    ResultsError
+        When there are none that fit the split.
+    """
     key = str(record.provenance.get("scores", ""))
     sets = parts_of(data, (record.anomaly,))
     scores = results.scores(key, lengths_of(sets, record.provenance.get("limit"))) if key else None
