@@ -28,10 +28,10 @@ def render(records: Sequence[Record], *, intervals: bool = False) -> str:
 
 def table(one: Table) -> str:
     """Return a table as Markdown under its title."""
-    escaped = [[_escape(cell) for cell in row] for row in one.rows]
+    escaped = [[escape(cell) for cell in row] for row in one.rows]
     text = tabulate(
         escaped,
-        headers=[_escape(h) for h in one.header],
+        headers=[escape(h) for h in one.header],
         tablefmt="pipe",
         colalign=one.alignment if escaped else None,
         disable_numparse=True,
@@ -42,11 +42,11 @@ def table(one: Table) -> str:
 def _board(board: Board, *, intervals: bool) -> str:
     ok = sum(r.ok for r in board.records)
     parts = [
-        f"## Split {_escape(board.split)}",
+        f"## Split {escape(board.split)}",
         "",
         f"Cells: {len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed.",
         "",
-        *(f"**{_escape(sentence)}**\n" for sentence in tables.findings(board)),
+        *(f"**{escape(sentence)}**\n" for sentence in tables.findings(board)),
         table(tables.ranking(board, intervals=intervals)),
         *(table(tables.anomaly_groups(board, h, intervals=intervals)) for h in board.horizons),
     ]
@@ -58,11 +58,11 @@ def _board(board: Board, *, intervals: bool) -> str:
         rows = [[r.environment, r.cell.partition("::")[2], r.status, r.reason] for r in failures]
         header = ["environment", "detector", "state", "reason"]
         parts.append(table(Table("Failures", header, rows, labels=4)))
-    parts += [f"- {_escape(line)}" for line in tables.notes(board)]
+    parts += [f"- {escape(line)}" for line in tables.notes(board)]
     return "\n".join(parts) + "\n"
 
 
-def _escape(text: str) -> str:
+def escape(text: str) -> str:
     """Keep text from being read as table or HTML: names and reasons are other people's."""
     flat = " ".join(text.split())
     for character in "\\|<>*_`[":

@@ -1,0 +1,1 @@
+"""Regression checks: results against a reference, with tolerances per metric."""
