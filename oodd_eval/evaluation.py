@@ -147,6 +147,8 @@ def make_records(
             "limit": plan.limit,
             "overrides": dict(unit.overrides),
             "inputs": offer.spec.inputs,
+            # Observations that seconds_score is for, so that detectors compare by time per step.
+            "steps_scored": cost.get("steps_scored"),
         },
     )
     records = [
