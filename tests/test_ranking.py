@@ -1,0 +1,243 @@
+"""Ranks: Holm, tie groups, studentized paired bootstrap, win rates."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from oodd_eval.errors import ResultsError
+from oodd_eval.intervals import bootstrap_weights, difference_interval
+from oodd_eval.metrics import Contribution, mean_of
+from oodd_eval.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
+
+CELLS = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid")]
+NAN = math.nan
+
+
+def row(values, cells=(("ant", "iid"),), seed=0):
+    """A row with one detector seed and the same values in every cell."""
+    return {seed: {cell: mean_of(values) for cell in cells}}
+
+
+def drawn(rng, mean=0.6, n=30, cells=CELLS):
+    return {0: {cell: mean_of(rng.normal(mean, 0.1, size=n)) for cell in cells}}
+
+
+def p_of(ranking, first, second):
+    return next(c for c in ranking.comparisons if (c.first, c.second) == (first, second))
+
+
+def test_holm_of_worked_numbers():
+    # Sorted .005 .01 .03 .04 times 4 3 2 1: .02 .03 .06 .04, and .04 is raised to .06 before it.
+    p = np.array([0.01, 0.04, 0.03, 0.005])
+    assert holm(p) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm(np.array([0.5, 0.9])) == pytest.approx([1.0, 1.0])
+    assert holm(np.array([])).tolist() == []
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_holm_rejects_what_stepping_down_rejects(values):
+    rejected = set()
+    for step, i in enumerate(sorted(range(len(values)), key=values.__getitem__)):
+        if values[i] * (len(values) - step) > ALPHA:
+            break
+        rejected.add(i)
+    corrected = holm(np.array(values))
+    assert {i for i, p in enumerate(corrected) if p <= ALPHA} == rejected
+
+
+def test_identical_detectors_share_the_first_rank():
+    values = np.random.default_rng(0).uniform(size=30)
+    ranking = rank({name: row(values, CELLS) for name in "abc"})
+    assert ranking.ranks == {"a": 1, "b": 1, "c": 1}
+    assert ranking.groups == [("a", "b", "c")]
+    assert {c.p for c in ranking.comparisons} == {1.0}
+
+
+def test_a_clearly_better_one_ranks_alone():
+    rng = np.random.default_rng(1)
+    ranking = rank({"a": drawn(rng), "best": drawn(rng, 0.8), "b": drawn(rng)})
+    assert ranking.ranks == {"best": 1, "a": 2, "b": 2}
+    assert [set(group) for group in ranking.groups] == [{"best"}, {"a", "b"}]
+    assert ranking.letters("best") == "a"
+
+
+def test_ranks_do_not_depend_on_any_order():
+    rng = np.random.default_rng(2)
+    rows = {
+        name: {seed: drawn(rng, mean)[0] for seed in (0, 1, 2)}
+        for name, mean in (("a", 0.6), ("b", 0.62), ("c", 0.7))
+    }
+    turned = {
+        name: {seed: dict(reversed(cells.items())) for seed, cells in reversed(one.items())}
+        for name, one in reversed(rows.items())
+    }
+    assert rank(turned) == rank(rows)
+    assert list(rank(turned).ranks) == list(rank(rows).ranks)
+
+
+def test_detectors_that_differ_by_noise_of_the_episodes_alone_are_told_apart():
+    # Episodes differ by far more than the detectors: only paired draws can see it.
+    rng = np.random.default_rng(3)
+    episodes, noise = rng.uniform(size=30), rng.normal(0, 0.005, size=30)
+    ranking = rank({"a": row(episodes + 0.01 + noise), "b": row(episodes)})
+    assert ranking.ranks == {"a": 1, "b": 2}
+
+
+def test_p_value_is_that_of_all_resamples_counted_out():
+    differences = np.array([0.3, 0.1, -0.1, 0.2, 0.25, 0.05])
+    n = len(differences)
+
+    def studentized(sample, centre):
+        spread = sum((x - sum(sample) / n) ** 2 for x in sample) / (n - 1) / n
+        shift = sum(sample) / n - centre
+        if abs(shift) < 1e-12:
+            return 0.0
+        return shift / math.sqrt(spread) if spread > 1e-20 else math.copysign(math.inf, shift)
+
+    observed = studentized(differences, 0.0)
+    resamples = itertools.product(differences, repeat=n)
+    reached = [studentized(s, differences.mean()) >= observed for s in resamples]
+    expected = sum(reached) / len(reached)
+    ranking = rank({"a": row(differences + 0.5), "b": row([0.5] * n)}, resamples=20_000)
+    found = p_of(ranking, "a", "b").p
+    assert 2.0**-n < expected < 0.2
+    assert found == pytest.approx(expected, abs=4 * math.sqrt(expected / 20_000))
+
+
+def test_interval_of_a_difference_is_the_paired_one():
+    rng = np.random.default_rng(4)
+    a, b = drawn(rng, n=12), drawn(rng, n=12)
+    ranking = rank({"a": a, "b": b}, resamples=2000)
+    weights = [bootstrap_weights(12, key=cell[0]) for cell in CELLS]
+    expected = difference_interval(
+        [a[0][c] for c in CELLS], [b[0][c] for c in CELLS], weights
+    )  # fmt: skip
+    one, other = p_of(ranking, "a", "b"), p_of(ranking, "b", "a")
+    assert (one.low, one.high) == pytest.approx(expected)
+    assert (other.difference, other.low, other.high) == (-one.difference, -one.high, -one.low)
+
+
+@pytest.mark.parametrize(("n", "environments"), [(10, 1), (30, 1), (10, 4)])
+def test_equal_detectors_are_called_different_in_one_table_of_twenty(n, environments):
+    rng = np.random.default_rng(5)
+    tables, wrong = 200, 0
+    for _ in range(tables):
+        episodes = {f"e{e}": rng.beta(4, 2, size=n) for e in range(environments)}
+        rows = {
+            f"d{d}": {
+                0: {
+                    (e, "iid"): mean_of(0.6 * base + 0.4 * rng.beta(3, 1.5, size=n))
+                    for e, base in episodes.items()
+                }
+            }
+            for d in range(4)
+        }
+        wrong += any(c.better for c in rank(rows, resamples=1000).comparisons)
+    # 5 % expected; 17 or more of 200 would come by chance in 3 of 100 suites at most.
+    assert wrong / tables <= 0.08
+
+
+def test_too_few_test_seeds_tell_nothing_apart():
+    # Four seeds that all favour one: signs alone would do that once in sixteen.
+    ranking = rank({"a": row([0.9, 0.8, 0.9, 0.8]), "b": row([0.1] * 4)})
+    assert p_of(ranking, "a", "b").p == 2.0**-4
+    assert ranking.ranks == {"a": 1, "b": 1}
+
+
+def test_a_constant_difference_is_a_difference():
+    # A perfect detector beside the clock: neither varies.
+    ranking = rank({"perfect": row([1.0] * 10), "clock": row([0.5] * 10)})
+    assert ranking.ranks == {"perfect": 1, "clock": 2}
+    assert p_of(ranking, "perfect", "clock").p == 2.0**-10
+    assert p_of(ranking, "clock", "perfect").p == 1.0
+
+
+def test_a_single_test_seed_tells_nothing_of_noise():
+    cells = [(f"e{i}", "iid") for i in range(20)]
+    ranking = rank({"a": row([0.9], cells), "b": row([0.1], cells)})
+    assert {c.p for c in ranking.comparisons} == {1.0}
+
+
+def test_detector_seeds_that_disagree_widen_a_comparison():
+    rng = np.random.default_rng(6)
+    cells = [drawn(rng, mean, cells=CELLS)[0] for mean in (0.5, 0.9)]
+    rival = drawn(rng, 0.6)
+    assert rank({"a": {1: cells[1]}, "rival": rival}).ranks == {"a": 1, "rival": 2}
+    both = rank({"a": {0: cells[0], 1: cells[1]}, "rival": rival})
+    assert both.ranks == {"a": 1, "rival": 1}
+    assert p_of(both, "a", "rival").difference == pytest.approx(0.1, abs=0.03)
+
+
+def test_rank_counts_better_rows_and_ties_need_not_be_transitive():
+    assert tie_groups(["a", "b", "c"], [("a", "c")]) == [("a", "b"), ("b", "c")]
+    ranking = Ranking({"a": 1, "b": 1, "c": 2}, [("a", "b"), ("b", "c")], [], 0)
+    assert [ranking.letters(name) for name in "abc"] == ["a", "ab", "b"]
+
+
+@given(st.integers(0, 6), st.sets(st.tuples(st.integers(0, 5), st.integers(0, 5))))
+def test_tie_groups_are_the_largest_sets_without_a_significant_pair(size, pairs):
+    names = [str(i) for i in range(size)]
+    apart = {(str(a), str(b)) for a, b in pairs if a < b < size}
+    subsets = [
+        set(s)
+        for k in range(1, size + 1)
+        for s in itertools.combinations(names, k)
+        if not any((a, b) in apart for a, b in itertools.combinations(s, 2))
+    ]
+    largest = {tuple(sorted(s)) for s in subsets if not any(s < other for other in subsets)}
+    assert set(tie_groups(names, apart)) == largest
+
+
+def test_long_tables_get_more_resamples():
+    ranking = rank({f"d{i:02}": row(np.linspace(0, 1, 5) + i) for i in range(16)})
+    assert ranking.resamples == 50 * 16 * 15
+    assert (1 / (ranking.resamples + 1)) * 16 * 15 < ALPHA
+    assert rank({"a": row([0.5, 0.6])}).resamples == 10_000
+
+
+def test_one_row_or_none_has_nothing_to_compare_with():
+    assert rank({"a": row([0.5, 0.6])}).ranks == {"a": 1}
+    assert rank({}).ranks == {}
+
+
+def test_rows_with_other_cells_are_refused():
+    with pytest.raises(ResultsError, match="b has 1 cells with seed 0, expected 3"):
+        rank({"a": row([0.5, 0.6], CELLS), "b": row([0.5, 0.6], CELLS[:1])})
+
+
+def test_rows_of_other_test_seeds_are_refused():
+    with pytest.raises(ResultsError, match="b has 3 test trajectories in ant/iid, expected 2"):
+        rank({"a": row([0.5, 0.6]), "b": row([0.5, 0.6, 0.7])})
+
+
+def test_a_row_with_an_undefined_cell_is_refused():
+    with pytest.raises(ResultsError, match="b has no value in ant/iid"):
+        rank({"a": row([0.5, 0.6]), "b": row([NAN, NAN])})
+
+
+def test_trajectories_without_a_value_are_left_out_of_a_mean():
+    part = Contribution(np.array([0.9, 0.0, 0.7]), np.array([1.0, 0.0, 1.0]))
+    ranking = rank({"a": {0: {("ant", "iid"): part}}, "b": row([0.5] * 3)})
+    assert p_of(ranking, "a", "b").difference == pytest.approx(0.3)
+
+
+def test_win_rates_count_equal_values_one_half():
+    values = {
+        "a": dict(zip(CELLS, [0.9, 0.5, 0.4], strict=True)),
+        "b": dict(zip(CELLS, [0.8, 0.5, 0.6], strict=True)),
+    }
+    assert win_rates(values) == {("a", "b"): 0.5, ("b", "a"): 0.5}
+    values["a"][CELLS[2]] = 0.7
+    assert win_rates(values)["a", "b"] == pytest.approx(2.5 / 3)
+
+
+def test_win_rates_are_over_common_defined_cells():
+    values = {"a": {CELLS[0]: 0.9, CELLS[1]: 0.1}, "b": {CELLS[0]: 0.8, CELLS[2]: 0.1}, "c": {}}
+    assert win_rates(values)["a", "b"] == 1.0
+    assert math.isnan(win_rates(values)["a", "c"])
+    values["b"][CELLS[1]] = NAN
+    assert win_rates(values)["a", "b"] == 1.0
