@@ -1,0 +1,528 @@
+"""Regression checks: tolerances, verdicts, reference files, exit codes, JUnit XML and Markdown."""
+
+import dataclasses
+import json
+import math
+from xml.etree import ElementTree as ET
+
+import pytest
+from helpers_records import make_record
+from hypothesis import given
+from hypothesis import strategies as st
+
+from oodd_eval import cli
+from oodd_eval.compare.differences import NothingInCommonError, compare
+from oodd_eval.compare.figures import (
+    figures_of,
+    read_figures,
+    reference_text,
+    write_reference,
+)
+from oodd_eval.compare.tolerance import KNOWN, Tolerance, parse_tolerance, worse_side
+from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.records import Metric
+from oodd_eval.report import differences, junit
+
+NAN = math.nan
+AUC = parse_tolerance("auc:-0.01")
+DELAY = parse_tolerance("delay:+10%")
+
+
+def record(anomaly="iid", *, detector="rf", environment="hopper", status="ok", **metrics):
+    """One record whose metrics are these, and 0.5 for those not named."""
+    one = make_record(
+        detector, environment, anomaly, status=status, reason="broke" * (status != "ok")
+    )
+    if status != "ok":
+        return one
+    changed = one.metrics | {k: Metric(v) for k, v in metrics.items()}
+    return dataclasses.replace(one, metrics=changed)
+
+
+def against(now, reference, *tolerances, **settings):
+    """Compare lists of records."""
+    return compare(figures_of(now), figures_of(reference), tolerances, **settings)
+
+
+def verdicts(*arguments, **settings):
+    return [d.verdict for d in against(*arguments, **settings).differences]
+
+
+def only(*arguments, **settings):
+    (found,) = against(*arguments, **settings).differences
+    return found
+
+
+def flat(text):
+    """Lines with single blanks."""
+    return [" ".join(line.split()) for line in text.splitlines()]
+
+
+def parsed(text):
+    return ET.fromstring(text)  # noqa: S314  written a line above
+
+
+# Tolerances
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("auc:-0.01", Tolerance("auc", "-", 0.01)),
+        ("auc:0.01", Tolerance("auc", "-", 0.01)),
+        ("delay:+10%", Tolerance("delay", "+", 10, percent=True)),
+        ("far_twin_at_1pct:+.5", Tolerance("far_twin_at_1pct", "+", 0.5)),
+        ("fpr95:2.", Tolerance("fpr95", "+", 2)),
+        ("auc_null:0.1", Tolerance("auc_null", "±", 0.1)),
+        ("auc_null:-0.1", Tolerance("auc_null", "-", 0.1)),
+        (" missed:0 ", Tolerance("missed", "+", 0)),
+    ],
+)
+def test_tolerances_are_read(text, expected):
+    assert parse_tolerance(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["auc", "auc:", "auc:-", "auc:--1", "auc:1e-3", "auc:nan", "auc:1%%", ":1", "auc=1"]
+)
+def test_other_forms_are_refused_with_an_example(text):
+    with pytest.raises(UsageError, match=r"expected METRIC:\[\+-\]NUMBER\[%\] such as 'auc:-0.01'"):
+        parse_tolerance(text)
+
+
+def test_an_unknown_metric_is_named_with_the_nearest():
+    with pytest.raises(UnknownNameError, match="unknown metric 'auc_mached': did you mean 'auc_m"):
+        parse_tolerance("auc_mached:1")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("auc:+0.01", "of auc, higher is better, .* write 'auc:-0.01'"),
+        ("delay:-10%", "of delay, lower is better, .* write 'delay:+10%'"),
+    ],
+)
+def test_a_sign_on_the_better_side_is_explained(text, message):
+    with pytest.raises(UsageError, match=message.replace("+", r"\+")):
+        parse_tolerance(text)
+
+
+def test_every_metric_has_its_worse_side():
+    falls = {m for m in KNOWN if worse_side(m) == "-"}
+    neither = {m for m in KNOWN if worse_side(m) == "±"}
+    assert falls == {"auc", "auc_matched", "auc_pooled", "average_precision"}
+    assert neither == {"auc_null", "auc_placebo", "delay_null", "threshold_at_1pct",
+                       "threshold_at_01pct"}  # fmt: skip
+    assert worse_side("of_another_version") == "±"
+
+
+# Verdicts
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "reference", "now", "verdict", "fails"),
+    [
+        (AUC, 0.9, 0.9, "same", False),
+        (AUC, 0.9, 0.9 - 5e-7, "same", False),
+        (AUC, 0.9, 0.895, "within", False),
+        (AUC, 0.9, 0.89, "within", False),  # as a float the difference is above 0.01
+        (AUC, 0.9, 0.88, "worse", True),
+        (AUC, 0.9, 0.905, "within", False),
+        (AUC, 0.9, 0.92, "better", False),
+        (DELAY, 10.0, 11.0, "within", False),
+        (DELAY, 10.0, 11.1, "worse", True),
+        (DELAY, 10.0, 8.9, "better", False),
+        (DELAY, 0.0, 0.1, "worse", True),
+        (parse_tolerance("auc_null:0.1"), 0.5, 0.7, "worse", True),
+        (parse_tolerance("auc_null:0.1"), 0.5, 0.3, "worse", True),
+        (parse_tolerance("auc_null:+0.1"), 0.5, 0.3, "better", False),
+        (AUC, NAN, NAN, "same", False),
+        (AUC, 0.9, NAN, "undefined", True),
+        (DELAY, NAN, 3.0, "undefined", True),
+    ],
+)
+def test_a_figure_against_its_reference(tolerance, reference, now, verdict, fails):
+    name = tolerance.metric
+    found = only([record(**{name: now})], [record(**{name: reference})], tolerance)
+    assert (found.verdict, found.fails) == (verdict, fails)
+
+
+@pytest.mark.parametrize(("tolerance", "reference", "now"), [(AUC, 0.9, 0.92), (DELAY, 10.0, 8.9)])
+def test_improvements_fail_when_both_sides_count_and_small_ones_do_not(tolerance, reference, now):
+    name = tolerance.metric
+    found = only(
+        [record(**{name: now})], [record(**{name: reference})], tolerance, two_sided=True
+    )  # fmt: skip
+    assert (found.verdict, found.fails) == ("better", True)
+    near = only([record(**{name: reference * 1.001})], [record(**{name: reference})], tolerance,
+                two_sided=True)  # fmt: skip
+    assert (near.verdict, near.fails) == ("within", False)
+
+
+def test_a_missing_or_failing_cell_of_the_reference_fails():
+    reference = [record("iid"), record("drift"), record("gravity")]
+    found = against([record("iid"), record("drift", status="timeout")], reference, AUC)
+    assert [(d.verdict, d.fails) for d in found.differences] == [
+        ("same", False), ("failed", True), ("missing", True),
+    ]  # fmt: skip
+    assert found.differences[1].reason == "timeout: broke"
+
+
+def test_a_cell_only_in_the_results_is_new_and_does_not_fail():
+    found = against([record("iid"), record("drift")], [record("iid")], AUC, two_sided=True)
+    assert [(d.place, d.verdict) for d in found.differences] == [
+        ("hopper/iid", "same"), ("hopper/drift", "new"),
+    ]  # fmt: skip
+    assert not found.failures
+
+
+def test_what_failed_in_the_reference_already_does_not_fail():
+    reference = [record("iid", status="oom"), record("drift", status="oom")]
+    now = [record("iid", status="error"), record("drift")]
+    assert verdicts(now, reference, AUC) == ["same", "recovered"]
+    assert not against(now, reference, AUC).failures
+    assert len(against(now, reference, AUC, two_sided=True).failures) == 1
+
+
+def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
+    changed = record(auc=0.4, auc_null=0.9, delay=0.4, far=0.6)
+    found = against([changed], [record()])
+    assert {d.metric for d in found.differences} == {
+        "auc", "auc_matched", "delay", "delay_censored", "missed", "far", "far_twin",
+    }  # fmt: skip
+    assert {d.metric for d in found.failures} == {"auc", "far"}
+
+
+def test_a_metric_that_the_reference_lacks_is_an_error_and_not_a_pass():
+    with pytest.raises(UsageError, match="metric 'fpr95' is not in records, expected one of auc, "):
+        against([record()], [record()], parse_tolerance("fpr95:0.1"))
+
+
+def test_of_several_records_of_a_cell_the_last_counts():
+    found = only([record(auc=0.1), record(auc=0.9)], [record(auc=0.9)], AUC)
+    assert found.verdict == "same"
+
+
+# Means
+
+
+def test_means_by_group_and_over_all():
+    names = ("iid", "drift", "gravity")
+    reference = [record(a, auc=0.9) for a in names]
+    now = [record("iid", auc=0.87), record("drift", auc=0.92), record("gravity", auc=0.83)]
+    found = against(now, reference, AUC, by="group").differences
+    assert [(d.place, round(d.change, 6), d.verdict) for d in found] == [
+        ("hopper/sensor", -0.005, "within"), ("hopper/dynamics", -0.07, "worse"),
+    ]  # fmt: skip
+    whole = only(now, reference, AUC, by="mean")
+    assert (whole.place, whole.now, whole.verdict) == ("mean", pytest.approx(2.62 / 3), "worse")
+
+
+def test_a_mean_says_which_share_of_its_cells_is_lost_or_turned():
+    reference = [record("iid"), record("drift")]
+    lost = only([record("iid")], reference, AUC, by="mean")
+    assert (lost.verdict, lost.reason, lost.fails) == (
+        "missing", "1 of 2 cells: not there now", True,
+    )  # fmt: skip
+    turned = only([record("iid", auc=NAN), record("drift")], reference, AUC, by="mean")
+    assert (turned.verdict, turned.reason) == (
+        "undefined",
+        "no value in the results in 1 of 2 cells",
+    )
+
+
+def test_means_are_over_the_cells_of_the_reference():
+    now = [record("iid", auc=0.5), record("drift", auc=0.0)]
+    found = against(now, [record("iid", auc=0.5)], AUC, by="mean").differences
+    assert (found[0].now, found[0].verdict) == (0.5, "same")
+
+
+# What cannot be compared
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"split_digest": "cd" * 32}, "mini abababababab, protocol 1; .* mini cdcdcdcdcdcd"),
+        ({"protocol": 2}, "protocol 1; .* protocol 2"),
+        ({"provenance": {"limit": 5}}, "protocol 1; .* limited to 5"),
+    ],
+)
+def test_other_digests_protocols_and_limits_have_nothing_in_common(change, message):
+    with pytest.raises(NothingInCommonError, match=message):
+        against([dataclasses.replace(record(), **change)], [record()], AUC)
+
+
+def test_other_cells_have_nothing_in_common():
+    with pytest.raises(
+        NothingInCommonError, match=r"hopper/iid::rf\S+\) is in records \(which .*:npn"
+    ):
+        against([record(detector="npn")], [record()], AUC)
+
+
+def test_of_several_splits_the_common_one_is_compared_and_the_others_are_named():
+    other = dataclasses.replace(record("drift"), split_digest="cd" * 32)
+    found = against([record(), other], [record()], AUC)
+    assert [d.verdict for d in found.differences] == ["same"]
+    assert found.notes == [
+        "Not compared: split mini cdcdcdcdcdcd, protocol 1, which is only in records."
+    ]
+
+
+# Reference files
+
+
+def test_a_reference_file_says_what_the_records_say(tmp_path):
+    records = [record("iid", auc=1 / 3, delay=NAN), record("drift", status="timeout")]
+    write_reference(records, tmp_path / "new" / "reference.json")
+    found = read_figures(tmp_path / "new" / "reference.json")
+    assert verdicts(records, records) == [d.verdict for d in compare(figures_of(records), found)
+                                          .differences]  # fmt: skip
+    (cells,) = found.boards.values()
+    figures = list(cells.values())
+    assert figures[0].metrics["auc"] == 0.333333
+    assert math.isnan(figures[0].metrics["delay"])
+    assert figures[1].status == "timeout"
+
+
+def test_a_reference_file_has_a_line_per_cell_and_the_origin(tmp_path):
+    text = reference_text([record("iid"), record("drift")])
+    assert sum(line.startswith('    "mini/hopper/') for line in text.splitlines()) == 2
+    plain = json.loads(text)
+    assert plain["boards"][0]["split_digest"] == "ab" * 32
+    assert plain["detectors"]["rf"]["plugin"] == "oodd-eval:rf"
+    assert text == reference_text([record("iid"), record("drift")])
+
+
+@given(st.floats(allow_infinity=False) | st.just(NAN))
+def test_results_are_the_same_as_their_own_reference(value):
+    value = value if math.isnan(value) or abs(value) < 1e9 else 0.0
+    records = [record(auc=value)]
+    plain = json.loads(reference_text(records))["boards"][0]["cells"]
+    ((_, metrics),) = plain.items()
+    stored = NAN if metrics["auc"] is None else metrics["auc"]
+    assert only(records, [record(auc=stored)], AUC).verdict == "same"
+
+
+def test_a_reference_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_reference([record()], tmp_path / "file" / "reference.json")
+
+
+def changed(**changes):
+    plain = json.loads(reference_text([record()]))
+    board = plain["boards"][0]
+    for name, value in changes.items():
+        (plain if name in plain else board)[name] = value
+    return json.dumps(plain)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[1]", "is no reference file: expected an object of kind 'oodd-eval reference'"),
+        (changed(kind="x"), "is no reference file"),
+        (changed(schema=2), "has schema 2, expected 1"),
+        (changed(boards={}), "boards is {}, expected list"),
+        (changed(boards=[3]), r"boards\[0\] is int, expected an object"),
+        (changed(protocol=True), r"boards\[0\]: protocol is True, expected int"),
+        (changed(split_digest=None), "split_digest is None, expected str"),
+        (changed(limit="5"), "limit is '5', expected int | None"),
+        (changed(cells={"a": "fine"}), "cell 'a' is 'fine', expected metrics or one of error"),
+        (changed(cells={"a": {"auc": "x"}}), "cell 'a': auc is 'x', expected a number or null"),
+    ],
+)
+def test_what_is_no_reference_is_refused_by_name(tmp_path, text, message):
+    (tmp_path / "r.json").write_text(text)
+    with pytest.raises(ResultsError, match=message.replace(" | ", r" \| ")):
+        read_figures(tmp_path / "r.json")
+
+
+# The command
+
+
+@pytest.fixture
+def run(tmp_path, capsys, monkeypatch):
+    """Call the command line beside two results directories, the same and worse."""
+    monkeypatch.chdir(tmp_path)
+    same = [record("iid", auc=0.9), record("gravity", auc=0.8), record("iid", environment="ant")]
+    worse = [record("iid", auc=0.7), record("gravity", auc=0.9), record("iid", environment="ant")]
+    for name, records in (("same", same), ("worse", worse)):
+        (tmp_path / name).mkdir()
+        text = "".join(r.to_json() + "\n" for r in records)
+        (tmp_path / name / "records.jsonl").write_text(text)
+    write_reference(same, tmp_path / "reference.json")
+
+    def call(*arguments):
+        code = cli.main(["compare", *arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+@pytest.mark.parametrize("reference", ["same", "same/records.jsonl", "reference.json"])
+@pytest.mark.parametrize("results", ["same", "same/records.jsonl", "reference.json"])
+def test_identical_results_are_exit_code_0_and_one_line(run, results, reference):
+    code, out, err = run(results, "--against", reference)
+    assert (code, err) == (0, "")
+    assert out == "3 cells compared in 7 metrics: 21 same.\n"
+
+
+def test_a_regression_is_exit_code_1_and_a_table(run):
+    code, out, _ = run("worse", "--against", "reference.json", "--fail", "auc:-0.01")
+    assert code == 1
+    rows = flat(out)
+    assert "hopper/iid auc 0.9000 0.7000 ↓ 0.2 -0.01 worse" in rows
+    assert "hopper/gravity auc 0.8000 0.9000 ↑ 0.1 -0.01 better" in rows
+    assert "3 cells compared in auc: 1 same, 1 better, 1 worse." in out
+    assert "Regression check failed: 1 of 3 figures" in out
+    assert "\x1b" not in out
+
+
+def test_improvements_are_exit_code_1_only_when_both_sides_count(run):
+    better = ("same", "--against", "worse", "--fail", "auc:-0.15", "-k", "iid")
+    assert run(*better)[0] == 0
+    assert run(*better, "--two-sided")[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("none", "--against", "same"), "no results or reference at 'none'"),
+        (("same", "--against", "none.json"), "no results or reference at 'none.json'"),
+        (
+            ("same", "--against", "same", "--fail", "ac:1"),
+            "unknown metric 'ac': did you mean 'auc'",
+        ),
+        (("same", "--against", "same", "--fail", "auc:+1"), "higher is better"),
+        (("same", "--against", "same", "--fail", "auc:1", "--fail", "auc:2"), "two tolerances for"),
+        (("same",), "nothing to do: expected --against REFERENCE or --write-reference FILE"),
+        (("same", "--against", "same", "--by", "x"), "invalid choice: 'x'"),
+        (("same", "--against", "same", "--junit", "no/j.xml"), "'no/j.xml' cannot be written"),
+        (("reference.json", "--write-reference", "r.json"), "has no records"),
+    ],
+)
+def test_what_cannot_be_done_is_exit_code_4(run, arguments, message):
+    code, _, err = run(*arguments)
+    assert code == 4
+    assert message in err
+
+
+def test_nothing_in_common_is_exit_code_5_with_the_reason(run):
+    code, _, err = run("same", "--against", "same", "-k", "walker2d")
+    assert (code, err) == (5, "oodd-eval: nothing in common: no cell is selected in same\n")
+    assert run("same", "--write-reference", "r.json", "-k", "walker2d")[0] == 5
+
+
+def test_a_reference_is_written_of_the_selected_cells(run, tmp_path):
+    code, out, _ = run("same", "--write-reference", "new.json", "-k", "hopper")
+    assert (code, out) == (0, "2 cells written to new.json\n")
+    assert run("worse", "--against", "new.json", "--fail", "auc:0.5")[0] == 0
+    assert "1 new cells" in run("same", "--against", "new.json")[1]
+
+
+def test_a_reference_can_be_compared_with_and_then_replaced(run):
+    again = ("--against", "reference.json", "--fail", "auc:-0.01")
+    assert run("worse", *again, "--write-reference", "reference.json")[0] == 1
+    assert run("worse", *again)[0] == 0
+
+
+def test_quiet_prints_the_summary_and_verbose_all_figures(run):
+    assert run("worse", "--against", "same", "-q")[1].count("\n") == 1
+    assert run("same", "--against", "same", "-v", "--fail", "auc:0")[1].count(" same ") >= 3
+
+
+# JUnit XML and Markdown
+
+ODD = 'a]]>&<b>"\x00\x1b\ufffe\U0001f600|`é'
+
+SCHEMA = {
+    "testsuites": ({"name", "time", "tests", "failures", "errors"}, {"testsuite"}),
+    "testsuite": ({"name", "tests", "failures", "errors", "time", "skipped"}, {"testcase"}),
+    "testcase": ({"name", "classname", "time"}, {"failure", "skipped"}),
+    "failure": ({"type", "message"}, set()),
+    "skipped": ({"message"}, set()),
+}
+"""Attributes and children that junit-10.xsd allows, as far as they are used."""
+
+
+def odd_comparison():
+    reference = [record("iid"), record("drift"), record("gravity")]
+    now = [record("iid", auc=0.2), record("drift", status="error"), record("components")]
+    odd = [dataclasses.replace(r, cell=r.cell.replace("rf", ODD), reason=ODD) for r in reference]
+    return against(
+        [dataclasses.replace(r, cell=r.cell.replace("rf", ODD), reason=ODD) for r in now], odd,
+        AUC, DELAY,
+    )  # fmt: skip
+
+
+def test_junit_has_the_layout_that_services_read():
+    root = parsed(junit.render(odd_comparison()))
+    assert root.tag == "testsuites"
+    for element in root.iter():
+        attributes, children = SCHEMA[element.tag]
+        assert set(element.attrib) == attributes
+        assert {child.tag for child in element} <= children
+    for element in (root, *root):
+        cases = list(element.iter("testcase"))
+        assert int(element.get("tests")) == len(cases) == 8
+        assert int(element.get("failures")) == len(list(element.iter("failure"))) == 5
+    assert len(list(root.iter("skipped"))) == int(root[0].get("skipped")) == 2
+
+
+def test_junit_has_a_test_case_per_cell_and_metric():
+    root = parsed(junit.render(against([record(auc=0.2)], [record()], AUC, DELAY)))
+    bad, good = root.iter("testcase")
+    assert (bad.get("classname"), bad.get("name")) == ("mini/hopper/iid::rf[h=1,seed=0]", "auc")
+    assert bad[0].get("message") == (
+        "auc worse: reference 0.5, now 0.2, ↓ 0.3, tolerance -0.01"
+    )  # fmt: skip
+    assert len(good) == 0
+
+
+@given(st.text(max_size=30))
+def test_junit_is_well_formed_whatever_the_names(text):
+    odd = dataclasses.replace(record(), cell=f"mini/hopper/iid::{text}", reason=text)
+    failed = dataclasses.replace(odd, status="error", metrics={})
+    parsed(junit.render(against([failed], [odd], AUC)))
+
+
+def test_markdown_says_verdict_summary_tables_and_conditions():
+    text = differences.render(against([record(auc=0.2), record("drift", auc=0.495)],
+                                      [record(), record("drift")], AUC))  # fmt: skip
+    lines = text.splitlines()
+    assert lines[0] == "## Regression check failed: 1 of 2 figures"
+    assert lines[2] == "2 cells compared in auc: 1 within, 1 worse."
+    assert "| hopper/iid | auc | 0.5000 | 0.2000 | ↓ 0.3 | -0.01 | worse |" in flat(text)
+    assert "<details><summary>Differences within the tolerance</summary>" in lines
+    assert lines[-1] == "- split mini abababababab, protocol 1"
+
+
+def test_markdown_of_no_difference_is_two_sentences():
+    text = differences.render(against([record()], [record()], AUC))
+    assert text.startswith("## Regression check passed\n\n1 cells compared in auc: 1 same.\n")
+    assert "|" not in text
+
+
+def test_names_in_markdown_are_no_markup():
+    text = differences.render(odd_comparison())
+    assert "<b>" not in text
+    assert r"\<b\>" in text
+
+
+def test_a_failing_cell_takes_one_row_of_the_table():
+    found = differences.table(differences.worth_showing(odd_comparison()))
+    assert [(row[0], row[1], row[-1]) for row in found.rows] == [
+        ("hopper/iid", "auc", "worse"),
+        ("hopper/drift", "all", "failed"),
+        ("hopper/gravity", "all", "missing"),
+    ]
+    assert list(dict.fromkeys(len(row) for row in found.rows)) == [len(found.header)]
+
+
+def test_a_relative_tolerance_shows_the_change_in_percent():
+    found = only([record(delay=12.5)], [record(delay=10.0)], DELAY)
+    assert differences.change(found) == "↑ 2.5 (+25.0%)"
