@@ -67,6 +67,10 @@ class NotFittedError(OoddError, RuntimeError):
     """`score` was called before `fit`."""
 
 
+class FittedStateError(OoddError, ValueError):
+    """Files that are not a fitted detector's, or not this one's."""
+
+
 class PluginError(OoddError, ImportError):
     """A plug-in that cannot be loaded, or two that offer the same name."""
 
@@ -85,6 +89,10 @@ class SimulationError(OoddError, RuntimeError):
 
 class ResultsError(OoddError, ValueError):
     """A results directory or record that cannot be read."""
+
+
+class ExecutorError(OoddError, RuntimeError):
+    """A place where units are to be carried out that cannot be reached or used."""
 
 
 class OutputError(OoddError, OSError):

@@ -148,7 +148,8 @@ def make_records(
             "overrides": dict(unit.overrides),
             "inputs": offer.spec.inputs,
             # Observations that seconds_score is for, so that detectors compare by time per step.
-            "steps_scored": cost.get("steps_scored"),
+            # A whole number, also when it was read back from a file of floats.
+            "steps_scored": int(cost["steps_scored"]) if "steps_scored" in cost else None,
         },
     )
     records = [

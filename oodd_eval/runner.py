@@ -6,26 +6,25 @@ same bytes for any number of jobs.
 
 from __future__ import annotations
 
-import os
-import threading
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
 
 from oodd_eval import provenance
 from oodd_eval.evaluation import make_records
+from oodd_eval.executors import LOCAL as LOCAL_EXECUTOR
+from oodd_eval.executors import Executor, Orders, available_cores, opener
 from oodd_eval.isolation import Limits
-from oodd_eval.plan import Plan, Unit
-from oodd_eval.plugins import Offer, Plugins
+from oodd_eval.keeping import Keeper
+from oodd_eval.plan import Plan
+from oodd_eval.plugins import Plugins
 from oodd_eval.records import Record
 from oodd_eval.results import ResultsDirectory, unit_key
 from oodd_eval.scoring import LOCAL, Scored, UnitJob
-from oodd_eval.splits import Split
+from oodd_eval.splits import EnvironmentData, Split
 
-
-def available_cores() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+__all__ = ["Run", "Settings", "available_cores", "run"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,19 +34,22 @@ class Settings:
     Attributes
     ----------
     jobs
-        Units at a time.
+        Units at a time; None means one per core, or per thread of a cluster.
     limits
         Of each unit's worker.
     fresh
         Whether to fit again what the results directory has already.
     stop_on_failure
         Whether to end the run at the first cell that is not ok.
+    executor
+        Where units are carried out: ``"local"`` or ``"dask://HOST:PORT"``.
     """
 
-    jobs: int = field(default_factory=available_cores)
+    jobs: int | None = None
     limits: Limits = field(default_factory=Limits)
     fresh: bool = False
     stop_on_failure: bool = False
+    executor: str = LOCAL_EXECUTOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,71 +90,98 @@ def run(
 
     Raises
     ------
+    UsageError, ExecutorError
+        Before any work, when the executor does not exist.
     OutputError
         Before any work, when `results` cannot be written to.
     SplitError
         When data is missing or damaged; what was finished is kept.
     """
-    if results:
-        results.prepare()
-    needed = dict.fromkeys(unit.environment for unit in plan.units)
-    data = {environment: split.environment(environment) for environment in needed}
-    plugins.notify("oodd_run_started", plan=plan)
-    finished: dict[int, list[Record]] = {}
-    stop = threading.Event()
-    origin = provenance.gather()
+    open_executor = opener(settings.executor)
+    keeper = Keeper(results)
+    keeper.prepare()
+    executor = open_executor(Orders(split, settings.limits, results, settings.fresh), settings.jobs)
+    data: dict[str, EnvironmentData] = {}
     interrupted = False
-    pool = ThreadPoolExecutor(max_workers=settings.jobs)
-    futures: dict[Future[Scored], int] = {}
     try:
-        for index, unit in enumerate(plan.units):
-            job = UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
-            submit = _now if job.offer.plugin == LOCAL else pool.submit
-            future = submit(job, settings.limits, stop, results, fresh=settings.fresh)
-            futures[future] = index
-        for future in as_completed(futures):
-            index = futures.pop(future)  # with it go its scores, once they are kept
-            unit = plan.units[index]
-            offer = plugins.offer(unit.detector)
-            scored = future.result()
-            key = _keep(plan, unit, offer, scored, results)
-            finished[index] = make_records(
-                plan, unit, offer, data[unit.environment], scored, {**origin, **key}
-            )
-            for record in finished[index]:
-                plugins.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
-            if settings.stop_on_failure and scored.status != "ok":
-                break
+        for environment in dict.fromkeys(unit.environment for unit in plan.units):
+            data[environment] = split.environment(environment)
+        plugins.notify("oodd_run_started", plan=plan)
+        _carry_out(plan, data, plugins, settings, executor, keeper)
     except KeyboardInterrupt:
         interrupted = True
     finally:
-        stop.set()
-        pool.shutdown(wait=True, cancel_futures=True)
-        records = [record for index in sorted(finished) for record in finished[index]]
-        if results and records:
-            results.merge_records(records)
-        for environment in data.values():
-            environment.close()
+        executor.close()
+        for opened in data.values():
+            opened.close()
+        keeper.write()
+    records = keeper.records
     plugins.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
     return Run(records, interrupted)
 
 
-def _now(job: UnitJob, *arguments: Any, **settings: Any) -> Future[Scored]:
-    """Do a job in this thread, where it can be interrupted; return it as a finished future."""
-    future: Future[Scored] = Future()
-    future.set_result(job(*arguments, **settings))
-    return future
+def _carry_out(
+    plan: Plan,
+    data: dict[str, EnvironmentData],
+    plugins: Plugins,
+    settings: Settings,
+    executor: Executor,
+    keeper: Keeper,
+) -> None:
+    """Carry out the units, make records of each, and tell the observers."""
+    origin = provenance.gather()
+    jobs = [
+        UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
+        for unit in plan.units
+    ]
+
+    def score(job: UnitJob) -> Scored:
+        scored = executor(job)
+        if job.offer.plugin != LOCAL:
+            keeper.keep(unit_key(plan, job.unit, job.offer), scored)
+        return scored
+
+    with closing(_as_they_finish(jobs, score, executor)) as outcomes:
+        for index, scored in outcomes:
+            job, source = jobs[index], {}
+            if job.offer.plugin != LOCAL:
+                key = unit_key(plan, job.unit, job.offer)
+                source = {"plugin_source": key.source, "scores": key.text}
+            records = make_records(
+                plan, job.unit, job.offer, job.data, scored, {**origin, **source}
+            )
+            keeper.add(index, records)
+            for record in records:
+                plugins.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
+            if settings.stop_on_failure and scored.status != "ok":
+                return
 
 
-def _keep(
-    plan: Plan, unit: Unit, offer: Offer, scored: Scored, results: ResultsDirectory | None
-) -> dict[str, str]:
-    """Store what a unit came to; return the provenance that leads there."""
-    if offer.plugin == LOCAL:
-        return {}
-    key = unit_key(plan, unit, offer)
-    if results and scored.status == "ok" and not scored.resumed:
-        results.write_scores(key.text, scored.file)
-    if results and scored.log:
-        results.write_log(key.text, scored.log)
-    return {"plugin_source": key.source, "scores": key.text}
+def _as_they_finish(
+    jobs: Sequence[UnitJob], score: Callable[[UnitJob], Scored], executor: Executor
+) -> Generator[tuple[int, Scored], None, None]:
+    """Yield places of jobs and their scores as they finish.
+
+    A job is begun only when one of those before it has been taken, so that the scores of a few
+    units are in memory, however many there are.
+    """
+    pool = ThreadPoolExecutor(max_workers=executor.jobs)
+    running: dict[Future[Scored], int] = {}
+    waiting = enumerate(jobs)
+    try:
+        while True:
+            # Twice as many as are carried out at a time: nobody waits while records are made.
+            while len(running) < 2 * executor.jobs and (entry := next(waiting, None)):
+                index, job = entry
+                if job.offer.plugin == LOCAL:
+                    yield index, score(job)  # in this thread, where it can be interrupted
+                else:
+                    running[pool.submit(score, job)] = index
+            if not running:
+                return
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in sorted(finished, key=running.__getitem__):
+                yield running.pop(future), future.result()
+    finally:
+        executor.stop()
+        pool.shutdown(wait=True, cancel_futures=True)

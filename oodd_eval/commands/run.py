@@ -17,7 +17,7 @@ from oodd_eval.plugins import Plugins
 from oodd_eval.report import markdown
 from oodd_eval.report.terminal import TerminalReporter, make_console
 from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import Run, Settings, available_cores
+from oodd_eval.runner import Run, Settings
 from oodd_eval.runner import run as carry_out
 from oodd_eval.selection import expression, memory_bytes, seconds, select, whole_numbers
 from oodd_eval.splits import Split, load_split
@@ -65,10 +65,11 @@ def _settings(options: argparse.Namespace) -> Settings:
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise UsageError(f"--{name} is {getattr(options, name)}, expected at least 1")
     return Settings(
-        jobs=options.jobs or available_cores(),
+        jobs=options.jobs,
         limits=Limits(seconds(options.timeout), memory_bytes(options.memory)),
         fresh=options.fresh,
         stop_on_failure=options.stop,
+        executor=options.executor,
     )
 
 

@@ -31,6 +31,8 @@ def _add_run(commands: Commands[Parser]) -> None:
     add("-x", dest="stop", action="store_true", help="stop at the first failure")
     add("--limit", type=int, metavar="N", help="use the first N trajectories of each part")
     add("--jobs", type=int, metavar="N", help="fits at a time (default: one per core)")
+    add("--executor", default="local", metavar="local|dask://HOST:PORT",
+        help="where fits are carried out: here, or on a Dask cluster (default: local)")  # fmt: skip
     add("--timeout", default="30m", help="wall-clock time of a fit with its scores (default: 30m)")
     add("--memory", default="8GB", help="resident memory of a fit (default: 8GB)")
     add("--fresh", action="store_true", help="fit again what the results directory has already")
@@ -57,4 +59,6 @@ def _add_show(commands: Commands[Parser]) -> None:
     add("--intervals", action="store_true", help="print 95 %% intervals")
     add("--detector", metavar="NAME", help="print the table by anomaly of one detector")
     add("--metric", default="auc_matched", help="metric of that table (default: auc_matched)")
+    add("--wide", action="store_true",
+        help="print all metrics, pooled AUC, average precision and FPR95 among them")  # fmt: skip
     add("--markdown", action="store_true", help="print Markdown, everything in it")
