@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -34,7 +35,9 @@ class Detector(Protocol):
 
     - ``score_many(trajectories) -> list of score arrays``: the same scores, for many trajectories
       at once, where batching is faster;
-    - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon.
+    - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
+    - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
+    - ``save(directory)`` and ``load(directory)``: see `StorableDetector`.
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
@@ -43,6 +46,57 @@ class Detector(Protocol):
 
     def score(self, trajectory: Trajectory) -> Scores:
         """Return float64 scores of shape (T + 1,), higher meaning more anomalous."""
+        ...
+
+
+@runtime_checkable
+class StreamingDetector(Detector, Protocol):
+    """A detector that can run beside a robot, one observation at a time."""
+
+    def reset(self) -> None:
+        """Begin a new episode; `fit` does so too."""
+        ...
+
+    def update(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> float:
+        """Return the score of the next observation, NaN where it is undefined.
+
+        The scores of an episode are those of `score` on the whole of it, to a relative 1e-5.
+
+        Parameters
+        ----------
+        observation : array of shape (D,)
+            ``o_t``.
+        action : array of shape (A,), optional
+            ``a_{t-1}``, commanded since the previous observation; None at the first one, and for
+            detectors that do not look at actions.
+        """
+        ...
+
+
+@runtime_checkable
+class StorableDetector(Detector, Protocol):
+    """A detector whose fit can be kept in plain files.
+
+    Neither method may use pickle: what is loaded may come from anywhere. Paths are directories.
+    """
+
+    def save(self, directory: Path) -> None:
+        """Write the fitted state as files into an empty directory."""
+        ...
+
+    def load(self, directory: Path) -> None:
+        """Take over what `save` wrote.
+
+        Called instead of `fit` on a new detector, made with the same parameters but for those that
+        `DetectorSpec.fit_ignores` names. Scores are then the same, bit for bit.
+
+        Raises
+        ------
+        FittedStateError
+            When the files are not what this detector saves.
+        """
         ...
 
 
@@ -75,6 +129,11 @@ class DetectorSpec:
     version
         Version of the library that does the work, where that is not the plug-in itself, such as
         ``"scikit-learn.1.9.1"``: scores of another version are not taken for these.
+    fit_ignores
+        Parameters, and ``"horizon"``, that decide scores but not the fit: one saved fit then serves
+        all their values.
+    fit_name
+        Detectors of one plug-in with the same name here share fits; default `name`.
     """
 
     name: str
@@ -87,6 +146,8 @@ class DetectorSpec:
     requires: tuple[str, ...] = ()
     extra: str = ""
     version: str = ""
+    fit_ignores: tuple[str, ...] = ()
+    fit_name: str = ""
 
 
 def check_scores(

@@ -43,7 +43,12 @@ _SINGLE_THREAD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a worker is told beside the trajectories; `train` is how many of them are to fit on."""
+    """What a worker is told beside the trajectories.
+
+    `train` is how many of them are to fit on. `load` is the directory of a fitted detector, which
+    then replaces the fit; `save` the empty one where a fitted detector may save itself. Both are
+    empty where there is none.
+    """
 
     plugin: str
     detector: str
@@ -51,6 +56,8 @@ class Request:
     seed: int
     horizon: int
     train: int
+    load: str = ""
+    save: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,17 +140,20 @@ def run_isolated(
     """
     to_worker, from_harness = _pipe()
     to_harness, from_worker = _pipe()
+    # Closed by the system when this process is killed, which ends the worker.
+    lifeline, held = _pipe()
+    for_worker = (to_worker, from_worker, lifeline)
     process = subprocess.Popen(  # noqa: S603  our own interpreter and module
-        [sys.executable, "-P", "-m", "oodd_eval.worker", str(to_worker), str(from_worker)],
+        [sys.executable, "-P", "-m", "oodd_eval.worker", *map(str, for_worker)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        pass_fds=(to_worker, from_worker),
+        pass_fds=for_worker,
         env=_environment(),
         start_new_session=True,
     )
-    os.close(to_worker)
-    os.close(from_worker)
+    for descriptor in for_worker:
+        os.close(descriptor)
     outcome = Outcome()
     log = _Tail(process.stdout)
     sender = _Sender(from_harness, request, train, score)
@@ -159,6 +169,7 @@ def run_isolated(
     finally:
         _kill_group(process)
         os.close(to_harness)
+        os.close(held)
         sender.join()
         outcome.log = log.finish()
     if sender.error:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.trajectory import Trajectory
@@ -72,6 +72,23 @@ class FeatureScale:
                 "detector was fitted on"
             )
         return ((trajectory.observations - self.mean) / self.std).astype(np.float32)
+
+    def row(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """Return one standardized observation, float32 of shape (D,).
+
+        Raises
+        ------
+        TrajectoryError
+            When it has another number of sensors, or a value that is not finite.
+        """
+        found = np.asarray(observation, dtype=np.float32)
+        if found.shape != self.mean.shape or not np.isfinite(found).all():
+            raise TrajectoryError(
+                f"fitted on {len(self.mean)} sensors and given an observation of shape "
+                f"{found.shape} with {int((~np.isfinite(found)).sum())} values that are not "
+                f"finite: expected ({len(self.mean)},), all finite"
+            )
+        return ((found - self.mean) / self.std).astype(np.float32)
 
 
 def anomaly_scores(

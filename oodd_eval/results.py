@@ -4,6 +4,7 @@
 
     records.jsonl      one record a line
     scores/<key>.h5    all scores of one unit; also the cache from which a later run resumes
+    fitted/<key>/      a fitted detector that could save itself, see `oodd_eval.fitted`
     logs/<key>.txt     what a failing detector printed, with its traceback
     report.md
 
@@ -12,12 +13,13 @@ Every file is written beside its place and then moved there, so that it is whole
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ import numpy as np
 from oodd_eval.benchmark import PROTOCOL
 from oodd_eval.detector import Scores
 from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.fitted import FittedStore
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.plugins import Offer
 from oodd_eval.provenance import source_digest
@@ -72,6 +75,21 @@ class UnitKey:
         return f"{detector}-{self.environment}-{digest[:20]}"
 
 
+def fit_key(plan: Plan, unit: Unit, offer: Offer) -> str:
+    """Return the key of a unit's fit: of all that decides the fitted detector, and nothing else.
+
+    It tells nothing of the environment, since the worker sees it.
+    """
+    spec = offer.spec
+    whole = asdict(unit_key(plan, unit, offer)) | {"detector": spec.fit_name or spec.name}
+    del whole["protocol"]
+    for name in spec.fit_ignores:
+        whole.pop(name, None)
+        whole["parameters"].pop(name, None)
+    canonical = json.dumps(whole, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(canonical.encode()).hexdigest()[:32]
+
+
 def unit_key(plan: Plan, unit: Unit, offer: Offer) -> UnitKey:
     """Return the key of a unit of a plan."""
     return UnitKey(
@@ -92,7 +110,8 @@ def unit_key(plan: Plan, unit: Unit, offer: Offer) -> UnitKey:
 class ScoreFile:
     """Scores of one unit by part (``calibration``, ``test/nominal``, ``test/iid`` and so on).
 
-    `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit.
+    `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit, and
+    ``steps_scored``, the number of observations that ``seconds_score`` is for.
     """
 
     parts: dict[str, list[Scores]]
@@ -110,6 +129,7 @@ class ResultsDirectory:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
+        self.fitted = FittedStore(self.path / "fitted")
 
     def prepare(self) -> None:
         """Make the directory and find out, before any work is done, whether it can be used.
@@ -163,13 +183,16 @@ class ResultsDirectory:
 
         Returns
         -------
-        All records of the directory: earlier ones in their places, new cells behind them.
+        All records of the directory: earlier ones in their places, new cells behind them. Places
+        of cells that are replaced are filled in the order of `records`, so that the end is the same
+        whether records come at once or one by one.
         """
-        earlier = self.records() if (self.path / RECORDS).exists() else []
-        merged = {r.identity: r for r in (*earlier, *records)}
-        text = "".join(record.to_json() + "\n" for record in merged.values())
-        self._write_text(self.path / RECORDS, text)
-        return list(merged.values())
+        with _alone(self.path):
+            earlier = self.records() if (self.path / RECORDS).exists() else []
+            merged = _merged(earlier, records)
+            text = "".join(record.to_json() + "\n" for record in merged)
+            self._write_text(self.path / RECORDS, text)
+        return merged
 
     def write_report(self, text: str) -> Path:
         """Write ``report.md`` and return its path."""
@@ -237,6 +260,26 @@ class ResultsDirectory:
     def _write_text(path: Path, text: str) -> None:
         with _replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
+
+
+def _merged(earlier: Sequence[Record], records: Iterable[Record]) -> list[Record]:
+    newer = {record.identity: record for record in records}
+    rest = iter(newer.values())
+    merged = {r.identity: next(rest) if r.identity in newer else r for r in earlier}
+    return [*merged.values(), *rest]
+
+
+@contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Keep other runs that write to the same directory waiting."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        # Not every file system has locks; without them two runs at a time are not supported.
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager

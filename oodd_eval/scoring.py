@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
@@ -12,14 +11,15 @@ import numpy as np
 
 from oodd_eval.detector import Scores, check_scores
 from oodd_eval.errors import ContractError
-from oodd_eval.isolation import Limits, Outcome, Request, run_isolated
+from oodd_eval.fitted import FittedStore
+from oodd_eval.isolation import Limits, Outcome, Request, Stop, run_isolated
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.plugins import Offer
-from oodd_eval.results import ResultsDirectory, ScoreFile, unit_key
+from oodd_eval.results import ResultsDirectory, ScoreFile, fit_key, unit_key
 from oodd_eval.splits import EnvironmentData, TrajectorySet
 from oodd_eval.splits_format import TWINS
 from oodd_eval.trajectory import Trajectory
-from oodd_eval.worker import fit_detector, score_chunk
+from oodd_eval.worker import make_detector, score_chunk
 
 CALIBRATION: Final = "calibration"
 
@@ -53,7 +53,7 @@ class UnitJob:
     def __call__(
         self,
         limits: Limits,
-        stop: threading.Event,
+        stop: Stop,
         results: ResultsDirectory | None,
         *,
         fresh: bool,
@@ -65,27 +65,43 @@ class UnitJob:
             return self._in_process(sets, counts)
         if reason := self.offer.unavailable():
             return Scored("unavailable", reason)
-        if results and not fresh:
-            lengths = lengths_of(sets, self.plan.limit)
-            key = unit_key(self.plan, self.unit, self.offer).text
-            if kept := results.scores(key, lengths):
-                return Scored(file=kept, resumed=True)
+        if not fresh and (kept := self.stored(results)):
+            return kept
         order = _shuffled(counts, self.unit.seed)
-        outcome = run_isolated(
-            Request(
-                plugin=self.offer.plugin,
-                detector=self.unit.detector,
-                parameters=dict(self.unit.parameters),
-                seed=self.unit.seed,
-                horizon=self.unit.horizon,
-                train=limited(len(self.data.train), self.plan.limit),
-            ),
-            islice(self.data.train, self.plan.limit),
-            (sets[part][i] for part, i in order),
-            limits=limits,
-            stop=stop,
-        )
+
+        def isolated(*, load: str = "", save: str = "") -> Outcome:
+            train = 0 if load else limited(len(self.data.train), self.plan.limit)
+            return run_isolated(
+                Request(
+                    plugin=self.offer.plugin,
+                    detector=self.unit.detector,
+                    parameters=dict(self.unit.parameters),
+                    seed=self.unit.seed,
+                    horizon=self.unit.horizon,
+                    train=train,
+                    load=load,
+                    save=save,
+                ),
+                islice(self.data.train, train),
+                (sets[part][i] for part, i in order),
+                limits=limits,
+                stop=stop,
+            )
+
+        if results:
+            key = fit_key(self.plan, self.unit, self.offer)
+            outcome = _with_store(isolated, results.fitted, key, stop, fresh=fresh)
+        else:
+            outcome = isolated()
         return self._checked(outcome, order, sets, counts)
+
+    def stored(self, results: ResultsDirectory | None) -> Scored | None:
+        """Return the scores that an earlier run has kept, if they are there and fit."""
+        if results is None:
+            return None
+        lengths = lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
+        kept = results.scores(unit_key(self.plan, self.unit, self.offer).text, lengths)
+        return Scored(file=kept, resumed=True) if kept else None
 
     def _checked(
         self,
@@ -107,6 +123,7 @@ class UnitJob:
             "seconds_fit": outcome.seconds_fit,
             "seconds_score": outcome.seconds_score,
             "peak_rss_mb": outcome.peak_rss_mb,
+            "steps_scored": sum(len(scores) for part in parts.values() for scores in part),
         }
         known = {name: value for name, value in cost.items() if value is not None}
         return Scored(file=ScoreFile(parts, known))
@@ -125,13 +142,13 @@ class UnitJob:
 
     def _in_process(self, sets: Mapping[str, TrajectorySet], counts: Mapping[str, int]) -> Scored:
         """Fit and score here: what the detector raises passes through."""
-        detector = fit_detector(
+        detector = make_detector(
             self.offer.spec.factory,
-            list(islice(self.data.train, self.plan.limit)),
             seed=self.unit.seed,
             horizon=self.unit.horizon,
             parameters=self.unit.parameters,
         )
+        detector.fit(list(islice(self.data.train, self.plan.limit)))
         parts: dict[str, list[Scores]] = {}
         for part, trajectories in sets.items():
             chunk = trajectories[: counts[part]]
@@ -140,6 +157,35 @@ class UnitJob:
                 for i, scores in enumerate(score_chunk(detector, chunk))
             ]
         return Scored(file=ScoreFile(parts, {}))
+
+
+def _with_store(
+    isolated: Callable[..., Outcome],
+    store: FittedStore,
+    key: str,
+    stop: Stop,
+    *,
+    fresh: bool,
+) -> Outcome:
+    """Score with the fit that is kept under a key, or fit and keep it."""
+    fitted = None if fresh else store.find(key)
+    if fitted is None:
+        with store.alone(key):
+            # Meanwhile another unit of the same fit may have kept it.
+            fitted = None if fresh else store.find(key)
+            if fitted is None:
+                with store.room() as room:
+                    outcome = isolated(save=str(room.absolute()))
+                    if outcome.status == "ok" and outcome.seconds_fit is not None:
+                        store.keep(key, room, outcome.seconds_fit)
+                return outcome
+    outcome = isolated(load=str(fitted.path.absolute()))
+    if outcome.seconds_fit is not None:
+        outcome.seconds_fit = fitted.seconds_fit
+    elif outcome.status != "ok" and not stop.is_set():
+        # It ended before it was loaded; whatever the reason, a fit of its own is what counts.
+        return _with_store(isolated, store, key, stop, fresh=True)
+    return outcome
 
 
 def parts_of(data: EnvironmentData, anomalies: tuple[str, ...]) -> dict[str, TrajectorySet]:

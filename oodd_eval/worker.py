@@ -2,8 +2,9 @@
 
 It never holds onsets, anomalies, twins' pairing or the name of the environment. Training
 trajectories come first, in the order of the split; then, shuffled together and in chunks, the
-trajectories to score. The harness starts it as ``python -m oodd_eval.worker READ_FD WRITE_FD`` with
-descriptors of their own, so that nothing a detector prints gets between the messages.
+trajectories to score. The harness starts it as ``python -m oodd_eval.worker READ_FD WRITE_FD
+LIFELINE_FD``: messages have descriptors of their own, so that nothing a detector prints gets
+between them, and the end of the harness is the end of its workers.
 """
 
 from __future__ import annotations
@@ -11,7 +12,10 @@ from __future__ import annotations
 import faulthandler
 import os
 import resource
+import shutil
+import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -21,21 +25,17 @@ from typing import Any, NoReturn
 import numpy as np
 
 from oodd_eval.channel import Channel
-from oodd_eval.detector import Detector
+from oodd_eval.detector import Detector, StorableDetector
 from oodd_eval.errors import ContractError, PluginError
 from oodd_eval.plugins import describe, discover
+from oodd_eval.spool import Spool
 from oodd_eval.trajectory import Trajectory
 
 
-def fit_detector(
-    factory: Callable[..., Detector],
-    train: Sequence[Trajectory],
-    *,
-    seed: int,
-    horizon: int,
-    parameters: Mapping[str, Any],
+def make_detector(
+    factory: Callable[..., Detector], *, seed: int, horizon: int, parameters: Mapping[str, Any]
 ) -> Detector:
-    """Make a detector and fit it.
+    """Make an unfitted detector.
 
     Raises
     ------
@@ -48,8 +48,21 @@ def fit_detector(
             f"the factory returned {type(detector).__name__}, expected an object with the methods "
             "fit(nominal) and score(trajectory)"
         )
-    detector.fit(train)
     return detector
+
+
+def save_fitted(detector: Detector, directory: str) -> None:
+    """Let a detector that can save its fit do so.
+
+    What fails here is printed and costs a later run the time of a fit, but no score.
+    """
+    if directory and isinstance(detector, StorableDetector):
+        try:
+            detector.save(Path(directory))
+        except Exception:  # noqa: BLE001  a detector may raise anything
+            traceback.print_exc()
+            shutil.rmtree(directory)
+            Path(directory).mkdir()
 
 
 def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
@@ -113,21 +126,28 @@ def peak_rss_mb() -> float:
 def serve(channel: Channel) -> None:
     """Fit the requested detector and score what comes until a chunk of zero."""
     request = channel.receive()
-    train = [channel.receive_trajectory() for _ in range(request["train"])]
+    train = Spool(channel.receive_trajectory() for _ in range(request["train"]))
     plugins = discover(only=[request["plugin"]])
     for broken in plugins.broken:
         raise PluginError(f"plug-in {broken.plugin!r} cannot be loaded: {broken.reason}")
     spec = plugins.offer(request["detector"]).spec
 
     start = time.perf_counter()
-    detector = fit_detector(
+    detector = make_detector(
         spec.factory,
-        train,
         seed=request["seed"],
         horizon=request["horizon"],
         parameters=request["parameters"],
     )
+    if request["load"]:
+        if not isinstance(detector, StorableDetector):
+            raise ContractError("a detector that had saved itself has no load(directory) any more")
+        detector.load(Path(request["load"]))
+    else:
+        detector.fit(train)
     seconds_fit = time.perf_counter() - start
+    if not request["load"]:
+        save_fitted(detector, request["save"])
     channel.send({"seconds_fit": seconds_fit, "warm_up": getattr(detector, "warm_up", 0)})
 
     seconds_score = 0.0
@@ -148,11 +168,25 @@ def _kind(scores: object) -> str:
     return "ndarray of object" if isinstance(scores, np.ndarray) else type(scores).__name__
 
 
+def end_with(lifeline: int) -> None:
+    """Kill this process and whatever it has started when the harness is no more.
+
+    The harness holds the other end of a pipe and never writes to it; reading ends when it closes.
+    """
+
+    def wait() -> None:
+        os.read(lifeline, 1)
+        os.killpg(os.getpgid(0), signal.SIGKILL)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def main(arguments: Sequence[str]) -> NoReturn:
     """Serve one request and end the process, whatever the detector has left running."""
-    reading, writing = (int(a) for a in arguments)
-    for descriptor in (reading, writing):
+    reading, writing, lifeline = (int(a) for a in arguments)
+    for descriptor in (reading, writing, lifeline):
         os.set_inheritable(descriptor, False)
+    end_with(lifeline)
     faulthandler.enable()
     channel = Channel(reading, writing)
     code = 0

@@ -5,7 +5,7 @@ import pytest
 import torch
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms
-from oodd_torch.forecast import forecast_errors, rollouts
+from oodd_torch.forecast import Forecaster, rollouts
 from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.training import (
     Schedule,
@@ -96,7 +96,7 @@ def learned():
     made = Ensemble(
         Architecture(features=1), [torch.Generator().manual_seed(0)], np.full(1, 0.2, np.float32)
     )
-    schedule = Schedule(updates=500, batch=60, chunk=50, levels=16, rates=(5e-3,))
+    schedule = Schedule(updates=500, batch=60, chunk=50, levels=16, rates=(5e-3,), widths=(0.2,))
     train(made, episodes[:108], episodes[108:], schedule, [np.random.default_rng(0)])
     return made.requires_grad_(requires_grad=False)
 
@@ -206,7 +206,7 @@ def test_rollouts_equal_a_slow_loop_sample_for_sample(architecture, mean_samplin
     rows = [w.observations for w in waves(2, 9, 2)]
     samples = 1 if not made.architecture.quantiles else 3
     options = {"horizon": horizon, "samples": samples, "mean_sampling": mean_sampling, "seed": 7}
-    fast = forecast_errors(made, rows, **options)
+    fast = Forecaster.of(made, **options).errors(rows)
     for found, episode in zip(fast, rows, strict=True):
         assert np.allclose(found, slow_errors(made, episode, **options), atol=1e-5)
 

@@ -3,6 +3,7 @@
 Importing this package imports torch; plug-in modules do so inside their factories only.
 """
 
-from oodd_torch.detector import ForecastDetector, Settings
+from oodd_torch.detector import ForecastDetector
+from oodd_torch.settings import Settings
 
 __all__ = ["ForecastDetector", "Settings"]

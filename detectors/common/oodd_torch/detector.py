@@ -2,84 +2,30 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, UsageError
 from oodd_eval.prediction import CONSTANT, FeatureScale, anomaly_scores
-from oodd_torch.forecast import forecast_errors
+from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
-from oodd_torch.training import Schedule, train
+from oodd_torch.settings import Settings
+from oodd_torch.storage import Fit, load_fit, save_fit
+from oodd_torch.training import train
 
 HELD_OUT = 0.15
 """Share of the nominal trajectories that decides when to stop training; at least one."""
 
-RATES = (1e-2,)
-"""Largest learning rates, in turn over the members: the paper's two (appendix B)."""
-
 BATCH = 64
 """Trajectories that are scored together."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What a detector of this family may be told.
-
-    Attributes
-    ----------
-    members
-        Networks in the ensemble, e; they differ in seed, order of episodes and learning rate.
-    samples
-        Samples of each network, M; 1 without quantiles.
-    window
-        Observations in the input, W.
-    recurrent, quantiles
-        Whether the networks have memory, and a quantile function as their output.
-    mean_sampling
-        Whether each step of a rollout feeds back the mean of M samples rather than one sample.
-    updates
-        Gradient steps of each member, at most.
-    batch, chunk
-        Episodes in a batch, and steps through which gradients flow.
-    levels
-        Quantile levels of an update, one from each of as many equal parts of (0, 1).
-    scheduled_sampling
-        Share of inputs that are the network's own samples at the end of training; it rises
-        linearly from 0 with the updates.
-    """
-
-    members: int = 5
-    samples: int = 8
-    window: int = 1
-    recurrent: bool = True
-    quantiles: bool = True
-    mean_sampling: bool = False
-    updates: int = 600
-    batch: int = 16
-    chunk: int = 100
-    levels: int = 8
-    scheduled_sampling: float = 0.0
-
-    def check(self, name: str) -> None:
-        """Raise `UsageError` when a value is out of range, naming detector and parameter."""
-        for field in ("members", "samples", "window", "updates", "batch", "chunk", "levels"):
-            value = getattr(self, field)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise UsageError(
-                    f"parameter {field} of detector {name!r}: expected an integer of at least 1, "
-                    f"got {value!r}"
-                )
-        share = self.scheduled_sampling
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
-            raise UsageError(
-                f"parameter scheduled_sampling of detector {name!r}: expected a number between 0 "
-                f"and 1, got {share!r}"
-            )
 
 
 def change_scale(episodes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
@@ -87,6 +33,16 @@ def change_scale(episodes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]
     changes = np.concatenate([np.diff(e, axis=0) for e in episodes])
     std = changes.std(axis=0, dtype=np.float64)
     return np.where(std < CONSTANT, 1.0, std).astype(np.float32)
+
+
+@dataclass(slots=True)
+class Stream:
+    """Where a live episode is: memory, the latest rows, and forecasts that await their times."""
+
+    memory: Tensor
+    latest: deque[NDArray[np.float32]]
+    awaited: deque[Tensor] = field(default_factory=deque)
+    now: int = 0
 
 
 class ForecastDetector:
@@ -125,9 +81,9 @@ class ForecastDetector:
                     f"got {value!r}"
                 )
         self.name, self.settings, self.seed, self.horizon = name, settings, seed, horizon
-        self.scale_: FeatureScale | None = None
-        self.network_: Ensemble | None = None
-        self.history_: list[list[float]] = []
+        self.fit_: Fit | None = None
+        self._forecaster: Forecaster | None = None
+        self._stream: Stream | None = None
 
     def fit(self, nominal: Sequence[Trajectory]) -> ForecastDetector:
         """Train the ensemble on nominal trajectories, forgetting any earlier fit.
@@ -148,32 +104,33 @@ class ForecastDetector:
         generators = [
             torch.Generator().manual_seed(int(state.generate_state(1)[0])) for state in states
         ]
-        network = Ensemble(
-            Architecture(
-                features=nominal[0].observation_dim,
-                window=s.window,
-                recurrent=s.recurrent,
-                quantiles=s.quantiles,
-            ),
-            generators,
-            change_scale(training),
-        )
-        self.history_ = train(
-            network,
-            training,
-            held_out,
-            Schedule(
-                updates=s.updates,
-                batch=s.batch,
-                chunk=s.chunk,
-                levels=s.levels,
-                rates=tuple(RATES[i % len(RATES)] for i in range(s.members)),
-                scheduled_sampling=s.scheduled_sampling,
-            ),
-            [np.random.default_rng([self.seed, 1, i]) for i in range(s.members)],
-        )
-        self.scale_, self.network_ = scale, network.requires_grad_(requires_grad=False)
+        architecture = Architecture(features=nominal[0].observation_dim, **s.architecture)
+        network = Ensemble(architecture, generators, change_scale(training)).to(s.place)
+        rngs = [np.random.default_rng([self.seed, 1, i]) for i in range(s.members)]
+        history = train(network, training, held_out, s.schedule, rngs)
+        self._take(Fit(network.requires_grad_(requires_grad=False), scale, history))
         return self
+
+    def save(self, directory: Path) -> None:
+        """Write the fit into a directory: weights in safetensors, the rest in JSON.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        """
+        save_fit(directory, self._fitted()[0])
+
+    def load(self, directory: Path) -> None:
+        """Take over a fit that `save` wrote; horizon, samples and device may be others.
+
+        Raises
+        ------
+        FittedStateError
+            When the files are missing, damaged, or of networks of another kind.
+        """
+        s = self.settings
+        self._take(load_fit(directory, members=s.members, expected=s.architecture, device=s.place))
 
     def score(self, trajectory: Trajectory) -> NDArray[np.float64]:
         """Return one score per observation, NaN for t < horizon.
@@ -189,24 +146,96 @@ class ForecastDetector:
 
     def score_many(self, trajectories: Sequence[Trajectory]) -> list[NDArray[np.float64]]:
         """Return the scores of several trajectories, computed in batches of similar length."""
-        if self.scale_ is None or self.network_ is None:
-            raise NotFittedError(
-                f"detector {self.name!r} was asked for scores before fit: fit it on nominal "
-                "trajectories"
-            )
-        rows = [self.scale_(x) for x in trajectories]
+        fit, forecaster = self._fitted()
+        rows = [fit.scale(x) for x in trajectories]
         order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
         scores: list[NDArray[np.float64]] = [np.zeros(0)] * len(rows)
         for start in range(0, len(order), BATCH):
             batch = order[start : start + BATCH]
-            errors = forecast_errors(
-                self.network_,
-                [rows[i] for i in batch],
-                horizon=self.horizon,
-                samples=self.settings.samples if self.settings.quantiles else 1,
-                mean_sampling=self.settings.mean_sampling,
-                seed=self.seed,
-            )
+            errors = forecaster.errors([rows[i] for i in batch])
             for i, error in zip(batch, errors, strict=True):
                 scores[i] = anomaly_scores(rows[i], error, self.horizon)
         return scores
+
+    def reset(self) -> None:
+        """Begin a new live episode.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        """
+        self._stream = self._begin()
+
+    @torch.no_grad()
+    def update(
+        self,
+        observation: NDArray[np.float32],
+        action: NDArray[np.float32] | None = None,  # noqa: ARG002  the contract's name
+    ) -> float:
+        """Return the score of the next observation of a live episode, NaN for t < horizon.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            When the observation has another number of sensors than those of `fit`, or a value that
+            is not finite.
+        """
+        fit, forecaster = self._fitted()
+        row = fit.scale.row(observation)
+        stream = self._stream = self._stream or self._begin()
+        score = float("nan")
+        if len(stream.awaited) == self.horizon:
+            error = (torch.from_numpy(row).to(fit.network.device) - stream.awaited.popleft()).abs()
+            score = float(error.mean(dtype=torch.float64))
+        if not stream.now:
+            stream.latest.extend([row] * (fit.network.architecture.window - 1))
+        stream.latest.appendleft(row)
+        x = torch.from_numpy(np.concatenate(stream.latest)).to(fit.network.device)
+        due = stream.now + self.horizon
+        samples, stream.memory = forecaster.forecast(
+            x.expand(fit.network.members, 1, 1, -1), stream.memory, range(due, due + 1)
+        )
+        stream.awaited.append(samples[:, 0, 0])  # (E, M, D)
+        stream.now += 1
+        return score
+
+    @property
+    def network_(self) -> Ensemble:
+        """The trained networks."""
+        return self._fitted()[0].network
+
+    @property
+    def scale_(self) -> FeatureScale:
+        """Mean and standard deviation of every sensor in training."""
+        return self._fitted()[0].scale
+
+    @property
+    def history_(self) -> list[list[float]]:
+        """Held-out losses of all networks, one list per evaluation."""
+        return self._fitted()[0].history
+
+    def _take(self, fit: Fit) -> None:
+        s = self.settings
+        self.fit_, self._stream = fit, None
+        self._forecaster = Forecaster.of(
+            fit.network,
+            horizon=self.horizon,
+            samples=s.samples if s.quantiles else 1,
+            mean_sampling=s.mean_sampling,
+            seed=self.seed,
+        )
+
+    def _begin(self) -> Stream:
+        network = self._fitted()[0].network
+        return Stream(network.start(1), deque(maxlen=network.architecture.window))
+
+    def _fitted(self) -> tuple[Fit, Forecaster]:
+        if self.fit_ is None or self._forecaster is None:
+            raise NotFittedError(
+                f"detector {self.name!r} was asked for scores before fit: fit it on nominal "
+                "trajectories"
+            )
+        return self.fit_, self._forecaster

@@ -3,12 +3,14 @@
 Up to the last true observation one pass of the GRU serves all samples. From there on every time t
 has rollouts of its own: M sampled ones, or one that is fed the mean of M samples at each step.
 
-Letters: E members, C times of a chunk, B trajectories, M samples, D sensors, H units.
+Letters: E members, K networks, C times of a chunk, B trajectories, M samples, D sensors, H units,
+R rollouts of a time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,80 +22,112 @@ from oodd_torch.network import Ensemble
 from oodd_torch.training import arrange, predict
 
 ROWS = 16_384
-"""Rollouts of one member that are computed together: bounds memory."""
+"""Rollouts of one network that are computed together: bounds memory."""
 
 
-@torch.no_grad()
-def forecast_errors(
-    network: Ensemble,
-    rows: Sequence[NDArray[np.float32]],
-    *,
-    horizon: int,
-    samples: int,
-    mean_sampling: bool,
-    seed: int,
-) -> list[NDArray[np.float64]]:
-    """Return mean absolute errors of the forecasts of every ``o_t``, ``t >= horizon``.
+@dataclass(frozen=True, slots=True)
+class Forecaster:
+    """How forecasts are made: horizon h, samples M, mean sampling, and the seed of the levels."""
 
-    Parameters
-    ----------
-    rows : list of float32 arrays of shape (T + 1, D)
-        Standardized observations.
-    horizon, samples, mean_sampling, seed
-        h, M, how rollouts go on, and the seed of the quantile levels.
+    network: Ensemble
+    horizon: int
+    samples: int
+    mean_sampling: bool
+    seed: int
+    table: Tensor | None
 
-    Returns
-    -------
-    list of float64 arrays of shape (max(T + 1 - h, 0),)
-    """
-    longest = max(len(r) for r in rows)
-    counts = [max(0, len(r) - horizon) for r in rows]
-    if longest <= horizon:
-        return [np.zeros(0) for _ in rows]
-    x, _, _ = arrange([[r if len(r) > 1 else np.repeat(r, 2, axis=0) for r in rows]],
-                      network.architecture.window)  # fmt: skip
-    truth = np.zeros((longest, len(rows), network.architecture.features), np.float32)
-    for b, r in enumerate(rows):
-        truth[: len(r), b] = r
-    target = torch.from_numpy(truth)
-    x = x.expand(network.members, -1, -1, -1)  # (E, T, B, W * D)
-    table = network.table() if network.architecture.quantiles else None
-    memory = network.start(len(rows))
-    width = 1 if mean_sampling or horizon == 1 else samples
-    chunk = max(1, ROWS // (len(rows) * width * (1 if horizon > 1 else 4)))
-    parts = []
-    for start in range(0, longest - horizon, chunk):
-        stop = min(start + chunk, longest - horizon)
-        times = range(start + horizon, stop + horizon)
-        levels = _levels(network, seed, times, horizon, samples)
-        if horizon == 1:
-            heads = None
-            if levels is not None and table is not None:
-                heads = network.heads_from(levels[0], table)
-            change, memory = predict(network, x[:, start:stop], memory, heads)
-            newest = x[:, start:stop, :, None, : network.architecture.features]
-            predicted = newest + network.unit * change
-        else:
-            predicted, memory = rollouts(
-                network, x[:, start:stop], memory, levels, table,
-                horizon=horizon, width=width if levels is not None else 1,
-            )  # fmt: skip
-        error = (target[start + horizon : stop + horizon, :, None] - predicted).abs()
-        parts.append(error.mean((0, 3, 4), dtype=torch.float64))
-    errors = torch.cat(parts).numpy()  # (T + 1 - h, B)
-    return [errors[:count, b].copy() for b, count in enumerate(counts)]
+    @classmethod
+    def of(
+        cls, network: Ensemble, *, horizon: int, samples: int, mean_sampling: bool, seed: int
+    ) -> Forecaster:
+        """Tabulate the embeddings of the quantile levels, which depend on nothing else."""
+        with torch.no_grad():
+            table = network.table() if network.architecture.quantiles else None
+        return cls(network, horizon, samples, mean_sampling, seed, table)
 
+    @property
+    def width(self) -> int:
+        """Rollouts of every time, R."""
+        alone = self.mean_sampling or self.horizon == 1 or self.table is None
+        return 1 if alone else self.samples
 
-def _levels(
-    network: Ensemble, seed: int, times: range, horizon: int, samples: int
-) -> Tensor | None:
-    """Levels of shape (h, E, C, M, D), or None without quantiles."""
-    if not network.architecture.quantiles:
-        return None
-    drawn = quantile_levels(
-        seed, times, horizon, network.members, samples, network.architecture.features
-    )
-    return torch.from_numpy(drawn.transpose(1, 2, 0, 3, 4).copy())
+    @torch.no_grad()
+    def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
+        """Return mean absolute errors of the forecasts of every ``o_t``, ``t >= horizon``.
+
+        Parameters
+        ----------
+        rows : list of float32 arrays of shape (T + 1, D)
+            Standardized observations.
+
+        Returns
+        -------
+        list of float64 arrays of shape (max(T + 1 - h, 0),)
+        """
+        network, horizon = self.network, self.horizon
+        longest = max(len(r) for r in rows)
+        counts = [max(0, len(r) - horizon) for r in rows]
+        if longest <= horizon:
+            return [np.zeros(0) for _ in rows]
+        # A lone row has no target; repeated, it is a step that is thrown away again.
+        episodes = [r if len(r) > 1 else np.repeat(r, 2, axis=0) for r in rows]
+        x = arrange([episodes], network.architecture.window)[0].to(network.device)
+        truth = np.zeros((longest, len(rows), network.architecture.features), np.float32)
+        for b, r in enumerate(rows):
+            truth[: len(r), b] = r
+        target = torch.from_numpy(truth).to(network.device)
+        x = x.expand(network.members, -1, -1, -1)  # (E, T, B, W * D)
+        memory = network.start(len(rows))
+        chunk = max(1, ROWS // (len(rows) * self.width * (1 if horizon > 1 else 4)))
+        parts = []
+        for start in range(0, longest - horizon, chunk):
+            stop = min(start + chunk, longest - horizon)
+            times = range(start + horizon, stop + horizon)
+            predicted, memory = self.forecast(x[:, start:stop], memory, times)
+            error = (target[start + horizon : stop + horizon, :, None] - predicted).abs()
+            parts.append(error.mean((0, 3, 4), dtype=torch.float64))
+        errors = torch.cat(parts).cpu().numpy()  # (T + 1 - h, B)
+        return [errors[:count, b].copy() for b, count in enumerate(counts)]
+
+    @torch.no_grad()
+    def forecast(self, x: Tensor, memory: Tensor, times: range) -> tuple[Tensor, Tensor]:
+        """Forecast the observations of the given times from those h steps before.
+
+        Parameters
+        ----------
+        x : (E, C, B, W * D)
+            Inputs up to the last true observation of each forecast.
+        memory : (K, B, H)
+            Memory before the chunk.
+        times
+            The C times that are forecast; they key the quantile levels.
+
+        Returns
+        -------
+        samples : (E, C, B, M, D)
+        memory : (K, B, H)
+            Memory after the chunk.
+        """
+        levels = self._levels(times)
+        network = self.network
+        if self.horizon > 1:
+            return rollouts(
+                network, x, memory, levels, self.table, horizon=self.horizon, width=self.width
+            )
+        heads = None
+        if levels is not None and self.table is not None:
+            heads = network.heads_from(levels[0], self.table)
+        change, memory = predict(network, x, memory, heads)
+        newest = x[..., None, : network.architecture.features]
+        return newest + network.unit * change, memory
+
+    def _levels(self, times: range) -> Tensor | None:
+        """Levels of shape (h, E, C, M, D), or None without quantiles."""
+        if self.table is None:
+            return None
+        members, features = self.network.members, self.network.architecture.features
+        drawn = quantile_levels(self.seed, times, self.horizon, members, self.samples, features)
+        return torch.from_numpy(drawn.transpose(1, 2, 0, 3, 4).copy()).to(self.network.device)
 
 
 def rollouts(
@@ -112,11 +146,11 @@ def rollouts(
     ----------
     x : (E, C, B, W * D)
         Inputs at the last true observations.
-    memory : (E, B, H)
+    memory : (K, B, H)
         Memory before the chunk.
     levels : (h, E, C, M, D)
         Grid indices of the levels of every step; None without quantiles.
-    table : (E, GRID, H)
+    table : (K, GRID, H)
         Embeddings of the grid.
     horizon, width
         h, and the number of rollouts R of every time: M, each fed its own samples, or 1, fed the
@@ -125,29 +159,29 @@ def rollouts(
     Returns
     -------
     samples : (E, C, B, M, D)
-    memory : (E, B, H)
+    memory : (K, B, H)
         Memory after the chunk.
     """
     a = network.architecture
     e, c, b, _ = x.shape
-    d, h = a.features, a.units
-    f = network.inputs(x.reshape(e, c * b, -1)).reshape(e, c, b, h)
+    d = a.features
+    f = network.inputs(x.reshape(e, c * b, -1)).reshape(-1, c, b, a.units)  # (K, C, B, H)
     state = f
     if a.recurrent:
         state, memory = network.run(f, memory)
 
-    def spread(tensor: Tensor) -> Tensor:
-        return tensor[:, :, None].expand(-1, -1, width, -1, -1).reshape(e, c * width * b, -1)
+    def repeat(tensor: Tensor) -> Tensor:
+        return tensor[:, :, None].expand(-1, -1, width, -1, -1).flatten(1, 3)
 
-    window, f, state = spread(x), spread(f), spread(state)  # (E, C * R * B, ...)
+    window, f, state = repeat(x), repeat(f), repeat(state)  # (E or K, C * R * B, ...)
     samples = _sample(network, window, f, state, levels, 0, table, (c, width, b))
-    for k in range(1, horizon):
+    for step in range(1, horizon):
         fed = samples if width > 1 else samples.mean(3, keepdim=True)  # (E, C, B, R, D)
         newest = fed.transpose(2, 3).reshape(e, c * width * b, d)
         window = torch.cat([newest, window[..., :-d]], dim=2)
         f = network.inputs(window)
         state = network.step(f, state) if a.recurrent else f
-        samples = _sample(network, window, f, state, levels, k, table, (c, width, b))
+        samples = _sample(network, window, f, state, levels, step, table, (c, width, b))
     return samples, memory
 
 
@@ -161,16 +195,18 @@ def _sample(
     table: Tensor | None,
     shape: tuple[int, int, int],
 ) -> Tensor:
-    """Draw the next observation of every rollout: (E, C, B, M, D) from states (E, C * R * B, H)."""
+    """Draw the next observation of every rollout: (E, C, B, M, D) from states (K, C * R * B, H)."""
     c, width, b = shape
-    e, d = network.members, network.architecture.features
+    d = network.architecture.features
     z = network.trunk(f, state)
+    k, p = len(z), network.architecture.outputs
     if levels is None or table is None:
-        change = torch.bmm(z, network.out).reshape(e, c, width, b, d).transpose(2, 3)
+        change = torch.bmm(z, network.out).reshape(k, c, width, b, p).transpose(2, 3)
     else:
         # R = M: every rollout has the level of its own sample; R = 1: M levels in one product.
-        heads = network.heads_from(levels[step].reshape(e, c * width, -1, d), table)
-        change = torch.matmul(z.reshape(e, c * width, b, -1), heads)  # (E, C * R, B, M / R * D)
-        change = change.reshape(e, c, width, b, -1, d).transpose(2, 3).flatten(3, 4)
-    newest = window[..., :d].reshape(e, c, width, b, d).transpose(2, 3)
-    return newest + network.unit * (change + network.out_bias[:, None, None])
+        heads = network.heads_from(levels[step].reshape(network.members, c * width, -1, d), table)
+        change = torch.matmul(z.reshape(k, c * width, b, -1), heads)  # (K, C * R, B, M / R * P)
+        change = change.reshape(k, c, width, b, -1, p).transpose(2, 3).flatten(3, 4)
+    change = network.gather(change + network.out_bias[:, None, None])
+    newest = window[..., :d].reshape(-1, c, width, b, d).transpose(2, 3)  # (E, C, B, R, D)
+    return newest + network.unit * change

@@ -1,7 +1,8 @@
 """An ensemble of forecasting networks as one set of batched matrix products.
 
 Letters in shape comments: E members, B trajectories, T steps, D sensors, N quantile levels,
-H = 64 units, W window.
+H = 64 units, W window; K = E networks with P = D outputs each, or, with one network per sensor,
+K = E D networks with P = 1 output.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ class Architecture:
         Whether a GRU stands between the first and the second layer.
     quantiles
         Whether the output is a quantile function rather than one value.
+    per_feature
+        Whether every sensor has a network of its own, rather than a head on a shared trunk.
     units, cosines
         Width of every layer, and of the cosine embedding.
     """
@@ -39,8 +42,19 @@ class Architecture:
     window: int = 1
     recurrent: bool = True
     quantiles: bool = True
+    per_feature: bool = False
     units: int = 64
     cosines: int = 64
+
+    @property
+    def networks(self) -> int:
+        """Networks of a member, K / E."""
+        return self.features if self.per_feature else 1
+
+    @property
+    def outputs(self) -> int:
+        """Sensors that one network predicts, P."""
+        return 1 if self.per_feature else self.features
 
 
 class Ensemble(torch.nn.Module):
@@ -65,19 +79,21 @@ class Ensemble(torch.nn.Module):
         super().__init__()
         a = self.architecture = architecture
         self.register_buffer("unit", torch.from_numpy(unit))
-        h, d = a.units, a.features
+        h, inputs = a.units, a.window * a.features
+        self.members = len(generators)
 
         def weight(rows: int, columns: int, fan_in: int | None = None) -> torch.nn.Parameter:
             bound = 1 / math.sqrt(fan_in or rows)
             drawn = [
-                torch.empty(rows, columns).uniform_(-bound, bound, generator=g) for g in generators
+                torch.empty(a.networks, rows, columns).uniform_(-bound, bound, generator=g)
+                for g in generators
             ]
-            return torch.nn.Parameter(torch.stack(drawn))
+            return torch.nn.Parameter(torch.cat(drawn))  # (K, rows, columns)
 
         def zeros(rows: int, columns: int) -> torch.nn.Parameter:
-            return torch.nn.Parameter(torch.zeros(len(generators), rows, columns))
+            return torch.nn.Parameter(torch.zeros(self.members * a.networks, rows, columns))
 
-        self.first, self.first_bias = weight(a.window * d, h), weight(1, h, a.window * d)
+        self.first, self.first_bias = weight(inputs, h), weight(1, h, inputs)
         if a.recurrent:
             # Gates in the order reset, update, candidate.
             self.gru_in, self.gru_in_bias = weight(h, 3 * h), weight(1, 3 * h, h)
@@ -85,29 +101,43 @@ class Ensemble(torch.nn.Module):
         self.second, self.second_bias = weight(h, h), weight(1, h, h)
         if a.quantiles:
             self.cosine, self.cosine_bias = weight(a.cosines, h), weight(1, h, a.cosines)
-        self.out, self.out_bias = zeros(h, d), zeros(1, d)
+        self.out, self.out_bias = zeros(h, a.outputs), zeros(1, a.outputs)
 
     @property
-    def members(self) -> int:
-        """Number of networks, E."""
-        return len(self.first)
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.first.device
 
     def start(self, rows: int) -> Tensor:
-        """Return the memory before the first observation: zeros of shape (E, rows, H)."""
-        return torch.zeros(self.members, rows, self.architecture.units)
+        """Return the memory before the first observation: zeros of shape (K, rows, H)."""
+        return self.first.new_zeros(len(self.first), rows, self.architecture.units)
+
+    def spread(self, x: Tensor) -> Tensor:
+        """Give every network what its member sees: (E, ...) to (K, ...)."""
+        return x.repeat_interleave(self.architecture.networks, 0) if self._split else x
+
+    def gather(self, out: Tensor) -> Tensor:
+        """Put the outputs of a member's networks together: (K, ..., P) to (E, ..., D)."""
+        if not self._split:
+            return out
+        return out[..., 0].reshape(self.members, -1, *out.shape[1:-1]).movedim(1, -1)
+
+    @property
+    def _split(self) -> bool:
+        return self.architecture.networks > 1
 
     def inputs(self, x: Tensor) -> Tensor:
-        """First layer: (E, B, W * D) to (E, B, H)."""
-        return torch.relu(torch.baddbmm(self.first_bias, x, self.first))
+        """First layer: (E, B, W * D) to (K, B, H)."""
+        return torch.relu(torch.baddbmm(self.first_bias, self.spread(x), self.first))
 
     def step(self, f: Tensor, memory: Tensor) -> Tensor:
-        """One step of the GRU: (E, B, H) and (E, B, H) to the new memory (E, B, H)."""
+        """One step of the GRU: (K, B, H) and (K, B, H) to the new memory (K, B, H)."""
         return self.gate(torch.baddbmm(self.gru_in_bias, f, self.gru_in), memory)
 
     def gate(self, projected: Tensor, memory: Tensor) -> Tensor:
-        """One step of the GRU from the projected input (E, B, 3H)."""
+        """One step of the GRU from the projected input (K, B, 3H)."""
         h = self.architecture.units
-        recurrent = torch.baddbmm(self.gru_bias, memory, self.gru)  # (E, B, 3H)
+        recurrent = torch.baddbmm(self.gru_bias, memory, self.gru)  # (K, B, 3H)
         opened = torch.sigmoid(projected[..., : 2 * h] + recurrent[..., : 2 * h])
         reset, update = opened[..., :h], opened[..., h:]
         candidate = torch.tanh(
@@ -116,47 +146,49 @@ class Ensemble(torch.nn.Module):
         return torch.lerp(candidate, memory, update)
 
     def run(self, f: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """GRU over time: (E, T, B, H) to memories (E, T, B, H) and the last one (E, B, H)."""
-        e, t, b, h = f.shape
-        projected = torch.baddbmm(self.gru_in_bias, f.reshape(e, t * b, h), self.gru_in)
+        """GRU over time: (K, T, B, H) to memories (K, T, B, H) and the last one (K, B, H)."""
+        k, t, b, h = f.shape
+        projected = torch.baddbmm(self.gru_in_bias, f.reshape(k, t * b, h), self.gru_in)
         outputs = []
-        for now in projected.reshape(e, t, b, 3 * h).unbind(1):
+        for now in projected.reshape(k, t, b, 3 * h).unbind(1):
             memory = self.gate(now, memory)
             outputs.append(memory)
         return torch.stack(outputs, dim=1), memory
 
     def trunk(self, f: Tensor, g: Tensor) -> Tensor:
-        """Second layer and skip connection: (E, B, H) and (E, B, H) to (E, B, H)."""
+        """Second layer and skip connection: (K, B, H) and (K, B, H) to (K, B, H)."""
         return torch.relu(torch.baddbmm(self.second_bias, g, self.second)) + f
 
     def embedding(self, tau: Tensor) -> Tensor:
-        """Cosine embedding of quantile levels: (E, N) to (E, N, H)."""
-        i = torch.arange(self.architecture.cosines, dtype=tau.dtype)
-        cosines = torch.cos(math.pi * i * tau[..., None])  # (E, N, cosines)
+        """Cosine embedding of quantile levels: (K, N) to (K, N, H)."""
+        i = torch.arange(self.architecture.cosines, dtype=tau.dtype, device=tau.device)
+        cosines = torch.cos(math.pi * i * tau[..., None])  # (K, N, cosines)
         return torch.relu(torch.baddbmm(self.cosine_bias, cosines, self.cosine))
 
     def table(self) -> Tensor:
-        """Embeddings of the whole grid of levels: (E, GRID, H)."""
-        tau = (torch.arange(GRID, dtype=torch.float32) + 0.5) / GRID
-        return self.embedding(tau.expand(self.members, -1))
+        """Embeddings of the whole grid of levels: (K, GRID, H)."""
+        tau = (torch.arange(GRID, dtype=torch.float32, device=self.device) + 0.5) / GRID
+        return self.embedding(tau.expand(len(self.first), -1))
 
     def heads_at(self, tau: Tensor) -> Tensor:
-        """Output layers at levels (E, N) that all sensors share: (E, 1, H, N * D)."""
-        phi = self.embedding(tau)[:, None, :, None]  # (E, 1, N, 1, H)
+        """Output layers at levels (E, N) that all sensors share: (K, 1, H, N * P)."""
+        phi = self.embedding(self.spread(tau))[:, None, :, None]  # (K, 1, N, 1, H)
         return self._fold(phi)
 
     def heads_from(self, index: Tensor, table: Tensor) -> Tensor:
-        """Output layers at grid levels per time and sensor: (E, G, N, D) to (E, G, H, N * D)."""
-        e, g, n, d = index.shape
-        flat = index.reshape(e, -1)
-        phi = torch.stack([table[i][flat[i]] for i in range(e)])
-        return self._fold(phi.reshape(e, g, n, d, -1))
+        """Output layers at grid levels per time and sensor: (E, G, N, D) to (K, G, H, N * P)."""
+        if self._split:
+            index = index.movedim(-1, 1).flatten(0, 1)[..., None]  # (K, G, N, 1)
+        k, g, n, p = index.shape
+        flat = index.reshape(k, -1)
+        phi = torch.stack([table[i][flat[i]] for i in range(k)])
+        return self._fold(phi.reshape(k, g, n, p, -1))
 
     def _fold(self, phi: Tensor) -> Tensor:
-        """Fold embeddings (E, G, N, D or 1, H) into the output layer.
+        """Fold embeddings (K, G, N, P or 1, H) into the output layer.
 
         ``(z * phi) v_d`` is ``z (phi * v_d)``, so that the outputs of all trajectories at the
         levels of a time are one matrix product.
         """
-        folded = phi * self.out.transpose(1, 2)[:, None, None]  # (E, G, N, D, H)
+        folded = phi * self.out.transpose(1, 2)[:, None, None]  # (K, G, N, P, H)
         return folded.flatten(2, 3).transpose(2, 3)

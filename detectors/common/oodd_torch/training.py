@@ -1,4 +1,4 @@
-"""Training of an ensemble: truncated gradients through time, early stopping per member.
+"""Training of an ensemble: truncated gradients through time, early stopping per network.
 
 Episodes are passed in chunks of consecutive steps; the memory is carried from chunk to chunk, its
 gradient is not. Members are independent networks: each has its own order of episodes, learning
@@ -22,12 +22,6 @@ from oodd_torch.network import Ensemble
 
 BETAS: Final = (0.9, 0.999)
 EPSILON: Final = 1e-8
-KAPPA: Final = 0.2
-"""Width of the quadratic part of the loss, in standard deviations of a sensor's change.
-
-With the usual 1 nearly all errors of a good forecast would fall into the quadratic part, and the
-minimizer would be an expectile instead of a quantile.
-"""
 
 CLIP: Final = 1.0
 """Largest norm of one member's gradient."""
@@ -49,6 +43,9 @@ class Schedule:
         Quantile levels of an update.
     rates
         Largest learning rate of each member; warmed up and decayed to a hundredth by a cosine.
+    widths
+        Width of the quadratic part of each member's quantile loss, kappa, in standard deviations
+        of a sensor's change.
     scheduled_sampling
         Share of inputs replaced by samples at the end of training; rises linearly from 0.
     evaluations
@@ -62,12 +59,13 @@ class Schedule:
     chunk: int
     levels: int
     rates: tuple[float, ...]
+    widths: tuple[float, ...]
     scheduled_sampling: float = 0.0
     evaluations: int = 20
     patience: int = 6
 
 
-def quantile_huber(error: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
+def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> Tensor:
     """Quantile Huber loss of Dabney et al. (2018), elementwise.
 
     ``rho = |tau - [u < 0]| L(u) / kappa``, ``L(u) = u^2 / 2`` for ``|u| <= kappa``, else
@@ -79,6 +77,8 @@ def quantile_huber(error: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
         ``u``, target minus prediction.
     tau : tensor
         Level at which each prediction was made, broadcast against `error`.
+    kappa : tensor or float
+        Width of the quadratic part, broadcast against `error`.
     """
     size = error.abs()
     huber = torch.where(size <= kappa, 0.5 * error * error, kappa * (size - 0.5 * kappa))
@@ -96,9 +96,9 @@ class Adam:
 
     @torch.no_grad()
     def step(self, rates: Tensor) -> None:
-        """Take one step; `rates` has shape (E,)."""
+        """Take one step; `rates` has shape (K,)."""
         gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self.parameters]
-        norm = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()  # (E,)
+        norm = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()  # (K,)
         shrink = (CLIP / norm.clamp(min=CLIP))[:, None, None]
         self.count += 1
         correction = (1 - BETAS[1] ** self.count) ** 0.5 / (1 - BETAS[0] ** self.count)
@@ -180,8 +180,8 @@ def predict(
     Parameters
     ----------
     x : (E, T, B, W * D)
-    memory : (E, B, H)
-    heads : (E, G, H, N * D)
+    memory : (K, B, H)
+    heads : (K, G, H, N * P)
         Output layers at N levels, see `Ensemble.heads_at`: G = T for levels of every step, G = 1
         for levels that all steps share. None without quantiles.
 
@@ -190,21 +190,23 @@ def predict(
     Changes in the network's units: the prediction is ``o + unit * change``.
     """
     e, t, b, _ = x.shape
-    d, h = network.architecture.features, network.architecture.units
+    a = network.architecture
     f = network.inputs(x.reshape(e, t * b, -1))
+    k, _, h = f.shape
     g = f
-    if network.architecture.recurrent:
-        g, memory = network.run(f.reshape(e, t, b, h), memory)
-        g = g.reshape(e, t * b, h)
-    z = network.trunk(f, g)  # (E, T * B, H)
+    if a.recurrent:
+        g, memory = network.run(f.reshape(k, t, b, h), memory)
+        g = g.reshape(k, t * b, h)
+    z = network.trunk(f, g)  # (K, T * B, H)
     if heads is None:
         change = torch.bmm(z, network.out)
     else:
-        change = torch.matmul(z.reshape(e, heads.shape[1], -1, h), heads)
-    return change.reshape(e, t, b, -1, d) + network.out_bias[:, None, None], memory
+        change = torch.matmul(z.reshape(k, heads.shape[1], -1, h), heads)
+    change = change.reshape(k, t, b, -1, a.outputs) + network.out_bias[:, None, None]
+    return network.gather(change), memory
 
 
-def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
+def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> Tensor:
     """Return the derivative of `quantile_huber` by the error.
 
     ``|tau - [u < 0]| clip(u / kappa, -1, 1)``
@@ -219,11 +221,18 @@ def _error(network: Ensemble, x: Tensor, y: Tensor, change: Tensor) -> Tensor:
 
 
 def descend(
-    network: Ensemble, x: Tensor, y: Tensor, mask: Tensor, memory: Tensor, tau: Tensor | None
+    network: Ensemble,
+    x: Tensor,
+    y: Tensor,
+    mask: Tensor,
+    memory: Tensor,
+    tau: Tensor | None,
+    kappa: Tensor,
 ) -> Tensor:
-    """Add the gradients of every member's mean loss; return the last memory.
+    """Add the gradients of every network's mean loss; return the last memory.
 
-    The loss is the mean over masked steps, levels and sensors. ``tau`` (E, N) holds the levels of
+    The loss is the mean over masked steps, levels and the network's sensors. ``kappa`` has shape
+    (E,); ``tau`` (E, N) holds the levels of
     this update, shared by all steps, episodes and sensors, so that their embeddings cost next to
     nothing. The slope of the loss is handed to the backward pass directly: the loss itself, a
     dozen passes over the largest array of a training step, is only needed when it is looked at.
@@ -233,30 +242,41 @@ def descend(
     with torch.no_grad():
         error = _error(network, x, y, change)
         if tau is not None:
-            error = quantile_huber_slope(error, tau[:, None, None, :, None], KAPPA)
-        steps = mask.sum((1, 2)).clamp(min=1) * error.shape[3] * error.shape[4]  # (E,)
+            error = quantile_huber_slope(error, tau[:, None, None, :, None], _wide(kappa))
+        terms = error.shape[3] * network.architecture.outputs
+        steps = mask.sum((1, 2)).clamp(min=1) * terms  # (E,)
         share = mask / steps[:, None, None]
         slope = error.mul_(-share[..., None, None])
     change.backward(slope)  # type: ignore[no-untyped-call]
     return memory
 
 
+def _wide(per_member: Tensor) -> Tensor:
+    """Lay a value of every member, (E,), against (E, T, B, N, D)."""
+    return per_member[:, None, None, None, None]
+
+
 @torch.no_grad()
-def evaluate(network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int) -> Tensor:
-    """Return the held-out loss of every member, (E,), at evenly spaced levels."""
+def evaluate(
+    network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int, kappa: Tensor
+) -> Tensor:
+    """Return the held-out loss of every network, (K,), at evenly spaced levels."""
     a = network.architecture
-    x, y, mask = arrange([list(episodes)], a.window)
+    x, y, mask = (v.to(network.device) for v in arrange([list(episodes)], a.window))
     x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
     mask = mask.expand(network.members, -1, -1)
-    tau = ((torch.arange(levels) + 0.5) / levels).expand(network.members, -1)
+    even = (torch.arange(levels, device=network.device) + 0.5) / levels
+    tau = even.expand(network.members, -1)
     heads = network.heads_at(tau) if a.quantiles else None
     change, _ = predict(network, x, network.start(x.shape[2]), heads)
     error = _error(network, x, y, change)
     if a.quantiles:
-        each = quantile_huber(error, tau[:, None, None, :, None], KAPPA)
+        each = quantile_huber(error, tau[:, None, None, :, None], _wide(kappa))
     else:
         each = 0.5 * error.square()
-    return (each.mean((3, 4)) * mask).sum((1, 2)) / mask.sum((1, 2))
+    steps = mask.sum((1, 2))[:, None]
+    loss = (each.mean(3) * mask[..., None]).sum((1, 2)) / steps  # (E, D)
+    return loss.flatten() if a.per_feature else loss.mean(1)
 
 
 def train(
@@ -270,31 +290,33 @@ def train(
 
     Returns
     -------
-    Held-out losses, one list of E values per evaluation.
+    Held-out losses, one list of K values per evaluation.
     """
-    a = network.architecture
+    a, device = network.architecture, network.device
     optimiser = Adam(list(network.parameters()))
-    rates = torch.tensor(schedule.rates)
+    rates = network.spread(torch.tensor(schedule.rates, device=device))
+    kappa = torch.tensor(schedule.widths, device=device)
     every = max(1, schedule.updates // schedule.evaluations)
-    best = torch.full((network.members,), torch.inf)
+    best = torch.full((len(network.first),), torch.inf, device=device)
     kept = [p.detach().clone() for p in network.parameters()]
     history: list[list[float]] = []
     stale, memory = 0, torch.zeros(0)
     batches = iter(Batches(episodes, rngs, a.window, schedule))
     for update in range(1, schedule.updates + 1):
         x, y, mask, new = next(batches)
+        x, y, mask = x.to(device), y.to(device), mask.to(device)
         memory = network.start(x.shape[2]) if new else memory.detach()
-        tau = _stratified(rngs, schedule.levels) if a.quantiles else None
+        tau = _stratified(rngs, schedule.levels).to(device) if a.quantiles else None
         done = update / schedule.updates
         share = schedule.scheduled_sampling * done
         if share > 0:
             x = _mix(network, x, memory, share, rngs)
-        memory = descend(network, x, y, mask, memory, tau)
+        memory = descend(network, x, y, mask, memory, tau, kappa)
         warm = min(1.0, update / 20)
         decay = 0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done))
         optimiser.step(rates * warm * float(decay))
         if update % every == 0 or update == schedule.updates:
-            found = evaluate(network, held_out, schedule.levels)
+            found = evaluate(network, held_out, schedule.levels, kappa)
             history.append(found.tolist())
             better = found < best
             best = torch.where(better, found, best)
@@ -333,11 +355,11 @@ def _mix(
     if a.quantiles:
         shape = (x.shape[1], 1, a.features)
         drawn = np.stack([rng.integers(GRID, size=shape) for rng in rngs])
-        heads = network.heads_from(torch.from_numpy(drawn), network.table())
+        heads = network.heads_from(torch.from_numpy(drawn).to(x.device), network.table())
     change = predict(network, x, memory, heads)[0][..., 0, :]  # (E, T, B, D)
     sampled = x[..., : a.features] + network.unit * change  # of the next rows
     replaced = np.stack([rng.random(x.shape[1:3]) < share for rng in rngs])
-    chosen = torch.from_numpy(replaced)[..., None]
+    chosen = torch.from_numpy(replaced).to(x.device)[..., None]
     mixed = x.clone()
     d = a.features
     mixed[:, 1:, :, :d] = torch.where(chosen[:, 1:], sampled[:, :-1], x[:, 1:, :, :d])

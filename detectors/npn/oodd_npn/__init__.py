@@ -12,6 +12,8 @@ PARAMETERS: dict[str, Any] = {
     "batch": 16,
     "chunk": 100,
     "scheduled_sampling": 0.0,
+    "trunk": "shared",
+    "device": "cpu",
 }
 
 
@@ -34,7 +36,8 @@ def oodd_detectors() -> list[DetectorSpec]:
             summary="recurrent networks without quantiles, one forecast each",
             reference="Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
             parameters=dict(PARAMETERS),
-            requires=("torch",),
+            requires=("torch", "safetensors"),
             extra="oodd-eval[reference]",
+            fit_ignores=("horizon", "device"),
         )
     ]

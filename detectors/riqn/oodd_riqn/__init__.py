@@ -16,6 +16,8 @@ PARAMETERS: dict[str, Any] = {
     "chunk": 100,
     "levels": 8,
     "scheduled_sampling": 0.0,
+    "trunk": "shared",
+    "device": "cpu",
 }
 
 
@@ -49,8 +51,9 @@ def oodd_detectors() -> list[DetectorSpec]:
     """Offer the three detectors of this package."""
     common: dict[str, Any] = {
         "reference": REFERENCE,
-        "requires": ("torch",),
+        "requires": ("torch", "safetensors"),
         "extra": "oodd-eval[reference]",
+        "fit_ignores": ("horizon", "samples", "device"),
     }
     return [
         DetectorSpec(
@@ -58,6 +61,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             factory=riqn,
             summary="recurrent implicit quantile networks, sampled forecasts",
             parameters=dict(PARAMETERS),
+            fit_name="riqn",
             **common,
         ),
         DetectorSpec(
@@ -65,6 +69,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             factory=riqn_ms,
             summary="RIQN whose rollouts feed back the mean of M samples",
             parameters=dict(PARAMETERS),
+            fit_name="riqn",
             **common,
         ),
         DetectorSpec(
