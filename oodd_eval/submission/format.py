@@ -42,8 +42,8 @@ class Entry:
     id
         Name of the entry and of its directory.
     title, submitter, citation, url, caption
-        Plain text for people; the caption is a note under the tables. All but the title and the
-        submitter may be empty.
+        Plain text for people; the caption is a note under the tables. All but the title may be
+        empty.
     detectors
         Names of the detectors in the records, sorted.
     trust
@@ -157,7 +157,9 @@ def entry_paths(root: Path | str) -> list[Path]:
     root = Path(root)
     if (root / ENTRY).exists():
         return [root]
-    return sorted(path.parent for path in root.glob(f"*/{ENTRY}"))
+    found = (path.parent for path in root.glob(f"*/{ENTRY}"))
+    # A name with a leading dot is an entry that is being written.
+    return sorted(path for path in found if not path.name.startswith("."))
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
