@@ -98,8 +98,12 @@ class Ranking:
     resamples: int
 
     def letters(self, row: str) -> str:
-        """Return the letters of the tie groups that a row is in, such as ``"ab"``."""
-        return "".join(_letter(i) for i, group in enumerate(self.groups) if row in group)
+        """Return the letters of the tie groups that a row shares with others, such as ``"ab"``.
+
+        Empty for a row that is told apart from all others.
+        """
+        shared = [group for group in self.groups if len(group) > 1]
+        return "".join(_letter(i) for i, group in enumerate(shared) if row in group)
 
 
 def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:

@@ -62,7 +62,7 @@ def test_a_clearly_better_one_ranks_alone():
     ranking = rank({"a": drawn(rng), "best": drawn(rng, 0.8), "b": drawn(rng)})
     assert ranking.ranks == {"best": 1, "a": 2, "b": 2}
     assert [set(group) for group in ranking.groups] == [{"best"}, {"a", "b"}]
-    assert ranking.letters("best") == "a"
+    assert [ranking.letters(name) for name in ("best", "a", "b")] == ["", "a", "a"]
 
 
 def test_ranks_do_not_depend_on_any_order():
