@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -41,10 +41,39 @@ NOMINAL_DTYPES: Final = {
 ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {"onsets": "<i8", "redraws": "<i8", "parameters": "|S"}
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
-_BLOCK: Final = 1 << 24
-"""Bytes that are held at once while a digest is computed."""
+_BLOCK: Final = 1 << 22
+"""Bytes that are held at once while content is digested or written."""
 
-Groups = Mapping[str, Mapping[str, NDArray[Any]]]
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """A dataset that comes in blocks of rows, because it may be larger than memory.
+
+    Attributes
+    ----------
+    shape
+        Of the whole.
+    blocks
+        Gives its rows from the first to the last, as arrays of any length.
+    """
+
+    shape: tuple[int, ...]
+    blocks: Callable[[], Iterable[NDArray[Any]]]
+
+    def of_length(self, rows: int) -> Iterator[NDArray[Any]]:
+        """Yield the rows in blocks of one length; only the last may be shorter."""
+        held: list[NDArray[Any]] = []
+        for block in self.blocks():
+            held.append(block)
+            while sum(map(len, held)) >= rows:
+                joined = np.concatenate(held)
+                yield joined[:rows]
+                held = [joined[rows:]]
+        if sum(map(len, held)):
+            yield np.concatenate(held)
+
+
+Groups = Mapping[str, Mapping[str, NDArray[Any] | Blocks]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,15 +190,7 @@ def write_environment(path: Path, groups: Groups) -> dict[str, dict[str, Any]]:
         for name, arrays in groups.items():
             group = file.create_group(name)
             for dataset, dtype in dtypes_of(name).items():
-                array = np.asarray(arrays[dataset])
-                array = array if dataset == "parameters" else array.astype(dtype, copy=False)
-                # Tiny datasets grow when compressed.
-                packed = array.nbytes > 512
-                group.create_dataset(
-                    dataset, data=array, track_times=False,
-                    **({"shuffle": True, "compression": "gzip", "compression_opts": 9}
-                       if packed else {}),
-                )  # fmt: skip
+                _write(group, dataset, arrays[dataset], dtype)
             check_layout(path.name, name, group)
             facts[name] = {
                 "sha256": content_digest(group),
@@ -178,6 +199,27 @@ def write_environment(path: Path, groups: Groups) -> dict[str, dict[str, Any]]:
             }
     partial.replace(path)
     return facts
+
+
+def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: str) -> None:
+    if not isinstance(content, Blocks):
+        array = np.asarray(content)
+        # Texts keep their width.
+        dtype = array.dtype.str if name == "parameters" else dtype
+        content = Blocks(array.shape, lambda: [array])
+    row = int(np.prod(content.shape[1:], dtype=np.int64)) * np.dtype(dtype).itemsize
+    # Tiny datasets grow when compressed.
+    packed = content.shape[0] * row > 512
+    dataset = group.create_dataset(
+        name, content.shape, dtype, track_times=False,
+        **({"shuffle": True, "compression": "gzip", "compression_opts": 9} if packed else {}),
+    )  # fmt: skip
+    # Whole chunks, so that each is compressed once.
+    step = dataset.chunks[0] if dataset.chunks else 1
+    start = 0
+    for block in content.of_length(step * max(1, _BLOCK // (row * step))):
+        dataset[start : start + len(block)] = block.astype(dtype, copy=False)
+        start += len(block)
 
 
 def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, PART_OFFSETS, SplitDefinition
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
+from oodd_eval.simulate.joining import Joined
 from oodd_eval.simulate.policies import load_policy
 from oodd_eval.simulate.record import (
     GENERATOR_VERSION,
@@ -327,38 +328,12 @@ def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     return found
 
 
-class _Joined(Mapping[str, Mapping[str, NDArray[Any]]]):
-    """Groups of an environment, each joined from its chunks only while it is written."""
-
-    def __init__(self, chunks: list[Chunk], work: Path) -> None:
-        self._files = {part: [work / c.file_name for c in chunks if c.part == part]
-                       for part in PART_OFFSETS}  # fmt: skip
-        self._names = ["train", "calibration", TWINS, *(f"test/{a}" for a in ANOMALIES)]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, group: str) -> dict[str, NDArray[Any]]:
-        parts: dict[str, list[NDArray[Any]]] = {}
-        for file in self._files[group.split("/", maxsplit=1)[0]]:
-            with np.load(file, allow_pickle=False) as stored:
-                for key in stored.files:
-                    owner, name = key.split(":")
-                    if owner == group:
-                        parts.setdefault(name, []).append(stored[key])
-        joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
-        joined["offsets"] = np.concatenate([[0], np.cumsum(joined.pop("lengths"))])
-        return joined
-
-
 def _assemble(
     environment: str, chunks: list[Chunk], work: Path, directory: Path, policy: str
 ) -> dict[str, Any]:
     file = f"{environment}.h5"
-    groups = write_environment(directory / file, _Joined(chunks, work))
+    files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
+    groups = write_environment(directory / file, Joined(files))
     digest = environment_digest({g: str(f["sha256"]) for g, f in groups.items()})
     return {"file": file, "policy": policy, "digest": digest, "groups": groups}
 

@@ -1,0 +1,236 @@
+"""A run that is killed at any moment loses no finished unit, and ends as if it never had been."""
+
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import h5py
+import pytest
+from helpers_plugins import install
+from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
+
+from oodd_eval.keeping import Keeper
+from oodd_eval.records import Record
+from oodd_eval.results import ResultsDirectory
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
+
+KILLS = 16
+VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb"}
+VOLATILE_PROVENANCE = {"time", "git_commit", "git_dirty"}
+
+
+def stable(path):
+    """Lines of a results directory without cost and time."""
+    lines = []
+    for line in (path / "records.jsonl").read_text().splitlines():
+        plain = {k: v for k, v in json.loads(line).items() if k not in VOLATILE}
+        origin = plain["provenance"].items()
+        plain["provenance"] = {k: v for k, v in origin if k not in VOLATILE_PROVENANCE}
+        lines.append(json.dumps(plain))
+    return lines
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plugin")
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch, path, "slow", SLOW)
+    return path
+
+
+def start(tiny_split, plugin, fits, output, *, seeds="0,1,2,3", jobs=2, pause=0.1):
+    return oodd_eval(
+        "run", "--detector", "slow", "--env", "all", "--anomaly", "iid,gravity", "--split",
+        tiny_split, "--seed", seeds, "--jobs", jobs, "--output", output, "--param",
+        f"pause={pause}", env=environment(plugin, fits, RUN=str(output)),
+    )  # fmt: skip
+
+
+def finish(process):
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    return output
+
+
+def fits_in(log):
+    return (
+        [tuple(line.split()[1:]) for line in log.read_text().splitlines()] if log.exists() else []
+    )
+
+
+def units_by_file(output):
+    """Names of score files, with the unit each is of as the log of fits names it."""
+    dimensions = {"cartpole": "4", "hopper": "15"}
+    return {
+        f"{r.provenance['scores']}.h5": (dimensions[r.environment], str(r.horizon), str(r.seed))
+        for r in ResultsDirectory(output).records()
+    }
+
+
+def test_killed_at_many_random_moments_it_ends_like_an_uninterrupted_run(
+    tiny_split, plugin, tmp_path
+):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    begun = time.monotonic()
+    finish(start(tiny_split, plugin, tmp_path / "whole-fits", whole))
+    length = time.monotonic() - begun
+    units = set(fits_in(tmp_path / "whole-fits"))
+    unit_of = units_by_file(whole)
+    assert len(units) == len(unit_of) == 8
+
+    moments = random.Random(4)
+    kept, marker, fits = {}, f"RUN={killed}".encode(), []
+    for attempt in range(KILLS):
+        log = tmp_path / f"fits-{attempt}"
+        process = start(tiny_split, plugin, log, killed)
+        # Half of the time soon after the work has begun, half of the time anywhere in the run.
+        if attempt % 2:
+            wait_until(lambda log=log, process=process: log.exists() or process.poll() is not None)
+            time.sleep(moments.uniform(0, 0.5))
+        else:
+            time.sleep(moments.uniform(0, length))
+        process.kill()
+        process.communicate()
+        assert wait_until(lambda: not workers_of(marker)), "a worker outlived the harness"
+        fits += fits_in(log)
+        assert not {unit_of[name] for name in kept} & set(fits_in(log)), "fitted again"
+        for name, content in kept.items():
+            assert (killed / "scores" / name).read_bytes() == content, "finished scores changed"
+        kept = {f.name: f.read_bytes() for f in (killed / "scores").glob("*.h5")}
+        for name in kept:
+            with h5py.File(killed / "scores" / name) as scores:
+                assert len(scores["test/nominal/scores"]) == scores["test/nominal/offsets"][-1]
+        if (killed / "records.jsonl").exists():
+            assert set(stable(killed)) <= set(stable(whole))
+    last = tmp_path / "last-fits"
+    finish(start(tiny_split, plugin, last, killed))
+    assert not {unit_of[name] for name in kept} & set(fits_in(last))
+
+    assert stable(killed) == stable(whole)
+    assert units <= {*fits, *fits_in(last)}
+    for part in ("", "scores", "logs"):
+        assert not list((killed / part).glob(".*"))
+    assert {f.name for f in (killed / "scores").iterdir()} == {
+        f.name for f in (whole / "scores").iterdir()
+    }
+
+
+def test_finished_units_are_not_fitted_again_after_a_kill(tiny_split, plugin, tmp_path):
+    log, output = tmp_path / "fits", tmp_path / "out"
+    process = start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1)
+    assert wait_until(lambda: len(list((output / "scores").glob("slow-*.h5"))) >= 2)
+    process.kill()
+    process.communicate()
+    finished = len(list((output / "scores").glob("slow-*.h5")))
+    begun = fits_in(log)
+    assert wait_until(lambda: not workers_of(f"RUN={output}".encode()))
+    finish(start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1))
+    assert len(begun) - finished in (0, 1)  # the one that was under way
+    assert len(fits_in(log)) == 6 + len(begun) - finished
+
+
+def test_a_fitting_worker_and_its_children_end_with_a_killed_harness(tiny_split, plugin, tmp_path):
+    process = start(tiny_split, plugin, tmp_path / "fits", tmp_path / "out", pause=600)
+    marker = f"RUN={tmp_path / 'out'}".encode()
+    assert wait_until((tmp_path / "fits").exists)
+    assert workers_of(marker)
+    process.kill()
+    process.communicate()
+    assert wait_until(lambda: not workers_of(marker), seconds=5)
+
+
+def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, plugin, tmp_path):
+    log, output = tmp_path / "fits", tmp_path / "out"
+    process = start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1)
+    assert wait_until(lambda: len(list((output / "scores").glob("slow-*.h5"))) >= 2)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert ResultsDirectory(output).records()
+    assert not workers_of(f"RUN={output}".encode())
+
+
+def test_records_are_there_while_the_run_goes_on(tiny_split, plugin, tmp_path):
+    output = tmp_path / "out"
+    process = start(tiny_split, plugin, tmp_path / "fits", output, pause=1, jobs=1)
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.communicate)
+        stack.callback(process.kill)
+        assert wait_until((output / "records.jsonl").exists)
+        assert ResultsDirectory(output).records()
+        assert process.poll() is None
+        assert len(list((output / "scores").glob("slow-*.h5"))) < 8
+
+
+def record(cell, *, seconds=0.0):
+    return Record(
+        cell=cell, detector="x", detector_version="", plugin="", parameters={}, environment="ant",
+        anomaly="iid", group="sensor", horizon=1, seed=0, split="s", split_digest="", status="ok",
+        protocol=1, seconds_fit=seconds,
+    )  # fmt: skip
+
+
+def test_records_written_in_any_order_end_in_the_order_of_the_plan(tmp_path):
+    results = ResultsDirectory(tmp_path)
+    results.merge_records([record("other")])
+    keeper = Keeper(results)
+    for index in (2, 0, 1):
+        keeper.add(index, [record(f"{index}")])
+        keeper.write()
+    assert [r.cell for r in results.records()] == ["other", "0", "1", "2"]
+    again = Keeper(results)
+    again.add(1, [record("1", seconds=5.0)])
+    again.write()
+    assert [r.cell for r in results.records()] == ["other", "0", "1", "2"]
+    assert results.records()[2].seconds_fit == 5.0
+
+
+def test_writing_records_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
+    clock, written = [0.0], []
+    monkeypatch.setattr("oodd_eval.keeping.time.monotonic", lambda: clock[0])
+
+    def merge(records):
+        clock[0] += 1.0  # a writing takes a second
+        written.append(len(records))
+
+    results = ResultsDirectory(tmp_path)
+    monkeypatch.setattr(results, "merge_records", merge)
+    keeper = Keeper(results)
+    for index in range(100):
+        clock[0] += 1.0
+        keeper.add(index, [record(str(index))])
+    assert written == [1, 21, 41, 61, 81]
+    keeper.write()
+    keeper.write()
+    assert written[-2:] == [81, 100]
+
+
+def test_leftovers_of_killed_processes_go_away_and_those_of_living_ones_stay(tmp_path):
+    with subprocess.Popen(["true"]) as gone:
+        pass
+    results = ResultsDirectory(tmp_path)
+    results.prepare()
+    stale = [
+        tmp_path / f".records.jsonl.{gone.pid}",
+        tmp_path / "scores" / f".a-b-0123.h5.{gone.pid}",
+        tmp_path / "logs" / f".a-b-0123.txt.{gone.pid}",
+    ]
+    living = tmp_path / "scores" / f".a-b-0123.h5.{os.getppid()}"
+    foreign = tmp_path / ".gitignore"
+    for file in (*stale, living, foreign):
+        file.write_text("x")
+    rooms = [tmp_path / "fitted" / f".{pid}-abc" for pid in (gone.pid, os.getppid())]
+    for room in rooms:
+        room.mkdir(parents=True)
+        (room / "weights").write_text("x")
+    Keeper(results).prepare()
+    assert not [file for file in stale if file.exists()]
+    assert living.exists()
+    assert foreign.exists()
+    assert [room.exists() for room in rooms] == [False, True]
