@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from oodd_eval.detector import Detector, DetectorSpec
     from oodd_eval.hookspecs import hookimpl
     from oodd_eval.splits import load_split
+    from oodd_eval.testing import check_detector
     from oodd_eval.trajectory import Trajectory
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "DetectorSpec",
     "Trajectory",
     "__version__",
+    "check_detector",
     "evaluate",
     "hookimpl",
     "load_split",
@@ -32,6 +34,7 @@ _HOMES = {
     "Detector": "detector",
     "DetectorSpec": "detector",
     "Trajectory": "trajectory",
+    "check_detector": "testing",
     "evaluate": "api",
     "hookimpl": "hookspecs",
     "load_split": "splits",

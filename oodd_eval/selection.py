@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import re
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from oodd_eval.errors import UnknownNameError, UsageError
 
@@ -92,6 +94,35 @@ def _quantity(text: str, units: dict[str, int], expected: str) -> float:
     if not match or match[2].lower() not in units or float(match[1]) == 0:
         raise UsageError(f"{text!r} is not {expected}")
     return float(match[1]) * units[match[2].lower()]
+
+
+def assignments(option: str, given: Iterable[str]) -> dict[str, str]:
+    """Return texts of the form ``NAME=VALUE`` as names and values.
+
+    Raises
+    ------
+    UsageError
+        When one has another form.
+    """
+    found = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise UsageError(f"{option} {text!r}, expected NAME=VALUE")
+        found[name] = value
+    return found
+
+
+def parameters(given: Iterable[str]) -> dict[str, Any]:
+    """Return what ``--param NAME=VALUE`` gives, values in JSON or else plain text."""
+    return {name: _plain(value) for name, value in assignments("--param", given).items()}
+
+
+def _plain(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
 
 
 def expression(text: str) -> Predicate:
