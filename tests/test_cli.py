@@ -317,6 +317,16 @@ def test_show_prints_one_detector_by_anomaly(run):
     assert "100.0" in out
 
 
+def test_show_wide_prints_all_metrics_and_the_pooled_ones(run):
+    run(*CLOCK)
+    assert "pooled AUC" not in run("show", "oodd-results")[1]
+    out = run("show", "oodd-results", "--wide")[1]
+    assert re.search(r"^detector +pooled AUC +AP +FPR95$", out, re.MULTILINE)
+    assert "clock: pooled AUC (%) by anomaly" in run(
+        "show", "oodd-results", "--detector", "clock", "--metric", "auc_pooled"
+    )[1]  # fmt: skip
+
+
 def test_show_with_intervals(run):
     run(*CLOCK)
     assert "50.0 [50.0, 50.0]" in run("show", "oodd-results", "--intervals")[1]

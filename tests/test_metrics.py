@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score, roc_auc_score, roc_curve
 
 from oodd_eval.cusum import Standardization
+from oodd_eval.evaluation import Rules, cell_metrics
 from oodd_eval.metrics import (
     METRICS,
     POOLED,
@@ -209,3 +210,19 @@ def test_pooled_metrics_without_a_class_are_undefined():
     assert all(map(math.isnan, pooled_metrics(arrays([NAN, 1, 2]), [1]).values()))
     assert all(map(math.isnan, pooled_metrics(arrays([1, 2, NAN]), [2]).values()))
     assert all(map(math.isnan, pooled_metrics(arrays([NAN, NAN]), [1]).values()))
+
+
+def test_a_cell_has_the_pooled_metrics_last_without_interval_or_contribution():
+    rng = np.random.default_rng(3)
+    calibration = list(rng.normal(size=(4, 300)))
+    scores, twins = list(rng.normal(size=(3, 80))), list(rng.normal(size=(3, 80)))
+    scores[2][:] = NAN
+    metrics, contributions = cell_metrics(
+        scores, twins, [10, 20, 30], Rules.fit(calibration), environment="hopper"
+    )
+    assert list(metrics)[-3:] == list(POOLED)
+    expected = pooled_metrics(scores, [10, 20, 30])
+    for name in POOLED:
+        assert (metrics[name].value, metrics[name].n) == (expected[name], 2)
+        assert math.isnan(metrics[name].low)
+        assert name not in contributions

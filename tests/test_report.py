@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.intervals import bootstrap_weights, mean_interval
+from oodd_eval.records import Metric
 from oodd_eval.report import markdown, tables
 from oodd_eval.report.board import Board, boards, contribution
 from oodd_eval.report.tables import Table
@@ -190,6 +191,16 @@ def test_no_text_breaks_a_markdown_table(text):
     unescaped = rows[2].replace("\\\\", "").replace("\\|", "")
     assert unescaped.count("|") == 5
     assert "<" not in unescaped.replace("\\<", "")
+
+
+def test_pooled_metrics_are_a_table_of_their_own_and_no_part_of_a_report():
+    one, two = make_record("riqn", anomaly="iid"), make_record("riqn", anomaly="drift")
+    for record, value in ((one, 0.25), (two, 0.5)):
+        record.metrics.update(auc_pooled=Metric(value), fpr95=Metric(float("nan")))
+    table = tables.pooled(Board([one, two]))
+    assert table.header == ["detector", "pooled AUC", "AP", "FPR95"]
+    assert table.rows == [["riqn", "37.5", tables.UNDEFINED, tables.UNDEFINED]]
+    assert "pooled" not in markdown.render([one, two])
 
 
 def test_a_transposed_table_exchanges_rows_and_columns():

@@ -64,9 +64,9 @@ def _splits() -> Iterable[tuple[str, ...]]:
 
 
 def _metrics() -> Iterable[tuple[str, ...]]:
-    from oodd_eval.metrics import METRICS  # noqa: PLC0415  likewise
+    from oodd_eval.metrics import METRICS, POOLED  # noqa: PLC0415  likewise
 
-    yield from METRICS.items()
+    yield from (METRICS | POOLED).items()
 
 
 _KINDS: Final[dict[str, Callable[[], Iterable[tuple[str, ...]]]]] = {

@@ -7,7 +7,7 @@ import sys
 
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.evaluation import rescore
-from oodd_eval.metrics import METRICS
+from oodd_eval.metrics import METRICS, POOLED
 from oodd_eval.records import Record
 from oodd_eval.report import markdown, tables
 from oodd_eval.report.board import boards
@@ -18,8 +18,8 @@ from oodd_eval.splits import load_split
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval show``; 1 when one of the cells failed."""
-    if options.metric not in METRICS:
-        raise UnknownNameError("metric", options.metric, METRICS)
+    if options.metric not in METRICS | POOLED:
+        raise UnknownNameError("metric", options.metric, METRICS | POOLED)
     results = ResultsDirectory(options.directory)
     records = results.records()
     if not options.stored:
@@ -35,6 +35,8 @@ def run(options: argparse.Namespace) -> int:
         _by_anomaly(options, records, reporter)
     else:
         reporter.tables(records)
+        if options.wide:
+            _wide(options, records, reporter)
         reporter.failures(records)
     reporter.console.print(summary(records))
     return int(not all(r.ok for r in records))
@@ -49,6 +51,14 @@ def _recomputed(records: list[Record], results: ResultsDirectory, place: str) ->
         own = [r for r in records if r.split_digest == digest]
         fresh |= {r.identity: r for r in rescore(own, results, split)}
     return [fresh[r.identity] for r in records]
+
+
+def _wide(options: argparse.Namespace, records: list[Record], reporter: TerminalReporter) -> None:
+    for board in boards(records):
+        reporter.table(tables.all_metrics(board, intervals=options.intervals))
+        if alarms := tables.calibrated(board, intervals=options.intervals):
+            reporter.table(alarms)
+        reporter.table(tables.pooled(board))
 
 
 def _by_anomaly(

@@ -122,7 +122,7 @@ class Board:
         if failed := next((r for r in records if not r.ok), None):
             return Value(state=failed.status, cells=len(records), partial=partial)
         with_metric = [r for r in records if metric in r.per_trajectory]
-        value = mean_value([contribution(r, metric) for r in with_metric])
+        value = _mean(records, metric)
         low, high = _interval(with_metric, metric) if intervals else (NAN, NAN)
         return Value(value, low, high, cells=len(records), partial=partial)
 
@@ -171,6 +171,15 @@ def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
     numerators, denominators = record.per_trajectory[metric]
     return Contribution(np.array(numerators), np.array(denominators))
+
+
+def _mean(records: Sequence[Record], metric: str) -> float:
+    """Mean over cells where it is defined."""
+    if any(metric in r.per_trajectory for r in records):
+        return _seed_mean(records, metric)
+    # One number of all trajectories of a cell, such as a pooled AUC.
+    defined = [v for v in (r.value(metric) for r in records) if not math.isnan(v)]
+    return sum(defined) / len(defined) if defined else NAN
 
 
 def _seed_mean(cell: Sequence[Record], metric: str) -> float:

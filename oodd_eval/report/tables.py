@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, GROUPS
-from oodd_eval.metrics import METRICS
+from oodd_eval.metrics import METRICS, POOLED
 from oodd_eval.report.board import Board, Entry, Value
 
-PERCENT: Final = frozenset({"auc", "auc_null", "auc_matched", "auc_placebo"})
-"""Metrics that are printed in percent, as the paper does."""
+PERCENT: Final = frozenset({"auc", "auc_null", "auc_matched", "auc_placebo", *POOLED})
+"""Metrics that are printed in percent, AUCs as the paper does."""
 
 TITLES: Final = {
     "auc": "AUC",
@@ -25,6 +25,9 @@ TITLES: Final = {
     "missed": "Missed",
     "far": "FAR",
     "far_twin": "FAR twin",
+    "auc_pooled": "pooled AUC",
+    "average_precision": "AP",
+    "fpr95": "FPR95",
 }
 
 UNDEFINED: Final = "\N{EN DASH}"
@@ -153,6 +156,11 @@ def anomaly_groups(
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric by detector, mean over all cells, with the null and placebo columns."""
     return _by_metric(board, list(METRICS), "All metrics, mean over cells", intervals=intervals)
+
+
+def pooled(board: Board) -> Table:
+    """Return pooled AUC, average precision and FPR95 by detector: no part of a report unasked."""
+    return _by_metric(board, list(POOLED), "Pooled steps (%), mean over cells", intervals=False)
 
 
 def calibrated(board: Board, *, intervals: bool = False) -> Table | None:
