@@ -1,0 +1,251 @@
+"""From a name on the command line to a class, importing no more than the name says."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from oodd_eval.errors import UnknownNameError, UsageError
+
+PLACES: Final = ("covariance", "ensemble", "linear_model", "mixture", "neighbors", "svm")
+"""Parts of scikit-learn whose classes need no path: those that hold its outlier detectors."""
+
+_DEFINITION: Final = re.compile(r"^class (\w+)\([^)]*Detector[^)]*\):", re.MULTILINE)
+
+
+def pyod_class(name: str) -> type:
+    """Return a detector class of ``pyod.models`` by its bare name.
+
+    Only the module that defines it is imported: others need libraries of their own.
+
+    Raises
+    ------
+    UnknownNameError
+        When there is no such class.
+    """
+    places: dict[str, str] = {}
+    directory = _directory("pyod.models")
+    for file in sorted(directory.glob("*.py")) if directory else []:
+        if not file.stem.startswith("base"):
+            for defined in _DEFINITION.findall(file.read_text(encoding="utf-8")):
+                places.setdefault(defined, file.stem)
+    if name not in places:
+        raise UnknownNameError("detector of PyOD", name, places)
+    found = getattr(importlib.import_module(f"pyod.models.{places[name]}"), name)
+    return _class(found, f"pyod:{name}", "fit", "decision_function")
+
+
+def sklearn_class(name: str) -> tuple[str, type]:
+    """Return an outlier detector or density estimator of scikit-learn, after its shortest name.
+
+    Parameters
+    ----------
+    name
+        ``IsolationForest``, or with the path to it: ``ensemble.IsolationForest``.
+
+    Raises
+    ------
+    UsageError
+        When there is no such class, or it is something else.
+    """
+    short = name.rpartition(".")[2]
+    known: dict[str, type] = {}
+    for place in PLACES:
+        module = importlib.import_module(f"sklearn.{place}")
+        known.update({n: c for n in module.__all__ if _judges(c := getattr(module, n))})
+    if name in known:
+        return name, known[name]
+    if short == name:
+        for place in PLACES:
+            if hasattr(importlib.import_module(f"sklearn.{place}"), name):
+                raise _no_outlier_detector(name, known)
+        raise UnknownNameError("outlier detector of scikit-learn", name, known)
+    found = imported(f"sklearn.{name}", f"sklearn:{name}")
+    if not _judges(found):
+        raise _no_outlier_detector(name, known)
+    return short if known.get(short) is found else name, found
+
+
+def imported(path: str, spec: str) -> Any:
+    """Import what a dotted path names.
+
+    Parameters
+    ----------
+    path
+        ``module.name``.
+    spec
+        The name it is a part of, for messages.
+
+    Raises
+    ------
+    UsageError
+        When the path cannot be one, its module does not exist or needs a module that does not.
+    UnknownNameError
+        When the module has no such name.
+    """
+    module_name, _, name = path.rpartition(".")
+    if not module_name or not all(part.isidentifier() for part in path.split(".")):
+        raise UsageError(
+            f"{spec!r} names no class: expected a module and a class in it, such as "
+            "forecast:sklearn.linear_model.Ridge"
+        )
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name and f"{module_name}.".startswith(f"{error.name}."):
+            raise _no_module(error.name, spec) from None
+        raise UsageError(
+            f"{spec!r} cannot be imported: {module_name} needs the module {error.name!r}, which is "
+            "not installed"
+        ) from None
+    if not hasattr(module, name):
+        public = [n for n, v in vars(module).items() if inspect.isclass(v) and n[0] != "_"]
+        raise UnknownNameError(f"class of {module_name}", name, public)
+    return getattr(module, name)
+
+
+def forecaster_class(path: str) -> type:
+    """Return a class with `fit` and `predict`, by its dotted path.
+
+    Raises
+    ------
+    UsageError
+        When there is none; of scikit-learn's classes, when it is not a regressor.
+    """
+    spec = f"forecast:{path}"
+    found = _class(imported(path, spec), spec, "fit", "predict")
+    if path.startswith("sklearn."):
+        from sklearn.base import RegressorMixin  # noqa: PLC0415  an optional extra
+
+        if not issubclass(found, RegressorMixin):
+            raise UsageError(
+                f"{spec!r} is not a regressor: a forecaster predicts numbers, such as "
+                "forecast:sklearn.linear_model.Ridge"
+            )
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """What a class's constructor takes.
+
+    Attributes
+    ----------
+    plain
+        Parameters whose default is a plain value, with the default.
+    required
+        Parameters without a default.
+    others
+        All further names that it takes; None if it takes any.
+    """
+
+    plain: Mapping[str, Any]
+    required: tuple[str, ...]
+    others: tuple[str, ...] | None
+
+    @classmethod
+    def of(cls, factory: type) -> Signature:
+        """Read the signature of a class."""
+        plain: dict[str, Any] = {}
+        required: list[str] = []
+        others: list[str] = []
+        anything = False
+        for p in inspect.signature(factory).parameters.values():
+            if p.kind is p.VAR_KEYWORD:
+                anything = True
+            elif p.kind in (p.VAR_POSITIONAL, p.POSITIONAL_ONLY):
+                continue
+            elif p.default is p.empty:
+                required.append(p.name)
+            elif _is_plain(p.default):
+                plain[p.name] = p.default
+            else:
+                others.append(p.name)
+        return cls(plain, tuple(required), None if anything else tuple(others))
+
+    def __contains__(self, name: str) -> bool:
+        """Whether it names this parameter; those that ``**`` would take do not count."""
+        return name in (*self.plain, *self.required, *(self.others or ()))
+
+    def check(self, given: Mapping[str, Any], spec: str) -> None:
+        """Raise unless the class can be made of these parameters.
+
+        Raises
+        ------
+        UnknownNameError
+            When it does not take one of them.
+        UsageError
+            When one that it needs is missing.
+        """
+        for name in given:
+            if self.others is not None and name not in self:
+                raise UnknownNameError(
+                    f"parameter of {spec}", name, [*self.plain, *self.required, *self.others]
+                )
+        if missing := [name for name in self.required if name not in given]:
+            raise UsageError(
+                f"{spec} needs a value for {', '.join(missing)}: give it as --param {missing[0]}=…"
+            )
+
+
+def _is_plain(value: object) -> bool:
+    """Whether JSON gives the value back as it is."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return False
+    try:
+        return bool(json.loads(json.dumps(value)) == value)
+    except (TypeError, ValueError):
+        return False
+
+
+def _judges(found: object) -> bool:
+    """Whether this is a class of scikit-learn that says how nominal a row is."""
+    from sklearn.base import DensityMixin, OutlierMixin  # noqa: PLC0415  an optional extra
+    from sklearn.neighbors import KernelDensity  # noqa: PLC0415  which lacks the mixin
+
+    return (
+        inspect.isclass(found)
+        and issubclass(found, DensityMixin | OutlierMixin | KernelDensity)
+        and hasattr(found, "score_samples")
+    )
+
+
+def _no_outlier_detector(name: str, known: Mapping[str, type]) -> UsageError:
+    return UsageError(
+        f"'sklearn:{name}' is neither an outlier detector nor a density estimator; those of "
+        f"scikit-learn are {', '.join(sorted(known))}"
+    )
+
+
+def _class(found: Any, spec: str, *methods: str) -> type:
+    if inspect.isclass(found) and all(callable(getattr(found, m, None)) for m in methods):
+        return found
+    raise UsageError(
+        f"{spec!r} is {found!r:.60}, expected a class with the methods {' and '.join(methods)}"
+    )
+
+
+def _no_module(name: str, spec: str) -> UsageError:
+    parent, _, last = name.rpartition(".")
+    if parent and (directory := _directory(parent)):
+        there = [p.stem for p in directory.iterdir() if p.stem[0] not in "_."]
+        return UnknownNameError(f"module of {parent}", last, there)
+    return UsageError(
+        f"{spec!r} cannot be imported: there is no module {name!r}; install what holds it, or name "
+        "the directory of your own module in the environment variable PYTHONPATH"
+    )
+
+
+def _directory(module: str) -> Path | None:
+    """Return where the modules of a package are; None for a module that is none."""
+    found = find_spec(module)
+    places = found.submodule_search_locations if found else None
+    return Path(next(iter(places))) if places else None

@@ -1,0 +1,145 @@
+"""What the plug-in says about a class it was asked for: name, parameters, version, needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any, Final
+
+from oodd_adapters.detectors import ForecastDetector, OutlierDetector, Settings
+from oodd_adapters.names import Signature, forecaster_class, pyod_class, sklearn_class
+from oodd_eval import Detector, DetectorSpec
+from oodd_eval.provenance import source_digest
+
+DEFAULTS: Final[Mapping[str, int]] = {"window": 4, "rows": 10_000}
+"""Parameters of the adapters themselves. They hide parameters of the same name of a class."""
+
+
+def pyod(name: str) -> DetectorSpec:
+    """Return the spec of a detector of PyOD: its `decision_function` on windows."""
+    summary = f"PyOD's {name} on a window of observations"
+    if not _present("pyod"):
+        return _absent(f"pyod:{name}", summary, "pyod", "oodd-eval[pyod]")
+    try:
+        found = pyod_class(name)
+    except ModuleNotFoundError as error:
+        return _absent(f"pyod:{name}", summary, str(error.name), "")
+    recipe = Recipe(found, f"pyod:{name}", outlier=("decision_function", 1))
+    return recipe.spec(summary, f"pyod.{version('pyod')}")
+
+
+def sklearn(name: str) -> DetectorSpec:
+    """Return the spec of an outlier detector of scikit-learn: minus its `score_samples`."""
+    if not _present("sklearn"):
+        summary = f"scikit-learn's {name} on a window of observations"
+        return _absent(f"sklearn:{name}", summary, "sklearn", "oodd-eval[reference]")
+    name, found = sklearn_class(name)
+    recipe = Recipe(found, f"sklearn:{name}", outlier=("score_samples", -1))
+    if "novelty" in recipe.signature:
+        # Without it the class judges its training rows and no others.
+        recipe = Recipe(found, recipe.name, recipe.outlier, {"novelty": True})
+    summary = f"scikit-learn's {name} on a window of observations"
+    return recipe.spec(summary, _sklearn_version())
+
+
+def forecast(path: str) -> DetectorSpec:
+    """Return the spec of a forecaster: the error of its `predict`, fed with windows."""
+    name = f"forecast:{path}"
+    summary = f"error of forecasts by {path.rpartition('.')[2]} from a window of observations"
+    top = path.partition(".")[0]
+    if top == "sklearn" and not _present(top):
+        return _absent(name, summary, top, "oodd-eval[reference]")
+    found = forecaster_class(path)
+    # Code of one's own changes without a new version; its digest tells.
+    label = _sklearn_version() if top == "sklearn" else f"{top}.{source_digest(top)[:12]}"
+    return Recipe(found, name, outlier=None).spec(summary, label)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to make a detector of a class: what a spec's factory is.
+
+    Attributes
+    ----------
+    found
+        The class.
+    name
+        Of the detector.
+    outlier
+        For outlier detectors, the method that scores and its sign; None for forecasters.
+    fixed
+        Parameters of the class that are not the user's to choose.
+    """
+
+    found: type
+    name: str
+    outlier: tuple[str, int] | None
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def signature(self) -> Signature:
+        """What the class's constructor takes."""
+        return Signature.of(self.found)
+
+    def spec(self, summary: str, label: str) -> DetectorSpec:
+        """Return the spec; the label says which version of which library does the work."""
+        signature = self.signature
+        hidden = {*self.fixed, "random_state"}
+        plain = {k: v for k, v in signature.plain.items() if k not in hidden}
+        return DetectorSpec(
+            name=self.name,
+            factory=self,
+            summary=summary,
+            reference=f"{self.found.__module__}.{self.found.__qualname__}",
+            parameters={**plain, **DEFAULTS},
+            other_parameters=bool(signature.required or signature.others is None),
+            version=label,
+        )
+
+    def __call__(
+        self,
+        *,
+        seed: int = 0,
+        horizon: int = 1,
+        window: int = DEFAULTS["window"],
+        rows: int = DEFAULTS["rows"],
+        **parameters: Any,
+    ) -> Detector:
+        """Return an unfitted detector, as the harness asks for it."""
+        signature = self.signature
+        arguments = {**parameters, **self.fixed}
+        if "random_state" in signature:
+            arguments.setdefault("random_state", seed)
+        signature.check(arguments, self.name)
+        make: Callable[[], Any] = lambda: self.found(**arguments)  # noqa: E731
+        settings = Settings(self.name, seed, horizon, window, rows)
+        if self.outlier is None:
+            return ForecastDetector(make, settings)
+        return OutlierDetector(make, *self.outlier, settings)
+
+
+def _present(module: str) -> bool:
+    return find_spec(module) is not None
+
+
+def _sklearn_version() -> str:
+    return f"scikit-learn.{version('scikit-learn')}"
+
+
+def _absent(name: str, summary: str, module: str, extra: str) -> DetectorSpec:
+    """Return the spec of a detector that cannot run here, and so cannot be looked at either."""
+    return DetectorSpec(
+        name=name,
+        factory=_cannot_run,
+        summary=summary,
+        parameters=dict(DEFAULTS),
+        other_parameters=True,
+        requires=(module,),
+        extra=extra,
+    )
+
+
+def _cannot_run(**_: Any) -> Detector:
+    raise ModuleNotFoundError("a module that this detector needs is not installed")

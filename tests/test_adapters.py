@@ -1,0 +1,487 @@
+"""Classes of other libraries as detectors: direction, causality, horizons, names, errors."""
+
+import random
+import sys
+
+import numpy as np
+import pytest
+from oodd_adapters import windows as w
+from oodd_adapters.names import Signature
+from sklearn.ensemble import IsolationForest
+from sklearn.neighbors import KernelDensity
+
+from oodd_eval import Trajectory, load_split
+from oodd_eval.cli import main
+from oodd_eval.errors import (
+    ContractError,
+    MissingExtraError,
+    NotFittedError,
+    UnknownNameError,
+    UsageError,
+)
+from oodd_eval.plugins import discover, resolve_parameters
+from oodd_eval.prediction import FeatureScale
+from oodd_eval.results import ResultsDirectory
+from oodd_eval.testing import check_detector
+
+THEIRS = '''
+"""Forecasters and detectors of a user."""
+import random
+import numpy as np
+
+
+class Mean:
+    """Predicts the mean of its targets; takes vectors, and a number to add."""
+    def __init__(self, plus=0.0):
+        self.plus = plus
+    def fit(self, x, y):
+        self.mean_ = y.mean(axis=0)
+    def predict(self, x):
+        return np.tile(self.mean_ + self.plus, (len(x), 1))
+
+
+class Single:
+    """Predicts one number only: the newest observation of the first sensor."""
+    def fit(self, x, y):
+        if y.ndim != 1:
+            raise ValueError("one number at a time")
+        self.mean_ = y.mean()
+    def predict(self, x):
+        return self.mean_ + 0 * x[:, 0]
+
+
+class Dice:
+    """Draws from global generators, as classes without a seed do."""
+    def fit(self, x, y):
+        self.drawn_ = np.random.random(y.shape[1]) + random.random()
+    def predict(self, x):
+        return np.tile(self.drawn_, (len(x), 1)) + np.random.random((len(x), 1))
+
+
+class Needy:
+    def __init__(self, order, *, scale=np.nan): ...
+    def fit(self, x, y): ...
+    def predict(self, x): ...
+
+
+class Open:
+    def __init__(self, **settings):
+        self.settings = settings
+    def fit(self, x, y): ...
+    def predict(self, x): return x[:, :2] * 0 + self.settings.get("plus", 0)
+'''
+
+
+@pytest.fixture
+def theirs(monkeypatch, tmp_path):
+    """Put a module of a user on the path, and return where it is."""
+    (tmp_path / "their_models.py").write_text(THEIRS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "their_models", raising=False)
+    yield tmp_path / "their_models.py"
+    sys.modules.pop("their_models", None)
+
+
+def noise(*lengths, seed=0, sensors=3):
+    rng = np.random.default_rng(seed)
+    return [
+        Trajectory(rng.normal(2.0, 3.0, size=(n, sensors)), np.zeros((n - 1, 1))) for n in lengths
+    ]
+
+
+def offer(name):
+    return discover(only=["adapters"]).offer(name)
+
+
+def make(name, **settings):
+    spec = offer(name).spec
+    return spec.factory(**{"seed": 0, "horizon": 1, **settings})
+
+
+# What a row is, and what is done with it
+
+
+def test_a_window_holds_the_newest_observation_first_and_repeats_the_first_one():
+    o = np.array([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]], np.float32)
+    assert w.windows(o, np.array([0, 2]), 2).tolist() == [[1, 10, 1, 10], [3, 30, 2, 20]]
+
+
+def test_training_windows_are_paired_with_what_came_next():
+    nominal = noise(3, 2)
+    scale = FeatureScale.fit(nominal)
+    rows, later = w.sample_windows(nominal, scale, length=1, ahead=1, limit=99, seed=0)
+    first, second = scale(nominal[0]), scale(nominal[1])
+    np.testing.assert_array_equal(rows, [first[0], first[1], second[0]])
+    np.testing.assert_array_equal(later, [first[1], first[2], second[1]])
+
+
+def test_of_too_many_windows_a_random_choice_is_taken():
+    nominal = noise(50, 60)
+    scale = FeatureScale.fit(nominal)
+    few, again, other = (
+        w.sample_windows(nominal, scale, length=2, ahead=0, limit=20, seed=s)[0] for s in (1, 1, 2)
+    )
+    everything = w.sample_windows(nominal, scale, length=2, ahead=0, limit=110, seed=1)[0]
+    assert few.shape == (20, 6)
+    assert {tuple(r) for r in few} < {tuple(r) for r in everything}
+    np.testing.assert_array_equal(few, again)
+    assert not np.array_equal(few, other)
+
+
+def test_rows_are_given_in_blocks_of_one_size():
+    sizes = []
+
+    def count(rows):
+        sizes.append(len(rows))
+        return rows.sum(axis=1)
+
+    rows = np.arange(2 * w.BLOCK + 5.0)[:, None]
+    np.testing.assert_array_equal(w.row_by_row(count, rows, alone=False), rows[:, 0])
+    assert sizes == [w.BLOCK] * 3
+    sizes.clear()
+    np.testing.assert_array_equal(w.row_by_row(count, rows[:3], alone=True), rows[:3, 0])
+    assert sizes == [1] * 3
+
+
+@pytest.mark.parametrize(
+    ("function", "compares"),
+    [
+        (lambda rows: rows.sum(axis=1), False),
+        (lambda rows: rows.sum(axis=1) + 1e-13 * len(rows), False),
+        (lambda rows: rows.sum(axis=1) - rows.sum(), True),
+        (lambda rows: np.argsort(np.argsort(rows[:, 0])) * 1.0, True),
+        (lambda rows: np.random.default_rng(0).random(len(rows)), True),
+    ],
+)
+def test_functions_that_compare_rows_are_found_out(function, compares):
+    rows = np.random.default_rng(0).normal(size=(100, 4))
+    assert w.compares_rows(function, rows) is compares
+
+
+def test_global_generators_are_seeded_inside_and_restored():
+    np.random.seed(5)  # noqa: NPY002
+    random.seed(5)
+    with w.seeded(1):
+        first = np.random.random(), random.random()  # noqa: NPY002
+    with w.seeded(1):
+        assert first == (np.random.random(), random.random())  # noqa: NPY002
+    found = np.random.random(), random.random()  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    random.seed(5)
+    assert found == (np.random.random(), random.random())  # noqa: NPY002
+
+
+# Outlier detectors
+
+
+@pytest.mark.parametrize("name", ["sklearn:IsolationForest", "pyod:IForest"])
+def test_isolation_forest_is_the_librarys_on_windows_with_the_sign_turned(name):
+    nominal, (x,) = noise(40, 50), noise(30, seed=1)
+    detector = make(name, seed=3, window=2, n_estimators=10)
+    detector.fit(nominal)
+    scale = FeatureScale.fit(nominal)
+    z = [scale(t).astype(float) for t in (*nominal, x)]
+    rows = [np.hstack([a, np.vstack([a[:1], a[:-1]])]) for a in z]
+    forest = IsolationForest(n_estimators=10, random_state=3).fit(np.vstack(rows[:2]))
+    expected = -forest.score_samples(rows[2])
+    scores = detector.score(x)
+    if name == "pyod:IForest":  # which subtracts the threshold of its contamination
+        scores, expected = scores - scores[0], expected - expected[0]
+    np.testing.assert_allclose(scores, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_density_estimator_scores_by_minus_its_log_density():
+    nominal, (x,) = noise(40), noise(10, seed=1)
+    detector = make("sklearn:KernelDensity", window=1, bandwidth=0.5)
+    detector.fit(nominal)
+    scale = FeatureScale.fit(nominal)
+    expected = -KernelDensity(bandwidth=0.5).fit(scale(nominal[0])).score_samples(scale(x))
+    np.testing.assert_allclose(detector.score(x), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sklearn:IsolationForest", "sklearn:LocalOutlierFactor", "sklearn:OneClassSVM",
+        "sklearn:EllipticEnvelope", "sklearn:SGDOneClassSVM", "sklearn:GaussianMixture",
+        "sklearn:KernelDensity", "pyod:KNN", "pyod:ECOD", "pyod:COPOD", "pyod:PCA",
+        "pyod:IForest", "pyod:LOF", "pyod:GMM",
+    ],
+)  # fmt: skip
+def test_every_outlier_detector_gives_a_far_observation_a_higher_score(name):
+    detector = make(name, window=1)
+    detector.fit(noise(60, 60))
+    (x,) = noise(20, seed=1)
+    rows = np.array(x.observations)
+    rows[7] += 40.0
+    scores = detector.score(Trajectory(rows, x.actions))
+    assert np.isfinite(scores).all()
+    assert scores[7] == scores.max()
+    assert scores[7] > np.median(scores)
+
+
+def test_a_detector_that_ranks_rows_among_each_other_gets_them_one_at_a_time():
+    detector, (x,) = make("pyod:ECOD"), noise(12, seed=1)
+    detector.fit(noise(60, 60))
+    assert detector.alone_
+    np.testing.assert_array_equal(detector.score(x)[:5], detector.score(x[:5]))
+
+
+def test_the_horizon_changes_nothing_for_an_outlier_detector():
+    (x,) = noise(20, seed=1)
+    one, five = make("pyod:KNN"), make("pyod:KNN", horizon=5)
+    one.fit(noise(60))
+    five.fit(noise(60))
+    np.testing.assert_array_equal(one.score(x), five.score(x))
+
+
+# Forecasters
+
+
+def test_forecast_error_by_hand(theirs):
+    # One step adds 2 in sensor 0 and 0 in sensor 1; std of (0, 2, 4) is sqrt(8/3).
+    line = Trajectory([[0, 7], [2, 7], [4, 7]], np.zeros((2, 1)))
+    detector = make("forecast:their_models.Mean")
+    detector.fit([line])
+    x = Trajectory([[0, 7], [2, 7], [3, 7], [5, 9]], np.zeros((3, 1)))
+    std = np.sqrt(8 / 3)
+    expected = [np.nan, 0.0, (1 / std + 0) / 2, (0 + 2) / 2]
+    np.testing.assert_allclose(detector.score(x), expected, atol=1e-6)
+
+
+def test_forecasts_are_fed_back_for_longer_horizons(theirs):
+    line = Trajectory([[0, 7], [2, 7], [4, 7]], np.zeros((2, 1)))
+    detector = make("forecast:their_models.Mean", horizon=3)
+    detector.fit([line])
+    x = Trajectory([[0, 7], [9, 7], [9, 7], [7, 7], [9, 7]], np.zeros((4, 1)))
+    std = np.sqrt(8 / 3)
+    # From 0 three steps lead to 6, where 7 is; from 9 they lead to 15, where 9 is.
+    expected = [np.nan] * 3 + [1 / std / 2, 6 / std / 2]
+    np.testing.assert_allclose(detector.score(x), expected, atol=1e-6)
+
+
+def test_a_class_that_predicts_one_number_is_fitted_for_each_sensor(theirs):
+    nominal, (x,) = noise(40), noise(10, seed=1)
+    one, several = make("forecast:their_models.Single"), make("forecast:their_models.Mean")
+    one.fit(nominal)
+    several.fit(nominal)
+    np.testing.assert_allclose(one.score(x), several.score(x), rtol=1e-12)
+
+
+def test_a_forecaster_that_draws_without_a_seed_is_repeatable_and_causal(theirs):
+    nominal, (x,) = noise(40), noise(10, seed=1)
+    first, again, other = (make("forecast:their_models.Dice", seed=s) for s in (1, 1, 2))
+    for detector in (first, again, other):
+        detector.fit(nominal)
+    np.testing.assert_array_equal(first.score(x), again.score(x))
+    np.testing.assert_array_equal(first.score(x)[:4], first.score(x[:4]))
+    assert not np.array_equal(first.score(x), other.score(x))
+
+
+def test_regression_trees_get_the_seed():
+    nominal, (x,) = noise(60), noise(20, seed=1)
+    scores = []
+    for seed in (1, 1, 2):
+        detector = make("forecast:sklearn.tree.ExtraTreeRegressor", seed=seed)
+        detector.fit(nominal)
+        scores.append(detector.score(x))
+    np.testing.assert_array_equal(scores[0], scores[1])
+    assert not np.array_equal(scores[0][1:], scores[2][1:])
+
+
+# The contract
+
+
+@pytest.mark.parametrize(
+    ("name", "horizon"),
+    [
+        ("sklearn:OneClassSVM", 1),
+        ("pyod:KNN", 1),
+        ("forecast:sklearn.linear_model.Ridge", 1),
+        ("forecast:sklearn.linear_model.Ridge", 4),
+    ],
+)
+def test_adapters_honour_the_contract(name, horizon):
+    assert check_detector(offer(name).spec, horizon=horizon).ok
+
+
+def test_scores_before_fit_are_an_error():
+    with pytest.raises(NotFittedError, match="'pyod:KNN' was asked for scores before fit"):
+        make("pyod:KNN").score(noise(5)[0])
+
+
+def test_a_class_that_scores_something_else_than_rows_is_an_error():
+    detector = make("pyod:KNN")
+    methods = {"fit": lambda s, x: s, "decision_function": lambda s, x: np.zeros(3)}
+    detector.make = type("Odd", (), methods)
+    with pytest.raises(ContractError, match=r"'pyod:KNN' gave an array of shape \(3,\) for 16"):
+        detector.fit(noise(20))
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("sklearn:IsolationForest", "sklearn:IsolationForest"),
+        ("sklearn:ensemble.IsolationForest", "sklearn:IsolationForest"),
+        ("sklearn:neighbors.LocalOutlierFactor", "sklearn:LocalOutlierFactor"),
+        ("pyod:KNN", "pyod:KNN"),
+        ("forecast:sklearn.linear_model.Ridge", "forecast:sklearn.linear_model.Ridge"),
+    ],
+)
+def test_one_detector_has_one_name(given, name):
+    assert offer(given).spec.name == name
+
+
+def test_parameters_are_those_of_the_class_and_the_windows():
+    spec = offer("sklearn:LocalOutlierFactor").spec
+    assert spec.parameters["n_neighbors"] == 20
+    assert spec.parameters["window"] == 4
+    # What the adapter decides is not the user's to set.
+    assert "novelty" not in spec.parameters
+    assert "random_state" not in offer("pyod:IForest").spec.parameters
+    with pytest.raises(UnknownNameError, match="did you mean 'n_neighbors'"):
+        resolve_parameters(spec, {"neighbors": 3})
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("sklearn:OneClassSVM", "+scikit-learn."),
+        ("pyod:KNN", "+pyod."),
+        ("forecast:sklearn.linear_model.Ridge", "+scikit-learn."),
+    ],
+)
+def test_the_librarys_version_is_part_of_the_detectors(name, version):
+    assert version in offer(name).version
+
+
+def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
+    before = offer("forecast:their_models.Mean").version
+    theirs.write_text(THEIRS + "\n# changed\n")
+    from oodd_eval.provenance import source_digest
+
+    source_digest.cache_clear()
+    assert before.startswith("0.")
+    assert offer("forecast:their_models.Mean").version != before
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("pyod:iforest", UnknownNameError, "unknown detector of PyOD 'iforest': did you mean 'IFo"),
+        ("pyod:BaseDetector", UnknownNameError, "unknown detector of PyOD 'BaseDetector'"),
+        ("pyod:os.system", UnknownNameError, "unknown detector of PyOD 'os.system'"),
+        ("sklearn:IsolationForst", UnknownNameError, "did you mean 'IsolationForest'"),
+        ("sklearn:Ridge", UsageError, "'sklearn:Ridge' is neither an outlier detector nor"),
+        ("sklearn:linear_model.Ridge", UsageError, "is neither an outlier detector nor"),
+        ("sklearn:ensembl.IsolationForest", UnknownNameError, "did you mean 'ensemble'"),
+        ("forecast:Ridge", UsageError, "names no class: expected a module and a class in it"),
+        ("forecast:sklearn.linear.Ridge", UnknownNameError, "did you mean 'linear_model'"),
+        ("forecast:sklearn.linear_model.Rige", UnknownNameError, "did you mean 'Ridge'"),
+        ("forecast:sklearn.cluster.KMeans", UsageError, "is not a regressor"),
+        ("forecast:no_such_module.X", UsageError, "there is no module 'no_such_module'; install"),
+        ("forecast:os.such.X", UsageError, "there is no module 'os.such'"),
+        ("forecast:os.system", UsageError, "expected a class with the methods fit and predict"),
+        ("forecast:json.JSONDecoder", UsageError, "expected a class with the methods fit and pre"),
+        ("forecast:os;system", UsageError, "names no class"),
+    ],
+)
+def test_a_name_that_leads_nowhere_says_what_is_wrong(name, error, message):
+    with pytest.raises(error) as caught:
+        offer(name)
+    assert message in str(caught.value)
+
+
+def test_a_module_that_needs_another_one_says_which(theirs):
+    theirs.write_text("import nothing_like_this\n")
+    with pytest.raises(UsageError, match="their_models needs the module 'nothing_like_this'"):
+        offer("forecast:their_models.Mean")
+
+
+def test_a_value_that_a_class_needs_is_asked_for(theirs):
+    spec = offer("forecast:their_models.Needy").spec
+    with pytest.raises(UsageError, match=r"needs a value for order: give it as --param order="):
+        spec.factory(seed=0, horizon=1)
+    resolved = resolve_parameters(spec, {"order": 2, "scale": 1.0})
+    spec.factory(seed=0, horizon=1, **resolved)
+    with pytest.raises(UnknownNameError, match="did you mean 'order'"):
+        spec.factory(seed=0, horizon=1, oder=2)
+
+
+def test_a_class_that_takes_anything_gets_anything(theirs):
+    spec = offer("forecast:their_models.Open").spec
+    detector = spec.factory(seed=0, horizon=1, **resolve_parameters(spec, {"plus": 2.0}))
+    detector.fit(noise(20, sensors=2))
+    assert detector.predict_(np.zeros((1, 8))).tolist() == [[2.0, 2.0]]
+
+
+def test_signature_tells_plain_defaults_from_others():
+    class Thing:
+        def __init__(self, a, b=1, c=np.nan, *rest, d=None, e=print): ...
+
+    found = Signature.of(Thing)
+    assert (dict(found.plain), found.required, found.others) == (
+        {"b": 1, "d": None}, ("a",), ("c", "e"),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "helps"),
+    [
+        ("pyod:IForest", "pyod", 'needs pyod: pip install "oodd-eval[pyod]"'),
+        ("sklearn:IsolationForest", "sklearn", 'pip install "oodd-eval[reference]"'),
+        ("forecast:sklearn.linear_model.Ridge", "sklearn", 'pip install "oodd-eval[reference]"'),
+    ],
+)
+def test_without_its_library_a_detector_is_unavailable(monkeypatch, name, missing, helps):
+    monkeypatch.setitem(sys.modules, missing, None)
+    found = offer(name)
+    assert helps in found.unavailable()
+    assert resolve_parameters(found.spec, {"n_estimators": 3})["n_estimators"] == 3
+    with pytest.raises(MissingExtraError):
+        found.require()
+
+
+# The whole way
+
+
+def test_adapters_run_beside_other_detectors(tmp_path, tiny_split, capsys):
+    names = "persistence,sklearn:ensemble.IsolationForest,forecast:sklearn.linear_model.Ridge"
+    command = [
+        "run", "--detector", names, "--env", "cartpole", "--anomaly", "iid",
+        "--split", str(tiny_split), "--output", str(tmp_path), "--jobs", "1", "-q",
+    ]  # fmt: skip
+    assert main(command) == 0
+    records = ResultsDirectory(tmp_path).records()
+    assert [r.detector for r in records] == [
+        "persistence", "sklearn:IsolationForest", "forecast:sklearn.linear_model.Ridge",
+    ]  # fmt: skip
+    assert all(r.ok for r in records)
+    assert not [p.name for p in tmp_path.rglob("*") if ":" in p.name]
+    assert main([*command, "-k", "sklearn:isolationforest"]) == 0
+    assert main([*command, "-k", "pyod:"]) == 5
+    assert main(["show", str(tmp_path)]) == 0
+    assert "sklearn:IsolationForest" in capsys.readouterr().out
+
+
+def test_parameters_reach_the_class(tmp_path, tiny_split):
+    command = [
+        "run", "--detector", "pyod:KNN", "--env", "cartpole", "--anomaly", "iid", "-q",
+        "--split", str(tiny_split), "--output", str(tmp_path), "--jobs", "1",
+        "--param", "n_neighbors=3", "--param", "window=2",
+    ]  # fmt: skip
+    assert main(command) == 0
+    (record,) = ResultsDirectory(tmp_path).records()
+    assert record.parameters["n_neighbors"] == 3
+    assert record.cell.endswith("::pyod:KNN[h=1,seed=0,n_neighbors=3,window=2]")
+
+
+def test_adapters_see_the_anomalies_of_the_tiny_split(tiny_split):
+    data = load_split(tiny_split).environment("cartpole")
+    detector = make("forecast:sklearn.linear_model.Ridge")
+    detector.fit(list(data.train))
+    twin, changed = data.twins[0], data.anomalous("gravity")[0]
+    assert np.nanmean(detector.score(changed)) > 1.5 * np.nanmean(detector.score(twin))
