@@ -11,7 +11,7 @@ import io
 import json
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,14 @@ from oodd_eval.trajectory import Trajectory
 
 class ChannelClosedError(OoddError, EOFError):
     """The other side ended before the message was complete."""
+
+
+class ChannelGarbledError(OoddError, ValueError):
+    """What came is no message: somebody else wrote into the pipe."""
+
+
+LONGEST_FRAME: Final = 2**31
+"""Bytes of a frame, at most; a length beyond that was not written by a channel."""
 
 
 class Channel:
@@ -46,10 +54,22 @@ class Channel:
         self._send_frame(json.dumps(message, default=repr).encode())
 
     def receive(self) -> dict[str, Any]:
-        """Receive a JSON object."""
-        message = json.loads(self._receive_frame())
+        """Receive a JSON object.
+
+        Raises
+        ------
+        ChannelClosedError
+            When the other side has ended.
+        ChannelGarbledError
+            When something else comes.
+        """
+        frame = self._receive_frame()
+        try:
+            message = json.loads(frame)
+        except (ValueError, RecursionError) as error:
+            raise ChannelGarbledError(f"expected JSON over the pipe: {error}") from None
         if not isinstance(message, dict):
-            raise ChannelClosedError(f"expected a JSON object over the pipe, got {message!r:.80}")
+            raise ChannelGarbledError(f"expected a JSON object over the pipe, got {message!r:.80}")
         return message
 
     def send_array(self, array: NDArray[Any]) -> None:
@@ -59,8 +79,12 @@ class Channel:
         self._send_frame(buffer.getbuffer())
 
     def receive_array(self) -> NDArray[Any]:
-        """Receive an array."""
-        array: NDArray[Any] = np.load(io.BytesIO(self._receive_frame()), allow_pickle=False)
+        """Receive an array; raise as `receive` does."""
+        frame = self._receive_frame()
+        try:
+            array: NDArray[Any] = np.load(io.BytesIO(frame), allow_pickle=False)
+        except (ValueError, OSError, EOFError, MemoryError) as error:
+            raise ChannelGarbledError(f"expected an array over the pipe: {error}") from None
         return array
 
     def send_trajectory(self, trajectory: Trajectory) -> None:
@@ -82,7 +106,10 @@ class Channel:
                 rest = rest[os.write(self._writing, rest) :]
 
     def _receive_frame(self) -> bytes:
-        return self._receive_bytes(int.from_bytes(self._receive_bytes(8), "little"))
+        length = int.from_bytes(self._receive_bytes(8), "little")
+        if length > LONGEST_FRAME:
+            raise ChannelGarbledError(f"a message of {length} bytes was announced over the pipe")
+        return self._receive_bytes(length)
 
     def _receive_bytes(self, n: int) -> bytes:
         if self._reading is None:

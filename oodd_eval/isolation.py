@@ -6,39 +6,24 @@ the harness. POSIX only; the memory limit is watched through ``/proc`` (Linux).
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import islice
-from pathlib import Path
-from typing import IO, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
-from oodd_eval.channel import Channel, ChannelClosedError
-from oodd_eval.errors import ContractError
+from oodd_eval.channel import Channel, ChannelClosedError, ChannelGarbledError
+from oodd_eval.processes import Child
 from oodd_eval.trajectory import Trajectory
 
 CHUNK: Final = 64
 """Trajectories that a worker scores at once."""
 
 POLL_SECONDS: Final = 0.05
-LOG_BYTES: Final = 64_000
-
-_SINGLE_THREAD: Final = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "BLIS_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
-    "NUMEXPR_NUM_THREADS": "1",
-    "LOKY_MAX_CPU_COUNT": "1",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,39 +128,30 @@ def run_isolated(
     # Closed by the system when this process is killed, which ends the worker.
     lifeline, held = _pipe()
     for_worker = (to_worker, from_worker, lifeline)
-    process = subprocess.Popen(  # noqa: S603  our own interpreter and module
-        [sys.executable, "-P", "-m", "oodd_eval.worker", *map(str, for_worker)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        pass_fds=for_worker,
-        env=_environment(),
-        start_new_session=True,
-    )
-    for descriptor in for_worker:
-        os.close(descriptor)
+    child = Child("oodd_eval.worker", for_worker)
     outcome = Outcome()
-    log = _Tail(process.stdout)
     sender = _Sender(from_harness, request, train, score)
-    watch = _Watch(process, to_harness, limits, stop)
+    watch = _Watch(child, to_harness, limits, stop)
     died = silent = False
     try:
         _converse(Channel(to_harness, None, watch), outcome)
     except _Abort as abort:
         outcome.status, outcome.reason = abort.args
+    except (ChannelGarbledError, KeyError):
+        outcome.status = "error"
+        outcome.reason = "the detector wrote into the pipe between worker and harness"
     except ChannelClosedError:
         died = True
-        silent = not _wait_for_exit(process, seconds=5.0)
+        silent = not child.wait_for_exit(seconds=5.0)
     finally:
-        _kill_group(process)
+        outcome.log = child.end()
         os.close(to_harness)
         os.close(held)
         sender.join()
-        outcome.log = log.finish()
     if sender.error:
         raise sender.error
     if died:
-        outcome.status, outcome.reason = _death(process.returncode, outcome, silent=silent)
+        outcome.status, outcome.reason = _death(child, outcome, silent=silent)
     return outcome
 
 
@@ -203,17 +179,15 @@ def _converse(channel: Channel, outcome: Outcome) -> None:
 class _Watch:
     """Wait for the worker's next bytes, and give up when a limit is passed."""
 
-    def __init__(
-        self, process: subprocess.Popen[bytes], descriptor: int, limits: Limits, stop: Stop
-    ) -> None:
-        self._process, self._descriptor = process, descriptor
+    def __init__(self, child: Child, descriptor: int, limits: Limits, stop: Stop) -> None:
+        self._child, self._descriptor = child, descriptor
         self._limits, self._stop = limits, stop
         self._start = time.monotonic()
 
     def __call__(self) -> None:
         while not select.select([self._descriptor], [], [], POLL_SECONDS)[0]:
             self._check()
-            if _exited(self._process):
+            if self._child.exited:
                 # A grandchild may hold the pipe open, so that its end would never come.
                 if not select.select([self._descriptor], [], [], 0)[0]:
                     raise ChannelClosedError("the worker ended")
@@ -226,7 +200,7 @@ class _Watch:
         seconds, memory = self._limits.seconds, self._limits.memory
         if seconds is not None and time.monotonic() - self._start > seconds:
             raise _Abort("timeout", f"not done after {seconds:g} s (--timeout)")
-        if memory is not None and (used := _resident_bytes(self._process.pid)) > memory:
+        if memory is not None and (used := self._child.resident_bytes) > memory:
             raise _Abort(
                 "oom",
                 f"resident memory {used / 1e6:.0f} MB is over the limit of {memory / 1e6:.0f} MB "
@@ -273,28 +247,6 @@ class _Sender:
         self._thread.join()
 
 
-class _Tail:
-    """Read what the worker prints, and keep the end of it."""
-
-    def __init__(self, stream: IO[bytes] | None) -> None:
-        if stream is None:
-            raise ContractError("the worker was started without a pipe for its output")
-        self._stream, self._kept = stream, b""
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while part := os.read(self._stream.fileno(), 1 << 16):
-            self._kept = (self._kept + part)[-LOG_BYTES:]
-
-    def finish(self) -> str:
-        # A process that escaped the group could hold the pipe open for ever: do not wait for it.
-        self._thread.join(timeout=1.0)
-        if not self._thread.is_alive():
-            self._stream.close()
-        return self._kept.decode(errors="replace")
-
-
 def _pipe() -> tuple[int, int]:
     reading, writing = os.pipe()
     return reading, writing
@@ -306,50 +258,11 @@ def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
         yield chunk
 
 
-def _environment() -> dict[str, str]:
-    """Return the harness's environment with its import path, one thread and no restriction."""
-    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
-    kept = {k: v for k, v in os.environ.items() if k != "OODD_EVAL_PLUGINS"}
-    return {**kept, **_SINGLE_THREAD, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
-
-
-def _resident_bytes(pid: int) -> int:
-    try:
-        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
-    except (OSError, IndexError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")
-
-
-def _death(code: int, outcome: Outcome, *, silent: bool) -> tuple[str, str]:
+def _death(child: Child, outcome: Outcome, *, silent: bool) -> tuple[str, str]:
     """Say how a worker ended that did not say so itself."""
     doing = "fitting" if outcome.seconds_fit is None else "scoring"
     if silent:
         return "error", f"the worker closed its pipe while {doing}, without a result"
-    if code == -signal.SIGKILL:
+    if child.process.returncode == -signal.SIGKILL:
         return "oom", f"the system killed the worker while {doing} (most likely out of memory)"
-    if code < 0:
-        return "error", f"the worker was killed by {signal.Signals(-code).name} while {doing}"
-    return "error", f"the worker ended with exit code {code} while {doing}"
-
-
-def _exited(process: subprocess.Popen[bytes]) -> bool:
-    """Whether the worker has ended, without giving its id back: its group is still to be killed."""
-    state = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    return state is not None
-
-
-def _wait_for_exit(process: subprocess.Popen[bytes], *, seconds: float) -> bool:
-    deadline = time.monotonic() + seconds
-    while not _exited(process):
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(POLL_SECONDS / 10)
-    return True
-
-
-def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """End the worker and whatever it started; only then is the leader's id given back."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    return "error", f"the worker {child.death()} while {doing}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
@@ -67,7 +68,9 @@ class UnitJob:
             return Scored("unavailable", reason)
         if not fresh and (kept := self.stored(results)):
             return kept
-        order = _shuffled(counts, self.unit.seed)
+        # A worker knows its seed, but not the digest: it cannot draw the same order.
+        plan, unit = self.plan, self.unit
+        order = shuffled(counts, f"{plan.split_digest}|{unit.environment}|{unit.seed}")
 
         def isolated(*, load: str = "", save: str = "") -> Outcome:
             train = 0 if load else limited(len(self.data.train), self.plan.limit)
@@ -204,7 +207,11 @@ def limited(n: int, limit: int | None) -> int:
     return n if limit is None else min(n, limit)
 
 
-def _shuffled(counts: Mapping[str, int], seed: int) -> list[tuple[str, int]]:
-    """Return all trajectories to score in an order that tells nothing of their parts."""
+def shuffled(counts: Mapping[str, int], key: str) -> list[tuple[str, int]]:
+    """Return all trajectories to score, as part and number, in an order that a key decides.
+
+    Position tells nothing of the part, and the same key gives the same order anywhere.
+    """
     ordered = [(part, i) for part, n in counts.items() for i in range(n)]
+    seed = int.from_bytes(hashlib.sha256(key.encode()).digest())
     return [ordered[i] for i in np.random.default_rng(seed).permutation(len(ordered))]

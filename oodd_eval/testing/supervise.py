@@ -82,19 +82,19 @@ def _one_process(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]
         for name in request.checks:
             watch.begin()
             yield _result(channel.receive(), name)
-        return
     except _LimitPassedError as passed:
         ending = str(passed)
     except (ChannelClosedError, BrokenPipeError, ValueError):
-        if not child.wait_for_exit(seconds=1.0):
-            # A detector may have closed the pipe, or written into it.
-            ending = "broke off the conversation with the harness"
+        # A detector may have closed the pipe, or written into it.
+        gone = child.wait_for_exit(seconds=1.0)
+        ending = "" if gone else "broke off the conversation with the harness"
+    else:
+        return
     finally:
         log = child.end()
         os.close(to_here)
         os.close(from_here)
-    ending = ending or child.death()
-    yield Result(name, "failed", f"the process {ending}", watch.elapsed, log)
+    yield Result(name, "failed", f"the process {ending or child.death()}", watch.elapsed, log)
 
 
 class _LimitPassedError(Exception):
