@@ -48,18 +48,18 @@ def ranking(ranks: RankedBoard, trust: Mapping[Entry, str]) -> Table:
             detector(one),
             settings(one),
             one.inputs.replace("observations+actions", "+actions") or UNDEFINED,
+            trust.get(one.entry, UNDEFINED),
             _text(board, one, METRIC, intervals=True),
             *(_text(board, one, METRIC, group, intervals=True) for group in groups),
             _text(board, one, "auc"),
             _text(board, one, "auc_placebo"),
             _percent(one.wins),
-            trust.get(one.entry, UNDEFINED),
         ]
         for one in ranks.standings
     ]
-    header = ["rank", "ties", "detector", "settings", "inputs", TITLES[METRIC], *groups,
-              TITLES["auc"], TITLES["auc_placebo"], "win rate", "trust"]  # fmt: skip
-    return Table("Ranking by matched AUC (%)", header, rows, labels=5)
+    header = ["rank", "ties", "detector", "settings", "inputs", "trust", TITLES[METRIC], *groups,
+              TITLES["auc"], TITLES["auc_placebo"], "win rate"]  # fmt: skip
+    return Table("Ranking by matched AUC (%)", header, rows, labels=6)
 
 
 def alarms(ranks: RankedBoard) -> Table:
@@ -114,8 +114,8 @@ def notes(ranks: RankedBoard) -> list[str]:
     seeds = ranks.board.test_seeds()
     if seeds and seeds[0] < FEW and len(ranks.ranking.ranks) > 1:
         lines.append(
-            f"With {seeds[0]} test seeds per environment only large differences are significant: "
-            "rows that share a letter may well differ."
+            f"With {seeds[0]} test seeds per environment small differences stay hidden: rows that "
+            "share a letter may well differ."
         )
     return lines
 
