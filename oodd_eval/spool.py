@@ -24,7 +24,8 @@ class Spool(Sequence[Trajectory]):
     """What an iterable gave, written to a file without a name and read when asked for.
 
     Every access reads the trajectory again, so that only those that somebody holds are in memory.
-    The file lies in the system's temporary directory (``TMPDIR``) and goes away with the process.
+    The file lies in the system's temporary directory (``TMPDIR``) and goes away with the process
+    at the latest.
 
     Parameters
     ----------
@@ -62,6 +63,10 @@ class Spool(Sequence[Trajectory]):
         return Trajectory(
             self._matrix(place.start, place.observations), self._matrix(middle, place.actions)
         )
+
+    def close(self) -> None:
+        """Give the file back; nothing can be read any more."""
+        self._file.close()
 
     def _matrix(self, start: int, shape: tuple[int, int]) -> NDArray[np.float32]:
         # Reading at a place leaves alone the position that forked processes share.
