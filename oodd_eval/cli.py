@@ -17,7 +17,17 @@ from typing import Final
 
 from oodd_eval._version import __version__
 from oodd_eval.errors import OoddError, UnknownNameError
-from oodd_eval.options import Parser, check, choices, compare, data, leaderboard, policies, running
+from oodd_eval.options import (
+    Parser,
+    check,
+    choices,
+    compare,
+    data,
+    leaderboard,
+    new,
+    policies,
+    running,
+)
 
 EXIT_CODES: Final = """exit codes:
   0  ok
@@ -27,7 +37,7 @@ EXIT_CODES: Final = """exit codes:
   4  the request cannot be carried out: unknown name, missing data, no place to write
   5  nothing was selected or compared"""
 
-FAMILIES: Final = (running, check, compare, leaderboard, data, policies)
+FAMILIES: Final = (running, check, compare, leaderboard, data, policies, new)
 """Modules of options, in the order of the help."""
 
 

@@ -463,7 +463,7 @@ def test_adapters_run_beside_other_detectors(tmp_path, tiny_split, capsys):
     assert not [p.name for p in tmp_path.rglob("*") if ":" in p.name]
     assert main([*command, "-k", "sklearn:isolationforest"]) == 0
     assert main([*command, "-k", "pyod:"]) == 5
-    assert main(["show", str(tmp_path)]) == 0
+    assert main(["show", str(tmp_path), "--stored"]) == 0
     assert "sklearn:IsolationForest" in capsys.readouterr().out
 
 
