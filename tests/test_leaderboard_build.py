@@ -1,0 +1,466 @@
+"""The board: standings, golden page and tables, what is never mixed, ``leaderboard build``."""
+
+import csv
+import dataclasses
+import io
+import os
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_records import example, make_record
+
+from oodd_eval.cli import main
+from oodd_eval.commands import leaderboard_build
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics import METRICS, POOLED
+from oodd_eval.records import Metric
+from oodd_eval.report import csv_tables, ranking_tables
+from oodd_eval.report.leaderboard import sections
+from oodd_eval.report.leaderboard_page import page
+from oodd_eval.report.standings import cost_of, ranked
+from oodd_eval.report.tables import UNDEFINED
+from oodd_eval.submission.format import Entry, SubmittedEntry
+
+GOLDEN = Path(__file__).parent / "golden"
+SEEDS = 12
+
+
+def record(detector, matched, *, environment="hopper", anomaly="iid", **more):
+    """A record of twelve test seeds with all metrics a board may show."""
+    values = {name: [0.5] * SEEDS for name in METRICS}
+    values |= {"auc_matched": matched, "delay": [3.0] * (SEEDS - 1) + [None]}
+    one = make_record(detector, environment, anomaly, values=values, **more)
+    one = dataclasses.replace(one, counts={"test": SEEDS})
+    if not one.ok:
+        return one
+    far = ([1.0] * SEEDS, [100.0] * SEEDS)
+    per_trajectory = one.per_trajectory | {
+        "far_twin_at_1pct": far,
+        "missed_at_1pct": one.per_trajectory["missed"],
+        "delay_censored_at_1pct": one.per_trajectory["delay_censored"],
+    }
+    metrics = one.metrics | {name: Metric(0.5) for name in per_trajectory}
+    return dataclasses.replace(
+        one,
+        metrics=metrics | {name: Metric(0.75) for name in POOLED},
+        per_trajectory=per_trajectory,
+        seconds_fit=2.0,
+        seconds_score=0.5,
+        peak_rss_mb=100.0,
+        provenance=one.provenance | {"inputs": "observations", "steps_scored": 10_000},
+    )
+
+
+def board():
+    """Records of four detectors in two environments; rf fails in one of them."""
+    rng = np.random.default_rng(0)
+    records = []
+    for environment in ("ant", "hopper"):
+        episodes = rng.uniform(0, 0.2, size=SEEDS)
+        for detector, mean in (("riqn", 0.75), ("rf", 0.6), ("persistence", 0.55), ("clock", 0.5)):
+            for anomaly in ("iid", "gravity"):
+                failed = (detector, environment) == ("rf", "ant")
+                own = {"status": "timeout", "reason": "after 5 s | <b>"} if failed else {}
+                noise = 0.02 * rng.normal(size=SEEDS)
+                matched = np.full(SEEDS, 0.5) if detector == "clock" else mean + episodes + noise
+                records.append(
+                    record(detector, matched, environment=environment, anomaly=anomaly, **own)
+                )
+        # A second method that is as good as the first, at another horizon.
+        records += [
+            record("riqn", 0.75 + episodes + 0.02 * rng.normal(size=SEEDS),
+                   environment=environment, anomaly=anomaly, horizon=10)
+            for anomaly in ("iid", "gravity")
+        ]  # fmt: skip
+    return records
+
+
+def entry(name, records, **meta):
+    first = records[0]
+    given = {
+        "title": "An entry", "citation": "", "url": "", "trust": "reported", "caption": "",
+        "command": f"oodd-eval run --detector {name} --env all", "submitter": "Somebody",
+    }  # fmt: skip
+    about = Entry(
+        id=name, detectors=sorted({r.detector for r in records}), split=first.split,
+        split_digest=first.split_digest, protocol=first.protocol, created="2026-11-21",
+        plugins=[{"distribution": "oodd-eval", "plugin": "riqn", "version": "0.1.0",
+                  "source_digest": "0" * 64}],
+        environment={"python": "3.11.7", "platform": "Linux", "packages": {"numpy": "2.4.6"}},
+        **given | meta,
+    )  # fmt: skip
+    return SubmittedEntry(Path(name), about, records)
+
+
+def entries():
+    trivial = [r for r in board() if r.detector in ("clock", "persistence")]
+    others = [r for r in board() if r.detector in ("rf", "riqn")]
+    other_split = [
+        record(d, [v] * SEEDS, digest="cd" * 32) for d, v in (("riqn", 0.8), ("clock", 0.5))
+    ]
+    return [
+        entry("reference", others, caption="Reduced: one network | all sensors.",
+              citation="Danesh & Fern 2021", url="https://example.org/riqn"),
+        entry("trivial", trivial, trust="re-run", rerun={"by": "us", "how": "fresh seeds"}),
+        entry("other-split", other_split),
+    ]  # fmt: skip
+
+
+def write(root, submitted):
+    for one in submitted:
+        folder = root / one.meta.id
+        folder.mkdir(parents=True)
+        (folder / "entry.json").write_text(one.meta.to_json())
+        lines = "".join(r.to_json() + "\n" for r in one.records)
+        (folder / "records.jsonl").write_text(lines)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def small_site(monkeypatch):
+    """The site has tests of its own; here it is one file that names the entries."""
+
+    def render(given, output):
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "index.html").write_text(" ".join(e.meta.id for e in given))
+        return output / "index.html"
+
+    monkeypatch.setitem(sys.modules, "oodd_eval.site", types.SimpleNamespace(render=render))
+
+
+def lines_of(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def row(table, detector):
+    (found,) = [dict(zip(table.header, r, strict=True)) for r in table.rows if detector in r]
+    return found
+
+
+def built(tmp_path, submitted, name="out"):
+    results = write(tmp_path / f"results-{name}", submitted)
+    output = tmp_path / name
+    code = main(["leaderboard", "build", str(results), "--output", str(output)])
+    return code, results, output
+
+
+def files_below(output):
+    return {
+        p.relative_to(output).as_posix(): p.read_bytes() for p in output.rglob("*") if p.is_file()
+    }
+
+
+# Rendering
+
+
+def test_page_and_tables_are_the_golden_files():
+    found = sections(entries())
+    first = found[0]
+    rendered = {
+        "leaderboard.md": page(found, site="site/index.html"),
+        "leaderboard-ranking.csv": csv_tables.ranking(first.ranks, first.trust),
+        "leaderboard-comparisons.csv": csv_tables.comparisons(first.ranks),
+    }
+    for name, text in rendered.items():
+        file = GOLDEN / name
+        if "OODD_EVAL_WRITE_GOLDEN" in os.environ:
+            file.write_text(text, encoding="utf-8")
+        assert text == file.read_text(encoding="utf-8"), name
+
+
+def test_equals_share_a_rank_and_a_letter_and_the_better_stand_before_the_trivial():
+    table = ranking_tables.ranking(ranked(board()), {})
+    places = [(r[0], r[1], r[2], r[3]) for r in table.rows]
+    assert set(places[:2]) == {("1", "a", "riqn", "Δ=1"), ("1", "a", "riqn", "Δ=10")}
+    assert places[2:] == [
+        ("3", UNDEFINED, "persistence (trivial)", "Δ=1"),
+        ("4", UNDEFINED, "clock (trivial)", "Δ=1"),
+        (UNDEFINED, UNDEFINED, "rf", "Δ=1"),
+    ]
+
+
+def test_a_row_with_failures_is_listed_with_its_state_and_no_rank():
+    ranks = ranked(board())
+    assert row(ranking_tables.ranking(ranks, {}), "rf")["matched AUC"] == "timeout"
+    assert "Not ranked: rf, timeout in 2 of 4 cells." in ranking_tables.notes(ranks)
+    assert row(ranking_tables.ranking(ranks, {}), "rf")["win rate"] == UNDEFINED
+
+
+def test_a_row_without_all_cells_is_listed_with_how_many_it_lacks():
+    records = [r for r in board() if (r.horizon, r.environment, r.anomaly) != (10, "ant", "iid")]
+    ranks = ranked(records)
+    assert "Not ranked: riqn[h=10], 1 of 4 cells missing." in ranking_tables.notes(ranks)
+    assert [s.rank for s in ranks.standings if s.entry.horizon == 10] == [None]
+
+
+def test_a_row_that_is_undefined_somewhere_is_not_ranked():
+    ranks = ranked([record("riqn", [None] * SEEDS), record("clock", [0.5] * SEEDS)])
+    assert "Not ranked: riqn, undefined in 1 of 1 cells." in ranking_tables.notes(ranks)
+    assert ranks.ranking.ranks == {"clock": 1}
+
+
+def test_a_second_seed_that_lacks_cells_makes_a_row_incomplete():
+    extra = record("riqn", [0.7] * SEEDS, environment="ant", seed=1)
+    notes = ranking_tables.notes(ranked([*board(), extra]))
+    assert "Not ranked: riqn, 3 of 8 cells missing." in notes
+
+
+def test_boards_without_any_ranked_row_are_rendered():
+    failed = [make_record(status="error", reason="no"), make_record("rf", status="oom")]
+    text = page(sections([entry("all-failed", failed)]))
+    assert "Not ranked: riqn, error in 1 of 1 cells." in text
+    assert "Win rates" not in text
+
+
+def test_inputs_come_from_the_records_and_may_be_absent():
+    with_actions = [
+        dataclasses.replace(r, provenance=r.provenance | {"inputs": "observations+actions"})
+        for r in board() if r.horizon == 10
+    ]  # fmt: skip
+    without = [make_record("riqn", e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
+    tables = [ranking_tables.ranking(ranked(r), {}) for r in (with_actions, without)]
+    assert [t.rows[0][4] for t in tables] == ["+actions", UNDEFINED]
+
+
+def test_settings_name_horizon_overrides_and_number_of_seeds():
+    records = [
+        record("riqn", [0.7] * SEEDS, horizon=5, seed=s, overrides={"members": 1}) for s in (0, 1)
+    ]
+    (one,) = ranking_tables.ranking(ranked(records), {}).rows
+    assert one[3] == "Δ=5, members=1, 2 seeds"
+
+
+def test_win_rate_is_the_mean_over_the_other_rows():
+    cells = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid"), ("hopper", "gravity")]
+    values = {"a": [0.9, 0.9, 0.9, 0.6], "b": [0.8, 0.8, 0.8, 0.7], "c": [0.8, 0.1, 0.1, 0.1]}
+    records = [
+        record(name, [value] * SEEDS, environment=e, anomaly=x)
+        for name, column in values.items()
+        for (e, x), value in zip(cells, column, strict=True)
+    ]
+    ranks = ranked(records)
+    # a beats b in 3 of 4 and c in 4 of 4; b ties with c in one and beats it in three.
+    assert {s.entry.label: s.wins for s in ranks.standings} == {
+        "a": (3 / 4 + 1) / 2, "b": (1 / 4 + 7 / 8) / 2, "c": (0 + 1 / 8) / 2
+    }  # fmt: skip
+    table = ranking_tables.wins(ranks)
+    assert dict(zip(table.header, table.rows[1], strict=True)) == {
+        "detector": "b", "a": "25", "b": "", "c": "88"
+    }  # fmt: skip
+
+
+def test_cost_counts_a_fit_once_for_all_its_anomalies():
+    records = [
+        dataclasses.replace(
+            record("rf", [0.5] * SEEDS, environment=environment, anomaly=anomaly),
+            seconds_fit=fit, seconds_score=score, peak_rss_mb=peak,
+        )
+        for environment, fit, score, peak in (("ant", 1.0, 0.1, 50.0), ("hopper", 4.0, 0.3, 40.0))
+        for anomaly in ("iid", "gravity", "drift")
+    ]  # fmt: skip
+    cost = cost_of(records)
+    # 0.4 s for 20 000 steps.
+    assert (cost.fit, cost.peak) == (2.5, 50.0)
+    assert cost.step == pytest.approx(20.0)
+
+
+def test_unknown_cost_is_a_dash():
+    bare = ranking_tables.cost(ranked([make_record()]))
+    assert bare.rows[0][3:] == [UNDEFINED, UNDEFINED, UNDEFINED]
+
+
+def test_few_test_seeds_are_said_to_be_few():
+    assert any("With 12 test seeds" in line for line in ranking_tables.notes(ranked(board())))
+
+
+# What is mixed and what never
+
+
+def test_no_table_mixes_digests_protocols_or_limits():
+    one = record("riqn", [0.6] * SEEDS)
+    others = [
+        record("riqn", [0.7] * SEEDS, digest="cd" * 32),
+        dataclasses.replace(record("riqn", [0.8] * SEEDS), protocol=2),
+        record("riqn", [0.9] * SEEDS, limit=12),
+    ]
+    submitted = [entry(f"e{i}", [r]) for i, r in enumerate([one, *others])]
+    found = sections(submitted)
+    assert [len(s.ranks.board.records) for s in found] == [1, 1, 1, 1]
+    assert len({s.name for s in found}) == 4
+    text = page(found)
+    assert text.count("\n## Split") == 4
+    # The newest protocol first, limited ones last.
+    assert [s.entries[0].meta.id for s in found] == ["e2", "e0", "e1", "e3"]
+
+
+def test_the_standard_split_comes_first():
+    standard = dataclasses.replace(
+        record("riqn", [0.6] * SEEDS, digest="ef" * 32), split="standard"
+    )  # fmt: skip
+    found = sections([entry("mini", board()), entry("standard", [standard])])
+    assert [s.ranks.board.split for s in found] == ["standard", "mini"]
+
+
+def test_nothing_depends_on_the_order_of_entries_or_records():
+    turned = [
+        dataclasses.replace(e, records=list(reversed(e.records))) for e in reversed(entries())
+    ]
+    one, other = sections(entries()), sections(turned)
+    assert page(one) == page(other)
+    for a, b in zip(one, other, strict=True):
+        assert csv_tables.cells(a.ranks) == csv_tables.cells(b.ranks)
+        assert csv_tables.ranking(a.ranks, a.trust) == csv_tables.ranking(b.ranks, b.trust)
+
+
+def test_a_cell_in_two_entries_is_refused():
+    twice = [entry("first", board()), entry("second", board()[:1])]
+    with pytest.raises(ResultsError, match=r"'first' and 'second' both hold mini/ant/iid::riqn"):
+        sections(twice)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("plugin", "oodd-x:x"), ("detector_version", "2.0"), ("parameters", {"members": 9})],
+)
+def test_a_row_of_two_different_things_is_refused(field, value):
+    one = record("riqn", [0.5] * SEEDS)
+    other = dataclasses.replace(record("riqn", [0.5] * SEEDS, environment="ant"), **{field: value})
+    with pytest.raises(ResultsError, match=r"row 'riqn' .* in entry 'first' .* in entry 'second'"):
+        sections([entry("first", [one]), entry("second", [other])])
+
+
+def test_further_seeds_from_another_entry_join_their_row_with_the_lowest_trust():
+    first = entry("first", [record("riqn", [0.5] * SEEDS)], trust="re-run")
+    second = entry("second", [record("riqn", [0.7] * SEEDS, seed=1)], trust="re-scored")
+    (section,) = sections([first, second])
+    (standing,) = section.ranks.standings
+    assert standing.seeds == 2
+    assert section.trust == {standing.entry: "re-scored"}
+
+
+# Text of others
+
+
+def test_nothing_that_others_wrote_becomes_markup():
+    evil = "<script>x</script> | `a` \n# b [c](javascript:d)"
+    hostile = entry(
+        "hostile", [dataclasses.replace(record("riqn", [0.5] * SEEDS), detector=evil)],
+        title=evil, citation=evil, url="javascript:alert(1)", caption=evil, command=evil,
+        submitter=evil,
+    )  # fmt: skip
+    text = page(sections([hostile]))
+    shown = "\n".join(line for line in text.splitlines() if not line.startswith("    "))
+    assert "<script" not in shown.replace("\\<", "")
+    assert "[c]" not in shown.replace("\\[", "")
+    assert "\n# b" not in text
+    assert "<javascript" not in text
+    # A command stands in an indented block, on one line.
+    assert "\n    <script>x</script> | `a` # b [c](javascript:d)\n" in text
+
+
+# Numbers for machines
+
+
+def test_csv_of_cells_has_a_line_per_cell_with_stored_metrics():
+    (section, _) = sections(entries())
+    lines = lines_of(csv_tables.cells(section.ranks))
+    assert len(lines) == len(section.ranks.board.records) == 20
+    by_cell = {(r.detector, r.horizon, r.environment, r.anomaly): r for r in board()}
+    for line in lines:
+        one = by_cell[line["detector"], int(line["horizon"]), line["environment"], line["anomaly"]]
+        assert line["status"] == one.status
+        if one.ok:
+            assert float(line["auc_matched"]) == pytest.approx(one.value("auc_matched"), rel=1e-5)
+        else:
+            assert line["auc_matched"] == ""
+
+
+def test_csv_numbers_have_six_digits_and_no_rounding_noise():
+    assert [csv_tables.number(v) for v in (1 / 3, 123456.7, -1e-17, float("nan"))] == [
+        "0.333333", "123457", "0", ""
+    ]  # fmt: skip
+
+
+# The command
+
+
+def test_build_writes_page_tables_and_site(tmp_path, capsys):
+    code, _, output = built(tmp_path, entries())
+    assert code == 0
+    written = set(files_below(output))
+    assert {"README.md", "site/index.html"} < written
+    assert {n for n in written if n.startswith("tables/")} == {
+        f"tables/mini-{digest}-protocol1-{kind}.csv"
+        for digest in ("ab" * 6, "cd" * 6)
+        for kind in ("ranking", "cells", "comparisons")
+    }
+    assert set(capsys.readouterr().out.split()) == {str(output / name) for name in written}
+    text = (output / "README.md").read_text()
+    for name in (*written, "results"):
+        assert f"]({name})" in text or name == "README.md"
+
+
+def test_building_again_gives_the_same_bytes(tmp_path):
+    _, _, first = built(tmp_path, entries(), "first")
+    _, _, second = built(tmp_path, reversed(entries()), "second")
+    assert files_below(first) == files_below(second)
+
+
+def test_check_passes_on_what_was_built_and_writes_nothing(tmp_path, capsys):
+    _, results, output = built(tmp_path, entries())
+    before = files_below(output)
+    (output / "notes.txt").write_text("mine")
+    capsys.readouterr()
+    code = main(["leaderboard", "build", str(results), "--output", str(output), "--check"])
+    assert code == 0
+    assert "up to date" in capsys.readouterr().out
+    assert files_below(output) == before | {"notes.txt": b"mine"}
+
+
+def test_check_names_every_file_that_differs(tmp_path, capsys):
+    _, results, output = built(tmp_path, entries())
+    name = f"tables/mini-{'ab' * 6}-protocol1"
+    (output / f"{name}-ranking.csv").write_text("rank\n")
+    (output / f"{name}-cells.csv").unlink()
+    (output / "tables" / "old.csv").write_text("")
+    (output / "site" / "index.html").write_text("")
+    capsys.readouterr()
+    code = main(["leaderboard", "build", str(results), "--output", str(output), "--check"])
+    assert code == 1
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        "site/index.html: differs",
+        f"{name}-cells.csv: missing",
+        f"{name}-ranking.csv: differs",
+        "tables/old.csv: no part of the leaderboard any more",
+    ]
+    assert "run leaderboard build" in said.err
+    assert (output / f"{name}-ranking.csv").read_text() == "rank\n"
+
+
+def test_tables_that_are_no_longer_written_are_named(tmp_path, capsys):
+    _, results, output = built(tmp_path, entries())
+    (output / "tables" / "old.csv").write_text("")
+    assert main(["leaderboard", "build", str(results), "--output", str(output), "-q"]) == 0
+    assert "old.csv is no part of the leaderboard any more: delete it" in capsys.readouterr().err
+
+
+def test_without_entries_nothing_is_written(tmp_path, capsys):
+    (tmp_path / "none").mkdir()
+    output = tmp_path / "out"
+    assert main(["leaderboard", "build", str(tmp_path / "none"), "--output", str(output)]) == 5
+    assert "no entries" in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    results = write(tmp_path / "results", [entry("trivial", example())])
+    found = leaderboard_build.read_entries(results)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tables").write_text("")
+    with pytest.raises(OSError, match="cannot write the leaderboard into"):
+        leaderboard_build.build(found, tmp_path / "out")
