@@ -26,6 +26,7 @@ from oodd_eval.options import (
     leaderboard,
     new,
     policies,
+    reproduce,
     running,
 )
 
@@ -37,7 +38,7 @@ EXIT_CODES: Final = """exit codes:
   4  the request cannot be carried out: unknown name, missing data, no place to write
   5  nothing was selected or compared"""
 
-FAMILIES: Final = (running, check, compare, leaderboard, data, policies, new)
+FAMILIES: Final = (running, check, compare, leaderboard, data, policies, reproduce, new)
 """Modules of options, in the order of the help."""
 
 
