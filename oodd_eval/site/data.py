@@ -1,0 +1,217 @@
+"""What the site shows, as plain data for its page: boards, rows, cells, intervals, curves.
+
+Everything that is not simple arithmetic is computed here; the page filters, averages over cells,
+sorts and draws.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.curves_format import read_curves
+from oodd_eval.cusum import DRIFT, THRESHOLD
+from oodd_eval.metrics import HIGHER_IS_BETTER, METRICS
+from oodd_eval.records import Record
+from oodd_eval.report.leaderboard import LeaderboardSection, sections
+from oodd_eval.report.standings import Standing
+from oodd_eval.report.tables import PERCENT, TITLES
+from oodd_eval.site.selections import Cell, selection_intervals, selections
+from oodd_eval.submission.format import SubmittedEntry
+
+WITH_INTERVALS: Final = (
+    "auc_matched", "auc", "delay", "delay_censored", "missed", "far", "far_twin",
+    "delay_censored_at_1pct", "missed_at_1pct", "far_twin_at_1pct",
+)  # fmt: skip
+"""Metrics whose means have intervals on the site: those that comparisons are made with."""
+
+ENTRY_FIELDS: Final = (
+    "id", "title", "submitter", "trust", "created", "citation", "url", "caption", "command",
+)  # fmt: skip
+"""What the site says of an entry."""
+
+SUFFIXES: Final = {"": "", "at_1pct": " at 1 %", "at_01pct": " at 0.1 %"}
+
+_PAPER = Path(__file__).parents[1] / "paper" / "tables.json"
+
+Json = dict[str, Any]
+Units = Mapping[str, list[Json]]
+"""Curves of single cells by the id of their entry."""
+
+
+def site_data(entries: Sequence[SubmittedEntry]) -> tuple[Json, list[Json]]:
+    """Return the content of the site.
+
+    Parameters
+    ----------
+    entries
+        As read by `oodd_eval.submission.format.read_entries`.
+
+    Returns
+    -------
+    data
+        What the page needs at once.
+    curves
+        What it needs when a row is opened, by ``environment/anomaly``. A row names its place in
+        this list.
+
+    Raises
+    ------
+    ResultsError
+        When entries contradict one another, or curves cannot be read.
+    """
+    units = {
+        entry.meta.id: read_curves(entry.curves)["units"] for entry in entries if entry.curves
+    }
+    curves: list[Json] = []
+    shown = [_board(section, units, curves) for section in sections(entries)]
+    names = dict.fromkeys(name for board in shown for name in board["metrics"])
+    return {
+        "threshold": THRESHOLD,
+        "drift": DRIFT,
+        "metrics": {name: _metric(name) for name in names},
+        "environments": {
+            e.id: {"title": e.title, "family": e.family} for e in ENVIRONMENTS.values()
+        },
+        "anomalies": {
+            a.id: {"title": a.title, "group": a.group, "summary": a.summary}
+            for a in ANOMALIES.values()
+        },
+        "paper": json.loads(_PAPER.read_text(encoding="utf-8"))["table5_groups_delta1"],
+        "boards": shown,
+    }, curves
+
+
+def _metric(name: str) -> Json:
+    base, _, suffix = name.partition("_at_")
+    suffix = f"at_{suffix}" if suffix else ""
+    kind = "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate"
+    return {
+        "title": TITLES.get(base, base) + SUFFIXES[suffix],
+        "meaning": METRICS.get(base, "smallest threshold that meets the target"),
+        "kind": kind,
+        "higher": base in HIGHER_IS_BETTER,
+    }
+
+
+def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Json:
+    ranks, board = section.ranks, section.ranks.board
+    found = {name for r in board.records for name in r.metrics}
+    names = [
+        name
+        for suffix in SUFFIXES
+        for name in (f"{m}_{suffix}" if suffix else m for m in (*METRICS, "threshold"))
+        if name in found
+    ]
+    have = {(r.environment, r.anomaly) for r in board.records}
+    chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
+    return {
+        "id": section.name,
+        "split": board.split,
+        "digest": board.digest,
+        "protocol": board.protocol,
+        "limit": board.limit,
+        "tests": board.test_seeds(),
+        "environments": board.environments,
+        "anomalies": board.anomalies,
+        "metrics": names,
+        "intervals": [name for name in WITH_INTERVALS if name in names],
+        "rows": [_row(section, s, names, chosen, units, curves) for s in ranks.standings],
+        "comparisons": [
+            [c.first, c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
+            for c in ranks.ranking.comparisons
+        ],
+        "resamples": ranks.ranking.resamples,
+        "wins": [[one, other, _short(rate)] for (one, other), rate in ranks.rates.items()],
+    }
+
+
+def _row(
+    section: LeaderboardSection,
+    standing: Standing,
+    names: Sequence[str],
+    chosen: Mapping[str, Sequence[Cell]],
+    units: Units,
+    curves: list[Json],
+) -> Json:
+    row, records, cost = standing.entry, standing.records, standing.cost
+    sources = [source.meta for source in section.sources[row]]
+    own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
+    if own:
+        curves.append(own)
+    return {
+        "id": f"{section.name}/{row.label}",
+        "label": row.label,
+        "detector": row.detector,
+        "version": records[0].detector_version,
+        "plugin": records[0].plugin,
+        "horizon": row.horizon,
+        "parameters": records[0].parameters,
+        "overrides": json.loads(row.overrides),
+        "seeds": sorted({r.seed for r in records}),
+        "trivial": standing.trivial,
+        "inputs": standing.inputs,
+        "rank": standing.rank,
+        "ties": standing.ties,
+        "state": standing.state,
+        "wins": _short(standing.wins),
+        "cost": {name: _short(getattr(cost, name)) for name in ("fit", "step", "peak")},
+        "trust": section.trust[row],
+        "entries": [{name: getattr(meta, name) for name in ENTRY_FIELDS} for meta in sources],
+        "cells": [_cell(r, names) for r in records],
+        "intervals": _intervals(records, names, chosen),
+        "curves": len(curves) - 1 if own else None,
+    }
+
+
+def _cell(record: Record, names: Sequence[str]) -> Json:
+    """One record: its values, and interval and n of each, in the order of the board's metrics."""
+    plain: Json = {
+        "environment": record.environment,
+        "anomaly": record.anomaly,
+        "seed": record.seed,
+    }
+    if not record.ok:
+        return plain | {"status": record.status, "reason": record.reason}
+    metrics = [record.metrics.get(name) for name in names]
+    return plain | {
+        "values": [m and _short(m.value) for m in metrics],
+        "low": [m and _short(m.low) for m in metrics],
+        "high": [m and _short(m.high) for m in metrics],
+        "n": [m and m.n for m in metrics],
+    }
+
+
+def _intervals(
+    records: Sequence[Record], names: Sequence[str], chosen: Mapping[str, Sequence[Cell]]
+) -> Json:
+    found: Json = {}
+    for metric in WITH_INTERVALS:
+        if metric in names:
+            for key, (low, high) in selection_intervals(records, metric, chosen).items():
+                found.setdefault(key, {})[metric] = [_short(low), _short(high)]
+    return found
+
+
+def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
+    """Curves of a row's cells by ``environment/anomaly``, of the first seed that has them."""
+    cells = {r.cell for r in records}
+    found: Json = {}
+    for unit in units:
+        if unit["cell"] in cells:
+            shown = {name: unit[name] for name in ("seed", "roc", "delay_far", "example")}
+            found.setdefault(f"{unit['environment']}/{unit['anomaly']}", shown)
+    return found
+
+
+def _short(value: float | None) -> float | None:
+    """Round to five digits, finer than anything printed; None for what is undefined."""
+    if value is None or not math.isfinite(value):
+        return None
+    near = float(f"{value:.5g}")
+    return int(near) if near.is_integer() else near

@@ -1,0 +1,137 @@
+// What the columns of the main table are: one list for each of its views.
+
+const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
+
+/** A column of a metric's mean; `within` narrows the selection. */
+function metricColumn(board, metric, options = {}) {
+  const { title, kind, higher, meaning } = DATA.metrics[metric];
+  const unit = titleOfUnit[kind];
+  return {
+    key: options.key ?? metric,
+    title: options.title ?? title,
+    unit: kind === "rate" ? "" : unit,
+    hint: options.hint ?? meaning,
+    better: higher ? "higher" : "lower",
+    kind,
+    interval: options.interval ?? false,
+    of: (row, selection) => mean(board, row, metric, { ...selection, ...options.within }),
+  };
+}
+
+/** A column of a plain number of a row. */
+function plainColumn(key, title, unit, hint, of, options = {}) {
+  return { key, title, unit, hint, better: "lower", plain: true, of: (row) => ({ value: of(row), cells: 1 }), ...options };
+}
+
+function paperColumn(metric, title, unit, kind) {
+  const hint = "Digits of the paper's Table 5 for the same environments and groups";
+  return {
+    key: `paper_${metric}`, title, unit, hint, kind, better: metric === "auc" ? "higher" : "lower",
+    of: (row, selection) => ({ value: paperMean(row, metric, selection), cells: 1 }),
+    paper: true,
+  };
+}
+
+const RANK = plainColumn(
+  "rank", "Rank", "", "1 + the number of rows that are significantly better over all cells",
+  (row) => row.rank, { digits: 0 },
+);
+
+const LISTS = {
+  ranking: {
+    title: "Ranking",
+    columns(board, selection) {
+      const columns = [
+        { ...metricColumn(board, "auc_matched", { interval: true }), whisker: true },
+      ];
+      if (selection.group === "all" && selection.anomaly === "all") {
+        for (const group of Object.keys(GROUP_TITLES)) {
+          if (inGroup(board, group).length) {
+            columns.push(metricColumn(board, "auc_matched", {
+              key: `matched_${group}`, title: GROUP_TITLES[group], within: { group },
+              hint: `Matched AUC over ${group} anomalies`, interval: true,
+            }));
+          }
+        }
+      }
+      columns.push(
+        metricColumn(board, "auc"),
+        metricColumn(board, "auc_placebo"),
+        plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",
+          (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", digits: 0, fixed: true }),
+      );
+      return columns;
+    },
+  },
+  aucs: {
+    title: "AUCs",
+    columns: (board) => [
+      metricColumn(board, "auc_matched", { interval: true }),
+      metricColumn(board, "auc_placebo"),
+      metricColumn(board, "auc", { interval: true }),
+      paperColumn("auc", "Paper\u2019s AUC", "%", "percent"),
+      metricColumn(board, "auc_null"),
+      ...["auc_pooled", "average_precision", "fpr95"].map((m) => m in DATA.metrics && metricColumn(board, m)),
+    ],
+  },
+  alarms: {
+    title: "Alarms",
+    columns: (board) => [
+      metricColumn(board, "delay", { interval: true }),
+      metricColumn(board, "delay_null"),
+      metricColumn(board, "delay_censored", { interval: true }),
+      metricColumn(board, "missed", { interval: true }),
+      metricColumn(board, "far", { interval: true }),
+      metricColumn(board, "far_twin", { interval: true }),
+      paperColumn("delay", "Paper\u2019s delay", "steps", "steps"),
+      paperColumn("far", "Paper\u2019s FAR", "", "rate"),
+    ],
+  },
+  calibrated: {
+    title: "Calibrated alarms",
+    columns: (board) => ["at_1pct", "at_01pct"].flatMap((suffix) =>
+      ["delay_censored", "delay", "missed", "far_twin", "far"]
+        .map((m) => `${m}_${suffix}`)
+        .filter((m) => board.metrics.includes(m))
+        .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),
+    empty: "No record of this board has calibrated alarms: too few calibration steps.",
+  },
+  environments: {
+    title: "By environment",
+    columns: (board, selection) => [
+      metricColumn(board, "auc_matched"),
+      ...board.environments
+        .filter((e) => ["all", DATA.environments[e].family, e].includes(selection.environment))
+        .map((e) => metricColumn(board, "auc_matched", {
+          key: e, title: DATA.environments[e].title, within: { environment: e }, interval: true,
+          hint: `Matched AUC in ${DATA.environments[e].title}`,
+        })),
+    ],
+  },
+  anomalies: {
+    title: "By anomaly",
+    columns: (board, selection) => [
+      metricColumn(board, "auc_matched"),
+      ...inGroup(board, selection.group)
+        .filter((a) => ["all", a].includes(selection.anomaly))
+        .map((a) => metricColumn(board, "auc_matched", {
+          key: a, title: DATA.anomalies[a].title, within: { anomaly: a, group: "all" }, interval: true,
+          hint: `Matched AUC under ${DATA.anomalies[a].title}: ${DATA.anomalies[a].summary}`,
+        })),
+    ],
+  },
+  cost: {
+    title: "Cost",
+    columns: () => [
+      plainColumn("fit", "Fit", "s", "Mean seconds of a fit", (row) => row.cost.fit),
+      plainColumn("step", "Score", "\u00b5s per step", "Microseconds per scored step", (row) => row.cost.step),
+      plainColumn("peak", "Peak memory", "MB", "Largest resident memory of a fit", (row) => row.cost.peak),
+    ],
+  },
+};
+
+/** Columns of a view that this board has numbers for. */
+function columnsOf(board, state) {
+  const columns = LISTS[state.view].columns(board, state).filter(Boolean);
+  return columns.filter((c) => !c.paper || board.rows.some((row) => isNumber(c.of(row, state).value)));
+}

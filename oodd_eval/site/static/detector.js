@@ -1,0 +1,215 @@
+// The page of one row: facts, all cells, curves of the chosen cell, comparisons, the paper's digits.
+
+function detectorPage(board, row, chosen) {
+  const first = row.cells.find((c) => !c.status) ?? row.cells[0];
+  const cell = row.cells.find((c) => chosen && c.environment === chosen[0] && c.anomaly === chosen[1]) ?? first;
+  return [
+    element("p", { class: "back" }, element("a", { href: "#/" }, "\u2190 All detectors")),
+    element("h1", { tabindex: "-1" }, row.label, " ", badges(row)),
+    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${underLabel(row)}`),
+    summary(board, row),
+    section("Cells", "cells", heat(board, row, cell),
+      element("p", { class: "note" }, "Choose a cell to see its curves below.")),
+    section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell", cellPart(board, row, cell)),
+    comparisons(board, row),
+    paperPart(board, row),
+    section("All metrics", "metrics", metricsTable(board, row)),
+    section("Where it is from", "source", facts(row)),
+  ];
+}
+
+const section = (title, id, ...content) =>
+  element("section", { id, "aria-labelledby": `${id}-title` }, element("h2", { id: `${id}-title` }, title), content);
+
+function summary(board, row) {
+  const card = (title, value, under, hint) => element("div", { class: "card", title: hint },
+    element("dt", {}, title), element("dd", {}, value, element("span", { class: "under" }, under)));
+  const of = (metric) => mean(board, row, metric);
+  const text = (metric) => meanText(of(metric), DATA.metrics[metric].kind);
+  const interval = (metric) => {
+    const { low, high } = of(metric);
+    const { kind } = DATA.metrics[metric];
+    return isNumber(low) ? `95 % interval ${show(low, kind)} to ${show(high, kind)}` : "no interval";
+  };
+  return element("dl", { class: "cards" },
+    card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched?.meaning),
+    card("Rank", row.rank ?? UNDEFINED, row.rank ? `of ${board.rows.filter((r) => r.rank).length}, ties ${row.ties}` : row.state),
+    card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc?.meaning),
+    card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay?.meaning),
+    card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin?.meaning),
+    card("Cost", `${brief(row.cost.fit, 2)} s`, `per fit; ${brief(row.cost.step, 2)} \u00b5s per step, ${brief(row.cost.peak, 2)} MB`));
+}
+
+/** Mix two colours, `share` of the second. */
+const mixed = (a, b, share) => `rgb(${a.map((v, i) => Math.round(v + (b[i] - v) * share)).join(" ")})`;
+
+function colours(value) {
+  if (!isNumber(value)) return {};
+  const far = Math.min(1, Math.abs(value - 0.5) * 2);
+  const end = value >= 0.5 ? [14, 98, 116] : [178, 84, 24];
+  return { back: mixed([255, 255, 255], end, 0.9 * far), front: far > 0.55 ? "#fff" : "#1d2733" };
+}
+
+/** Matched AUC by environment and anomaly; every value is a link to its cell. */
+function heat(board, row, chosen) {
+  const cellAt = (e, a) => mean(board, row, "auc_matched", { environment: e, group: "all", anomaly: a });
+  const filled = (found, content, extra = {}) => {
+    const { back, front } = colours(found.value);
+    const node = element("td", extra, content);
+    if (back) Object.assign(node.style, { backgroundColor: back, color: front });
+    return node;
+  };
+  const text = (found) => meanText({ ...found, partial: false }, "percent") || "";
+  const tip = (found) => isNumber(found.low) ? `95 % interval ${show(found.low, "percent")} to ${show(found.high, "percent")}` : null;
+  const one = (e, a) => {
+    const found = cellAt(e, a);
+    if (!found.cells) return element("td", {});
+    const current = e === chosen.environment && a === chosen.anomaly;
+    const link = element("a", { href: address("detector", row.id, e, a), "aria-current": current ? "true" : null }, text(found));
+    return filled(found, link, { class: current ? "current" : null, title: tip(found) });
+  };
+  const total = (selection) => {
+    const found = mean(board, row, "auc_matched", { ...EVERYTHING, ...selection });
+    return filled(found, text(found), { class: "total", title: tip(found) });
+  };
+  const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
+  const ordered = groups.flatMap((g) => inGroup(board, g));
+  return element("div", { class: "scroll" }, element("table", { class: "heat" },
+    element("caption", {}, "Matched AUC (%): white is 50, chance; teal is better, orange is worse than chance"),
+    element("thead", {},
+      element("tr", {}, element("td", {}), groups.map((g) => element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
+      element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
+        ordered.map((a) => element("th", { scope: "col", title: DATA.anomalies[a].summary }, DATA.anomalies[a].title)),
+        element("th", { scope: "col" }, "Mean"))),
+    element("tbody", {},
+      board.environments.map((e) => element("tr", {}, element("th", { scope: "row" }, DATA.environments[e].title),
+        ordered.map((a) => one(e, a)), total({ environment: e }))),
+      element("tr", { class: "total" }, element("th", { scope: "row" }, "Mean"),
+        ordered.map((a) => total({ anomaly: a })), total({})))));
+}
+
+/** Numbers and drawings of one cell. */
+function cellPart(board, row, cell) {
+  const selection = { environment: cell.environment, group: "all", anomaly: cell.anomaly };
+  const of = (metric) => mean(board, row, metric, selection);
+  if (of("auc_matched").state) {
+    const failed = row.cells.find((c) => c.status && selects(selection, c));
+    return element("p", { class: "failure" }, element("strong", {}, failed.status), `: ${failed.reason}`);
+  }
+  const text = (metric) => {
+    const found = of(metric);
+    const { kind } = DATA.metrics[metric];
+    const unit = titleOfUnit[kind] === "%" ? "\u202f%" : kind === "steps" ? " steps" : "";
+    const interval = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
+    return show(found.value, kind) + unit + interval;
+  };
+  const sentence = element("p", {},
+    `${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}; delay ${text("delay")}, ` +
+    `against ${text("delay_null")} from false alarms alone; missed ${text("missed")}; ` +
+    `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`);
+  const curves = row.curves === null ? null : curvesOf(row)[`${cell.environment}/${cell.anomaly}`];
+  if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
+  const at = (metric) => of(metric).value;
+  const calibrated = board.metrics.includes("far_twin_at_1pct") ? [at("far_twin_at_1pct"), at("delay_censored_at_1pct")] : null;
+  const seed = row.seeds.length > 1 ? element("p", { class: "note" }, `Curves of detector seed ${curves.seed}; numbers are means over seeds.`) : null;
+  return [sentence, seed,
+    element("div", { class: "figures" }, rocFigure(curves.roc, at("auc_matched")), delayFigure(curves.delay_far, calibrated)),
+    trajectoryFigure(curves.example)];
+}
+
+const readCurves = new Map();
+
+/** Curves of a row, parsed when first asked for. */
+function curvesOf(row) {
+  if (!readCurves.has(row.curves)) {
+    readCurves.set(row.curves, JSON.parse(document.getElementById(`curves-${row.curves}`).textContent));
+  }
+  return readCurves.get(row.curves);
+}
+
+/** The row against every other ranked row. */
+function comparisons(board, row) {
+  const found = board.comparisons.filter(([first]) => first === row.label);
+  if (!found.length) return null;
+  const back = new Map(board.comparisons.filter(([, second]) => second === row.label).map((c) => [c[0], c]));
+  const wins = new Map(board.wins.filter(([first]) => first === row.label).map(([, other, rate]) => [other, rate]));
+  const links = new Map(board.rows.map((r) => [r.label, r.id]));
+  const verdict = (p, other) => p <= 0.05 ? "better" : back.get(other)?.[5] <= 0.05 ? "worse" : "not told apart";
+  return section("Against the others", "comparisons", element("div", { class: "scroll" }, element("table", { class: "plain" },
+    element("caption", {}, `Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
+    element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
+      element("th", { scope: "col", class: i ? null : "left" }, t)))),
+    element("tbody", {}, found.sort((a, b) => a[2] - b[2]).map(([, other, difference, low, high, p]) => element("tr", {},
+      element("th", { scope: "row" }, element("a", { href: address("detector", links.get(other)) }, other)),
+      element("td", {}, signed(difference)),
+      element("td", {}, `[${signed(low)}, ${signed(high)}]`),
+      element("td", { class: verdict(p, other).split(" ")[0] }, verdict(p, other)),
+      element("td", {}, isNumber(wins.get(other)) ? (100 * wins.get(other)).toFixed(0) : UNDEFINED)))))));
+}
+
+const signed = (share) => isNumber(share) ? `${share < 0 ? "\u2212" : "+"}${Math.abs(100 * share).toFixed(1)}` : UNDEFINED;
+
+/** Ours beside the digits of the paper's Table 5, where it has them. */
+function paperPart(board, row) {
+  if (paperMean(row, "auc") === null) return null;
+  const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
+  const columns = ["auc", "delay", "far"].flatMap((metric) => groups.map((group) => ({ metric, group })));
+  const numbers = (environment) => columns.flatMap(({ metric, group }) => {
+    const selection = { environment, group, anomaly: "all" };
+    const { kind } = DATA.metrics[metric];
+    return [element("td", {}, meanText(mean(board, row, metric, selection), kind)),
+      element("td", { class: "paper" }, show(paperMean(row, metric, selection), kind))];
+  });
+  return section("Beside the paper", "paper", element("div", { class: "scroll" }, element("table", { class: "plain" },
+    element("caption", {}, "Here, and in the paper\u2019s Table 5 (\u0394 = 1). Policies, split and alarm unit are not the paper\u2019s, so digits are not expected to agree."),
+    element("thead", {},
+      element("tr", {}, element("td", {}), columns.map(({ metric, group }) => element("th", { scope: "colgroup", colspan: 2 },
+        `${DATA.metrics[metric].title}, ${group}`))),
+      element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
+        columns.map(() => ["here", "paper"].map((t) => element("th", { scope: "col", class: t === "paper" ? "paper" : null }, t))))),
+    element("tbody", {}, [...board.environments, "all"].map((e) => element("tr", { class: e === "all" ? "total" : null },
+      element("th", { scope: "row" }, DATA.environments[e]?.title ?? "Mean"), numbers(e)))))));
+}
+
+function metricsTable(board, row) {
+  return element("div", { class: "scroll" }, element("table", { class: "plain" },
+    element("caption", {}, "Means over all cells"),
+    element("thead", {}, element("tr", {}, ["Metric", "Mean", "95 % interval", "Meaning"].map((t, i) =>
+      element("th", { scope: "col", class: i % 3 ? null : "left" }, t)))),
+    element("tbody", {}, board.metrics.map((metric) => {
+      const { title, kind, meaning } = DATA.metrics[metric];
+      const found = mean(board, row, metric);
+      const unit = kind === "rate" ? "" : ` (${titleOfUnit[kind]})`;
+      return element("tr", {}, element("th", { scope: "row" }, title + unit), element("td", {}, meanText(found, kind)),
+        element("td", {}, isNumber(found.low) ? `[${show(found.low, kind)}, ${show(found.high, kind)}]` : ""),
+        element("td", { class: "text" }, meaning));
+    }))));
+}
+
+/** What the entries say of themselves. Only http addresses become links. */
+function facts(row) {
+  const list = (known) => element("dl", { class: "facts" }, known.filter(([, value]) => value).map(([name, value]) =>
+    [element("dt", {}, name), element("dd", {}, value)]));
+  const text = (value) => typeof value === "string" ? value : JSON.stringify(value);
+  return [
+    list([
+      ["Plug-in", `${row.plugin} ${row.version}`],
+      ["Parameters", Object.entries(row.parameters).map(([name, value]) => `${name} = ${text(value)}`).join(", ")],
+      ["Seeds", row.seeds.join(", ")],
+    ]),
+    row.entries.map((entry) => [
+      element("h3", {}, entry.title || entry.id),
+      list([
+        ["Entry", entry.id],
+        ["Submitted by", entry.submitter],
+        ["Trust", `${entry.trust}: ${(TRUST[entry.trust] ?? "").toLowerCase()}`],
+        ["Date", entry.created],
+        ["Made by", element("code", {}, entry.command)],
+        ["Citation", entry.citation],
+        ["Address", /^https?:\/\//.test(entry.url)
+          ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],
+        ["Note", entry.caption],
+      ]),
+    ]),
+  ];
+}

@@ -1,0 +1,59 @@
+// The form above the main table. Every control changes `state` and draws the table again.
+
+function drawFilters() {
+  const board = DATA.boards.find((b) => b.id === state.board);
+  const environments = [
+    ["all", "All environments"],
+    ...["classic", "bullet"]
+      .filter((family) => board.environments.some((e) => DATA.environments[e].family === family))
+      .map((family) => [family, family === "classic" ? "Classic control" : "Bullet"]),
+    ...board.environments.map((e) => [e, DATA.environments[e].title]),
+  ];
+  const groups = [["all", "Both groups"], ...Object.entries(GROUP_TITLES).filter(([g]) => inGroup(board, g).length)];
+  const anomalies = [["all", "All anomalies"], ...inGroup(board, state.group).map((a) => [a, DATA.anomalies[a].title])];
+  const horizons = [...new Set(board.rows.map((row) => row.horizon))].sort((a, b) => a - b);
+  const inputs = [...new Set(board.rows.map((row) => row.inputs).filter(Boolean))].sort();
+  const views = Object.entries(LISTS).map(([name, list]) =>
+    element("label", {}, element("input", {
+      type: "radio", name: "view", value: name, checked: state.view === name, onchange: choose("view"),
+    }), element("span", {}, list.title)));
+  document.getElementById("filters").replaceChildren(
+    select("board", "Board", DATA.boards.map((b) => [b.id, boardTitle(b)])),
+    select("environment", "Environment", environments),
+    select("group", "Group", groups),
+    select("anomaly", "Anomaly", anomalies),
+    select("horizon", "Horizon", [["all", "All horizons"], ...horizons.map((h) => [String(h), `\u0394 = ${h}`])]),
+    select("inputs", "Inputs", [["all", "All inputs"], ...inputs.map((i) => [i, i.replace("+", " + ")])]),
+    element("label", { class: "check" }, element("input", {
+      type: "checkbox", name: "trivial", checked: state.trivial,
+      onchange: (event) => { state.trivial = event.target.checked; drawTable(); },
+    }), " trivial rows"),
+    element("fieldset", { class: "views" }, element("legend", {}, "Columns"), views),
+  );
+}
+
+function boardTitle(board) {
+  const limit = board.limit === null ? "" : `, first ${board.limit}`;
+  return `${board.split} (${board.digest.slice(0, 8)}), protocol ${board.protocol}${limit}`;
+}
+
+function select(name, label, options) {
+  if (!options.some(([value]) => value === state[name])) state[name] = options[0][0];
+  return element("label", {}, element("span", {}, label),
+    element("select", { name, onchange: choose(name) },
+      options.map(([value, text]) => element("option", { value, selected: value === state[name] }, text))));
+}
+
+/** A listener that stores a control's value and draws what depends on it. */
+function choose(name) {
+  return (event) => {
+    state[name] = event.target.value;
+    if (name === "group") state.anomaly = "all";
+    if (name === "view") Object.assign(state, { sort: "", ascending: false });
+    if (name === "board" || name === "group") {
+      drawFilters();
+      document.querySelector(`#filters [name="${name}"]`).focus();
+    }
+    drawTable();
+  };
+}

@@ -1,0 +1,193 @@
+// Drawings of one cell: ROC curve, delay against false-alarm rate, one trajectory with its twin.
+
+const TWIN = "twin";
+const ANOMALOUS = "anomalous";
+const NULL = "null";
+
+/** A scale from numbers to positions; `bend` makes it other than linear. */
+function scale([from, to], [start, stop], bend = (v) => v) {
+  const [low, high] = [bend(from), bend(to)];
+  return (value) => start + ((bend(value) - low) / (high - low || 1)) * (stop - start);
+}
+
+/** About `n` round numbers between two. */
+function ticks(from, to, n = 5) {
+  const rough = (to - from) / n || 1;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * ([1, 2, 5].find((m) => m * power >= rough) ?? 10);
+  const found = [];
+  for (let t = Math.ceil(from / step - 1e-9) * step; t <= to + 1e-9 * step; t += step) found.push(Number(t.toPrecision(12)));
+  return found;
+}
+
+/** Linear up to about `unit`, logarithmic beyond: for numbers with a few very large among them. */
+const bent = (unit) => (value) => Math.asinh(value / unit);
+
+/** 0 and powers of ten times a unit, on both sides, within a range; not more than can be read. */
+function bentTicks(unit, from, to) {
+  const positive = [];
+  for (let t = unit; t <= Math.max(to, -from); t *= 10) positive.push(t);
+  const every = Math.ceil(positive.length / 5);
+  const kept = positive.filter((_, i) => i % every === 0);
+  return [...kept.map((t) => -t).reverse(), 0, ...kept].filter((t) => t >= from && t <= to);
+}
+
+/** An empty chart with axes: `x` and `y` are {range, ticks, label, bend}. */
+function chart(name, x, y, options = {}) {
+  const { width = 440, height = 300, left = 58, right = 14, top = 12, bottom = 44 } = options;
+  const sx = scale(x.range, [left, width - right], x.bend);
+  const sy = scale(y.range, [height - bottom, top], y.bend);
+  const drawing = shape("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": name, class: options.class },
+    shape("g", { class: "grid" },
+      x.ticks.map((t) => shape("line", { x1: sx(t), x2: sx(t), y1: top, y2: height - bottom })),
+      y.ticks.map((t) => shape("line", { x1: left, x2: width - right, y1: sy(t), y2: sy(t) }))),
+    shape("g", { class: "axis" },
+      x.ticks.map((t) => shape("text", { x: sx(t), y: height - bottom + 16, "text-anchor": "middle" }, brief(t))),
+      y.ticks.map((t) => shape("text", { x: left - 7, y: sy(t) + 4, "text-anchor": "end" }, brief(t))),
+      shape("text", { class: "label", x: (left + width - right) / 2, y: height - 6, "text-anchor": "middle" }, x.label),
+      shape("text", {
+        class: "label", "text-anchor": "middle",
+        transform: `translate(14 ${(top + height - bottom) / 2}) rotate(-90)`,
+      }, y.label)));
+  return { drawing, sx, sy, left, right: width - right, top, bottom: height - bottom };
+}
+
+/** A line through points; null breaks it. */
+function line(plot, xs, ys, kind) {
+  let path = "";
+  let open = false;
+  ys.forEach((y, i) => {
+    if (!isNumber(y)) { open = false; return; }
+    path += `${open ? "L" : "M"}${plot.sx(xs[i]).toFixed(1)} ${plot.sy(y).toFixed(1)}`;
+    open = true;
+  });
+  return shape("path", { class: `line ${kind}`, d: path });
+}
+
+/** A figure: drawings, legend, caption, and the numbers behind them. */
+function figure(drawings, legend, caption, numbers) {
+  return element("figure", {},
+    element("div", { class: "scroll" }, drawings),
+    legend.length ? element("ul", { class: "legend" }, legend.map(([kind, text]) => element("li", {},
+      shape("svg", { width: 26, height: 10, viewBox: "0 0 26 10", "aria-hidden": "true" },
+        kind === "point" || kind === "calibrated"
+          ? shape("circle", { class: kind, cx: 13, cy: 5, r: 4 })
+          : shape("line", { class: `line ${kind}`, x1: 1, x2: 25, y1: 5, y2: 5 })), text))) : null,
+    element("figcaption", {}, caption),
+    numbers && element("details", {}, element("summary", {}, "Numbers"), element("div", { class: "scroll" }, numbers())));
+}
+
+function numbersTable(columns) {
+  const names = Object.keys(columns);
+  return element("table", { class: "numbers" },
+    element("thead", {}, element("tr", {}, names.map((n) => element("th", { scope: "col" }, n)))),
+    element("tbody", {}, columns[names[0]].map((_, i) => element("tr", {}, names.map((n) => element("td", {}, brief(columns[n][i])))))));
+}
+
+function rocFigure(roc, area) {
+  if (!roc.fpr.length) return element("p", { class: "note" }, "No ROC curve: no trajectory has scores of both classes.");
+  const unit = { range: [0, 1], ticks: [0, 0.2, 0.4, 0.6, 0.8, 1] };
+  const plot = chart("ROC curve", { ...unit, label: "false-positive rate" }, { ...unit, label: "true-positive rate" },
+    { width: 340, height: 320 });
+  plot.drawing.append(
+    line(plot, [0, 1], [0, 1], NULL),
+    line(plot, [0, ...roc.fpr], [0, ...roc.tpr], ANOMALOUS));
+  return figure([plot.drawing], [[ANOMALOUS, `this detector (matched AUC ${show(area, "percent")} %)`], [NULL, "no better than chance (50 %)"]],
+    "Scores from the onset on against the nominal twin\u2019s at the same times, averaged over test trajectories at equal false-positive rates.",
+    () => numbersTable({ "false-positive rate": roc.fpr, "true-positive rate": roc.tpr }));
+}
+
+/** False-alarm rates run from 0 to a few tenths; a square root gives the small ones room. */
+function farAxis(far) {
+  const top = Math.max(0.01, ...far) * 1.02;
+  const marks = [0, 0.001, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.8].filter((t) => t <= top);
+  return { range: [0, top], ticks: marks, label: "achieved false-alarm rate on nominal twins (alarms per step)", bend: Math.sqrt };
+}
+
+function delayFigure(points, calibrated) {
+  if (!points.far.length) return element("p", { class: "note" }, "No curve: no score of the twins is defined.");
+  const x = farAxis(points.far);
+  const high = Math.max(1, ...points.delay_censored, ...points.null_censored) * 1.05;
+  const plot = chart("Delay against false-alarm rate", x, { range: [0, high], ticks: ticks(0, high), label: "delay (steps)" }, { height: 230, bottom: 28 });
+  plot.drawing.querySelectorAll(".label")[0].remove();
+  plot.drawing.append(
+    line(plot, points.far, points.null_censored, TWIN),
+    line(plot, points.far, points.delay_censored, ANOMALOUS));
+  const missed = chart("Missed trajectories against false-alarm rate", x, { range: [0, 1], ticks: [0, 0.5, 1], label: "missed" }, { height: 122 });
+  missed.drawing.append(line(missed, points.far, points.missed, ANOMALOUS));
+  const legend = [[ANOMALOUS, "anomalous trajectories"], [TWIN, "nominal twins: what false alarms alone give"]];
+  const at = points.threshold.indexOf(DATA.threshold);
+  if (at >= 0) {
+    plot.drawing.append(shape("circle", { class: "point", cx: plot.sx(points.far[at]), cy: plot.sy(points.delay_censored[at]), r: 4.5 }));
+    missed.drawing.append(shape("circle", { class: "point", cx: missed.sx(points.far[at]), cy: missed.sy(points.missed[at]), r: 4.5 }));
+    legend.push(["point", `the paper\u2019s threshold, ${DATA.threshold}`]);
+  }
+  if (calibrated && calibrated.every(isNumber) && calibrated[0] <= x.range[1] && calibrated[1] <= high) {
+    plot.drawing.append(shape("circle", { class: "calibrated", cx: plot.sx(calibrated[0]), cy: plot.sy(calibrated[1]), r: 4.5 }));
+    legend.push(["calibrated", "threshold calibrated to a false-alarm rate of 1 %"]);
+  }
+  return figure([plot.drawing, missed.drawing], legend,
+    "Mean delay from the onset to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. Left is stricter: fewer false alarms, longer delay.",
+    () => numbersTable({
+      "threshold": points.threshold, "false-alarm rate": points.far, "delay (steps)": points.delay_censored,
+      "missed": points.missed, "twins\u2019 delay (steps)": points.null_censored,
+    }));
+}
+
+/** A vertical axis over some numbers: linear, or bent where a few are very large. */
+function axisOf(values, unit, label) {
+  const numbers = values.filter(isNumber);
+  const low = Math.min(0, ...numbers);
+  const high = Math.max(unit, ...numbers);
+  const sizes = numbers.map(Math.abs).sort((a, b) => a - b);
+  const typical = Math.max(unit, sizes[Math.floor(sizes.length / 2)] ?? 0);
+  if (Math.max(high, -low) > 30 * typical) {
+    return { range: [low * 1.1, high * 1.1], ticks: bentTicks(unit, low * 1.1, high * 1.1), label, bend: bent(unit) };
+  }
+  const room = 0.05 * (high - low);
+  const range = [low < 0 ? low - room : 0, high + room];
+  return { range, ticks: ticks(...range, 4), label };
+}
+
+function trajectoryFigure(example) {
+  const rows = (list) => list.map((_, i) => example.start + i);
+  const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
+  const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
+  const wide = { width: 920, height: 210, class: "wide" };
+  const onset = (plot, text) => shape("g", { class: "onset" },
+    shape("line", { x1: plot.sx(example.onset), x2: plot.sx(example.onset), y1: plot.top, y2: plot.bottom }),
+    text && shape("text", { x: plot.sx(example.onset) + 5, y: plot.top + 11 }, `onset \u03c4 = ${example.onset}`));
+
+  const scores = chart("Scores", x, axisOf([...example.scores, ...example.twin], 1, "score (s.d.)"), { ...wide, bottom: 26 });
+  scores.drawing.querySelectorAll(".label")[0].remove();
+  scores.drawing.append(onset(scores, true),
+    line(scores, rows(example.twin), example.twin, TWIN),
+    line(scores, rows(example.scores), example.scores, ANOMALOUS));
+
+  const statistics = [...example.cusum, ...example.twin_cusum];
+  const cusum = chart("CUSUM statistic and alarms", x, axisOf(statistics, DATA.threshold, "CUSUM"), { ...wide, height: 250, bottom: 84 });
+  cusum.drawing.append(onset(cusum, false),
+    shape("line", { class: "threshold", x1: cusum.left, x2: cusum.right, y1: cusum.sy(DATA.threshold), y2: cusum.sy(DATA.threshold) }),
+    line(cusum, rows(example.twin_cusum), example.twin_cusum, TWIN),
+    line(cusum, rows(example.cusum), example.cusum, ANOMALOUS),
+    alarmStrip(cusum, example.alarms, ANOMALOUS, 26), alarmStrip(cusum, example.twin_alarms, TWIN, 40));
+
+  const first = (alarms) => {
+    const found = alarms.find((t) => t >= example.onset);
+    return found === undefined ? "none in this window" : `${found - example.onset} steps after the onset`;
+  };
+  const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;
+  return figure([scores.drawing, cusum.drawing],
+    [[ANOMALOUS, "anomalous trajectory"], [TWIN, "its nominal twin"], ["threshold", `alarm threshold ${DATA.threshold}`]],
+    `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
+    "Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift 0.0018, before the reset that an alarm brings; marks below it are alarms. " +
+    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}. Axes with very large values are logarithmic beyond one unit.`);
+}
+
+/** Marks below a chart, one for each alarm. */
+function alarmStrip(plot, alarms, kind, below) {
+  const y = plot.bottom + below;
+  return shape("g", { class: `alarms ${kind}` },
+    shape("text", { x: plot.left - 7, y: y + 8, "text-anchor": "end" }, kind === TWIN ? "twin" : "alarms"),
+    alarms.map((t) => shape("line", { x1: plot.sx(t), x2: plot.sx(t), y1: y, y2: y + 9 })));
+}

@@ -1,0 +1,170 @@
+"""Headless Chromium through its own driver: the W3C WebDriver protocol over HTTP, nothing else."""
+
+import base64
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+
+FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--disable-extensions",
+    "--disable-dev-shm-usage", "--force-prefers-reduced-motion",
+]  # fmt: skip
+
+KEYS = {"tab": "\ue004", "enter": "\ue007", "space": " ", "down": "\ue015", "right": "\ue014",
+        "shift": "\ue008"}  # fmt: skip
+
+_ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
+
+
+def programs():
+    """Paths of the browser and its driver; None where one is missing."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    browser = browser or shutil.which("google-chrome")
+    return (browser, driver) if browser and (driver := shutil.which("chromedriver")) else None
+
+
+class Browser:
+    """One browser window. Every method waits for what it asks for."""
+
+    def __init__(self, address):
+        self._address = address
+        self._session = ""
+
+    def open_session(self, browser, profile, size):
+        capabilities = {
+            "browserName": "chrome",
+            "goog:chromeOptions": {
+                "binary": browser,
+                "args": [*FLAGS, f"--user-data-dir={profile}", f"--window-size={size}"],
+            },
+            "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
+        }
+        found = self._call("POST", "/session", {"capabilities": {"alwaysMatch": capabilities}})
+        self._session = f"/session/{found['sessionId']}"
+
+    def close(self):
+        self._call("DELETE", self._session)
+
+    def open(self, url):
+        self._call("POST", f"{self._session}/url", {"url": url})
+
+    def run(self, script, *arguments):
+        """Run the body of a function in the page and return what it returns."""
+        body = {"script": script, "args": list(arguments)}
+        return self._call("POST", f"{self._session}/execute/sync", body)
+
+    def texts(self, selector):
+        """Visible texts of all elements that match."""
+        return self.run(
+            "return [...document.querySelectorAll(arguments[0])].map((e) => e.innerText.trim())",
+            selector,
+        )
+
+    def text(self, selector):
+        (found,) = self.texts(selector)
+        return found
+
+    def click(self, selector):
+        element = self._find(selector)
+        self._call("POST", f"{self._session}/element/{element}/click", {})
+
+    def choose(self, name, text):
+        """Choose an option of a select element, as a person does who types its first letters."""
+        script = """
+            const select = document.querySelector(`select[name="${arguments[0]}"]`);
+            const option = [...select.options].find((o) => o.text === arguments[1]);
+            if (!option) throw new Error(`no option ${arguments[1]}`);
+            select.value = option.value;
+            select.dispatchEvent(new Event("change", { bubbles: true }));
+        """
+        self.run(script, name, text)
+
+    def press(self, *names):
+        """Press keys one after the other on whatever has the focus."""
+        actions = [
+            {"type": kind, "value": KEYS[name]} for name in names for kind in ("keyDown", "keyUp")
+        ]
+        body = {"actions": [{"type": "key", "id": "keyboard", "actions": actions}]}
+        self._call("POST", f"{self._session}/actions", body)
+
+    def resize(self, width, height):
+        body = {"width": width, "height": height}
+        self._call("POST", f"{self._session}/window/rect", body)
+
+    def console(self):
+        """Messages of the console since the last call."""
+        return [m["message"] for m in self._log("browser")]
+
+    def requests(self):
+        """Addresses that the page asked for since the last call."""
+        events = [json.loads(entry["message"])["message"] for entry in self._log("performance")]
+        return [
+            e["params"]["request"]["url"]
+            for e in events
+            if e["method"] == "Network.requestWillBeSent"
+        ]
+
+    def screenshot(self, path):
+        path.write_bytes(base64.b64decode(self._call("GET", f"{self._session}/screenshot")))
+
+    def _log(self, kind):
+        return self._call("POST", f"{self._session}/se/log", {"type": kind})
+
+    def _find(self, selector):
+        body = {"using": "css selector", "value": selector}
+        return self._call("POST", f"{self._session}/element", body)[_ELEMENT]
+
+    def _call(self, method, path, body=None):
+        data = json.dumps(body).encode() if body is not None else None
+        request = urllib.request.Request(  # noqa: S310  the driver's own address
+            self._address + path, data, {"Content-Type": "application/json"}, method=method
+        )
+        # The driver is on this machine, whatever proxy the environment names.
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        try:
+            with opener.open(request, timeout=60) as answer:
+                return json.loads(answer.read())["value"]
+        except urllib.error.HTTPError as error:
+            with error:
+                raise RuntimeError(json.loads(error.read())["value"]["message"]) from None
+
+
+@contextlib.contextmanager
+def launch(directory, size="1280,1000"):
+    """Start driver and browser with a profile in `directory`, and end both afterwards."""
+    browser, program = programs()
+    directory = Path(directory)
+    log = directory / "driver.log"
+    driver = subprocess.Popen(
+        [program, "--port=0", f"--log-path={log}"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "HOME": str(directory)},
+    )
+    try:
+        port = _port(driver)
+        window = Browser(f"http://127.0.0.1:{port}")
+        window.open_session(browser, directory / "profile", size)
+        try:
+            yield window
+        finally:
+            window.close()
+    finally:
+        driver.terminate()
+        driver.wait(timeout=20)
+        driver.stdout.close()
+
+
+def _port(driver):
+    """The port that the driver says it has chosen."""
+    until = time.monotonic() + 30
+    while time.monotonic() < until and (line := driver.stdout.readline()):
+        if "started successfully on port" in line:
+            return int(line.rstrip().rstrip(".").rpartition(" ")[2])
+    raise RuntimeError("the driver did not start")
