@@ -5,6 +5,7 @@ The layout is that of the schema of Jenkins' xUnit plug-in, ``junit-10.xsd``.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from typing import Final
@@ -53,7 +54,10 @@ def _case(suite: ET.Element, d: Difference) -> None:
 
 def message(d: Difference) -> str:
     """Return one line about a difference: figures, change, tolerance and what it means."""
-    figures = f"{d.metric} {d.verdict}: reference {d.reference:.6g}, now {d.now:.6g}, {change(d)}"
+    reference, now = (
+        "undefined" if math.isnan(v) else f"{v:.6g}" for v in (d.reference, d.now)
+    )  # fmt: skip
+    figures = f"{d.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
     return f"{figures}, tolerance {d.tolerance.text}"
 
 

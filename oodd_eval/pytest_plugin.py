@@ -1,0 +1,50 @@
+"""pytest plug-in: a detector's regression check among the tests of its own repository.
+
+::
+
+    pytest --oodd-detector mine --oodd-reference reference.json
+
+adds one test per cell. Without ``--oodd-detector`` nothing happens: pytest loads this module in
+every environment in which oodd-eval is installed, so it imports nothing of the harness until asked.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import pytest
+
+_OTHERS: Final = ("reference", "env", "fail", "two_sided", "output")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup("oodd-eval", "regression check of detectors (oodd-eval)")
+    add = group.addoption
+    add("--oodd-detector", metavar="NAMES",
+        help="add a test per cell of these installed detectors: comma lists or globs")  # fmt: skip
+    add("--oodd-reference", metavar="FILE",
+        help="what the figures must come up to, written by oodd-eval compare --write-reference; "
+             "without it a test passes when its cell does not fail")  # fmt: skip
+    add("--oodd-split", default="mini", metavar="NAME", help="split (default: mini)")
+    add("--oodd-env", metavar="NAMES",
+        help="environments (default: those of the reference, or all)")  # fmt: skip
+    add("--oodd-fail", action="append", default=[], metavar="METRIC:[+-]NUMBER[%]",
+        help="fail when the metric changed by more in the direction of the sign, such as "
+             "auc:-0.01 (default: when any metric is worse at all)")  # fmt: skip
+    add("--oodd-two-sided", action="store_true",
+        help="fail for improvements beyond the tolerance, too")  # fmt: skip
+    add("--oodd-output", metavar="DIR", help="results directory to keep and to resume from")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin, if asked."""
+    if config.getoption("oodd_detector"):
+        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415  only now the harness is needed
+
+        config.pluginmanager.register(Cells(config), "oodd-eval-cells")
+        return
+    for name in _OTHERS:
+        if config.getoption(f"oodd_{name}"):
+            option = f"--oodd-{name.replace('_', '-')}"
+            raise pytest.UsageError(f"{option} needs --oodd-detector, the name of a detector")
