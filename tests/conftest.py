@@ -22,3 +22,11 @@ with warnings.catch_warnings(), contextlib.suppress(ImportError):
 def tiny_split(tmp_path_factory):
     """Directory of a synthetic split with two environments; tests must not write to it."""
     return make_split(tmp_path_factory.mktemp("splits") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def submissions(tmp_path_factory):
+    """Valid entries of the leaderboard with their results and split; see `Submissions`."""
+    from helpers_submission import make_submissions
+
+    return make_submissions(tmp_path_factory.mktemp("submissions"))

@@ -25,13 +25,9 @@ from oodd_eval.submission.findings import Findings, shown
 from oodd_eval.submission.format import CURVES, ENTRY, SCORES, TRUST, Entry
 from oodd_eval.submission.identities import check_identities
 from oodd_eval.submission.record_check import read_records
-from oodd_eval.submission.rescoring import (
-    check_against_split,
-    check_recomputed_curves,
-    check_rescored,
-    find_split,
-)
+from oodd_eval.submission.rescoring import check_recomputed_curves, check_rescored
 from oodd_eval.submission.score_check import check_scores
+from oodd_eval.submission.trajectories import check_against_split, find_split, read_facts
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})
 """Files that may lie beside the entries."""
@@ -111,9 +107,10 @@ def verify_entry(directory: Path, *, name: str = "", split: str | Path | None = 
         own = {w: r for w, r in records.items() if r.split_digest == opened.digest}
         scored = {w: r for w, r in scored.items() if w in own}
         sound = not findings.count
-        check_against_split(own, opened, findings)
+        facts = read_facts(opened, (record.environment for record in own.values()))
+        check_against_split(own, facts, findings)
         if scored:
-            rescored = check_rescored(scored, directory, opened, findings)
+            rescored = check_rescored(scored, directory, opened, facts, findings)
         if scored and curves is not None and sound:
             check_recomputed_curves(curves, list(scored.values()), directory, opened, findings)
     complete = all(w in scored for w, r in records.items() if r.ok)
