@@ -61,6 +61,8 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_eval/py.typed",
         "oodd_riqn/py.typed",
         "oodd_eval/data/mini/manifest.json",
+        "oodd_eval/scaffold/templates/pyproject.toml.in",
+        "oodd_eval/scaffold/templates/gitignore.in",
     } <= names
     assert "oodd_eval/simulate/frozen/ant.npz" in names
 

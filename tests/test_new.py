@@ -1,0 +1,174 @@
+"""What `oodd-eval new` writes, and which names it refuses."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval.cli import main
+from oodd_eval.errors import OutputError, UsageError
+from oodd_eval.scaffold import FILES, LONGEST, Project, write_project
+
+LONG = ("abcde-" * 9)[: LONGEST - 1] + "z"
+
+
+@pytest.mark.parametrize(
+    ("name", "distribution", "module", "class_name"),
+    [
+        ("slow", "oodd-slow", "oodd_slow", "Slow"),
+        ("slow-drift-2", "oodd-slow-drift-2", "oodd_slow_drift_2", "SlowDrift2"),
+    ],
+)
+def test_names_follow_from_the_detectors(name, distribution, module, class_name):
+    project = Project(name)
+    found = (project.distribution, project.module, project.class_name)
+    assert found == (distribution, module, class_name)
+
+
+@pytest.mark.parametrize(
+    ("name", "close"),
+    [
+        ("My Detector", "my-detector"),
+        ("slow_drift", "slow-drift"),
+        ("SlowDrift", "slow-drift"),
+        ("9lives", "lives"),
+        ("oodd-slow", "slow"),
+        ("slow--drift", "slow-drift"),
+        ("-slow-", "slow"),
+        ("slow:drift", "slow-drift"),
+        ("a" * (LONGEST + 1), "a" * LONGEST),
+    ],
+)
+def test_a_name_that_is_none_gets_one_that_would_be(name, close):
+    with pytest.raises(UsageError, match=f"is no name for a detector: .*did you mean '{close}'"):
+        Project(name)
+
+
+@pytest.mark.parametrize("name", ["", "..", "é", "123"])
+def test_some_names_are_beyond_help(name):
+    with pytest.raises(UsageError) as caught:
+        Project(name)
+    assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["all", "eval"])
+def test_names_with_another_meaning_are_refused(name):
+    with pytest.raises(UsageError, match="means something else"):
+        Project(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "taken"),
+    [
+        ("rf", "there is a detector 'rf' already, of oodd-eval"),
+        ("adapters", "there is a plug-in 'adapters' already"),
+        ("torch", "there is a module 'oodd_torch' already"),
+    ],
+)
+def test_a_name_that_is_taken_is_refused(name, taken, tmp_path, capsys):
+    assert main(["new", name, "--output", str(tmp_path / "new")]) == 4
+    message = capsys.readouterr().err
+    assert taken in message
+    assert f"such as 'my-{name}'" in message
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_detector_of_another_plugin_is_taken_too(monkeypatch, tmp_path, capsys):
+    code = "@hookimpl\ndef oodd_detectors(): return offer(theirs=Good)"
+    install(monkeypatch, tmp_path / "site", "other", code)
+    assert main(["new", "theirs", "--output", str(tmp_path / "new")]) == 4
+    assert "of oodd-other 1.0" in capsys.readouterr().err
+
+
+def test_a_directory_in_use_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("kept")
+    with pytest.raises(OutputError, match="exists and is not an empty directory"):
+        write_project(Project("slow"), tmp_path)
+    with pytest.raises(OutputError, match="exists and is not an empty directory"):
+        write_project(Project("slow"), tmp_path / "mine.txt")
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_empty_directory_is_filled(tmp_path):
+    written = write_project(Project("slow"), tmp_path)
+    assert sorted(written) == sorted(p for p in tmp_path.rglob("*") if p.is_file())
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_project(Project("slow"), tmp_path / "file" / "below")
+
+
+def test_every_template_is_used():
+    there = {p.name for p in (files("oodd_eval.scaffold") / "templates").iterdir()}
+    assert there == set(FILES.values())
+
+
+def test_nothing_is_left_to_fill_in():
+    for path, text in Project("slow-drift").render().items():
+        assert not re.search("@[A-Z]+@|TODO|FIXME|<<|>>|{{", path + text), path
+        assert not text or text.endswith("\n"), path
+
+
+def test_the_project_says_what_it_is():
+    project = Project("slow-drift")
+    rendered = project.render()
+    metadata = tomllib.loads(rendered["pyproject.toml"])
+    assert metadata["project"]["name"] == "oodd-slow-drift"
+    assert metadata["project"]["entry-points"]["oodd_eval"] == {"slow-drift": "oodd_slow_drift"}
+    assert "src/oodd_slow_drift/detector.py" in rendered
+
+
+@pytest.mark.parametrize("name", ["z", LONG], ids=["short", "long"])
+def test_the_project_passes_its_own_linter(name, tmp_path):
+    write_project(Project(name), tmp_path)
+    ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or "ruff"
+    for command in (["check"], ["format", "--check"]):
+        done = subprocess.run(
+            [ruff, *command, "--no-cache", "."],
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_commands_in_the_projects_readme_exist():
+    from oodd_eval.cli import build_parser
+
+    text = Project("slow").render()["README.md"]
+    commands = re.findall(r"(?:^|`)oodd-eval ([^\n`]+)", text, re.MULTILINE)
+    assert len(commands) >= 4
+    for line in commands:
+        # The README speaks of verifying what submitting has written.
+        build_parser().parse_args([*line.split(), *["entry"][: line.endswith("verify")]])
+
+
+def test_the_workflow_runs_what_the_readme_says():
+    rendered = Project("slow").render()
+    runs = re.findall(r"- run: (.*)", rendered[".github/workflows/ci.yml"])
+    assert {'pip install -e ".[test]"', "pytest", "oodd-eval check slow"} <= set(runs)
+
+
+def test_next_commands_are_printed(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "slow"]) == 0
+    printed = capsys.readouterr().out
+    assert "  src/oodd_slow/detector.py\n" in printed
+    assert printed.partition("next:\n")[2].splitlines() == [
+        '  pip install -e "./oodd-slow[test]"',
+        "  oodd-eval check slow",
+        "  oodd-eval run --detector slow --env all",
+        "  oodd-eval leaderboard submit oodd-results --detector slow",
+    ]
+    assert (tmp_path / "oodd-slow" / "pyproject.toml").is_file()
+
+
+def test_quiet_prints_nothing(tmp_path, capsys):
+    assert main(["new", "slow", "-q", "--output", str(tmp_path / "new")]) == 0
+    assert capsys.readouterr().out == ""
