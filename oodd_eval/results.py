@@ -71,7 +71,8 @@ class UnitKey:
         """Return the key as a short file name: detector, environment and a digest of it all."""
         canonical = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"), default=str)
         digest = hashlib.sha256(canonical.encode()).hexdigest()
-        detector = self.detector.replace(":", "-")  # which some file systems do not take
+        # Some file systems take no colons, and some do not tell capitals.
+        detector = self.detector.lower().replace(":", "-")
         return f"{detector}-{self.environment}-{digest[:20]}"
 
 

@@ -41,7 +41,9 @@ entry_id = matching(
     "at most 80 lower-case letters, digits, '.', '_', '-', no '..'",
 )
 detector_name = matching(
-    r"[a-z0-9][a-z0-9-]{0,63}", "a name of lower-case letters, digits and '-', at most 64"
+    r"[a-z0-9][a-z0-9-]{0,63}(:[A-Za-z_][A-Za-z0-9_]{0,63}(\.[A-Za-z_][A-Za-z0-9_]{0,63}){0,7})?",
+    "a name of lower-case letters, digits and '-', at most 64, perhaps with a class behind a ':', "
+    "such as rf or pyod:IForest",
 )
 name = matching(
     r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", "a name of letters, digits, '.', '_', '-', at most 100"

@@ -189,9 +189,12 @@ def _entry(records: Sequence[Record], statement: Statement) -> Entry:
     first = records[0]
     detectors = sorted({r.detector for r in records})
     split = first.split.replace("@", "-").lower()
-    name = statement.id or f"{'-'.join(detectors)}-{split}"
+    # Detectors made of classes have capitals and a colon in their names.
+    name = statement.id or f"{'-'.join(detectors)}-{split}".lower().replace(":", "-")
     if not statement.id and (len(detectors) > 3 or rules.entry_id(name)):
-        raise UsageError(f"{len(detectors)} detectors make no short name: choose one with --id")
+        raise UsageError(
+            f"the names of {len(detectors)} detectors make no short id: choose one with --id"
+        )
     if complaint := rules.entry_id(name):
         raise UsageError(f"--id {complaint}")
     shown = ", ".join(detectors[:3]) + (f" and {len(detectors) - 3} more" * (len(detectors) > 3))
