@@ -3,15 +3,22 @@
 import dataclasses
 import json
 import math
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
+import yaml
 from helpers_records import make_record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval import cli
-from oodd_eval.compare.differences import NothingInCommonError, compare
+from oodd_eval import cli, load_split
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, PROTOCOL
+from oodd_eval.compare.differences import MEANINGS, NothingInCommonError, compare
 from oodd_eval.compare.figures import (
     figures_of,
     read_figures,
@@ -22,8 +29,10 @@ from oodd_eval.compare.tolerance import KNOWN, Tolerance, parse_tolerance, worse
 from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
 from oodd_eval.records import Metric
 from oodd_eval.report import differences, junit
+from oodd_eval.selection import expression
 
 NAN = math.nan
+ROOT = Path(__file__).parents[1]
 AUC = parse_tolerance("auc:-0.01")
 DELAY = parse_tolerance("delay:+10%")
 
@@ -526,3 +535,72 @@ def test_a_failing_cell_takes_one_row_of_the_table():
 def test_a_relative_tolerance_shows_the_change_in_percent():
     found = only([record(delay=12.5)], [record(delay=10.0)], DELAY)
     assert differences.change(found) == "↑ 2.5 (+25.0%)"
+
+
+# What stands in documents, and this project's own check
+
+DOCUMENT = (ROOT / "docs/regression-checks.md").read_text()
+CHECK = (ROOT / ".ci/run").read_text()
+
+
+def parse(command):
+    """Parse a command line of the shell that calls oodd-eval, as the program would."""
+    words = shlex.split(command)
+    assert words[0].endswith("oodd-eval")
+    return cli.build_parser().parse_args(words[1:])
+
+
+def test_the_workflow_is_yaml_and_its_commands_parse():
+    workflow = yaml.safe_load(re.search(r"```yaml\n(.*?)```", DOCUMENT, re.DOTALL)[1])
+    (job,) = workflow["jobs"].values()
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    own = [parse(c) for c in commands if c.startswith("oodd-eval")]
+    assert [options.command for options in own] == ["run", "compare"]
+    assert own[0].output == own[1].results
+    assert [t.metric for t in map(parse_tolerance, own[1].fail)] == [
+        "auc_matched", "delay_censored", "missed",
+    ]  # fmt: skip
+    assert all(set(step) <= {"name", "run", "uses", "with", "if", "continue-on-error"}
+               for step in job["steps"])  # fmt: skip
+    written = {own[1].junit, own[1].markdown, own[0].output}
+    assert written == set(job["steps"][-1]["with"]["path"].split())
+
+
+def test_the_document_names_every_verdict_and_every_option_of_the_plugin():
+    assert all(re.search(rf"\b{verdict}\b", DOCUMENT) for verdict in MEANINGS)
+    source = (ROOT / "oodd_eval/pytest_plugin.py").read_text()
+    options = set(re.findall(r'add\("(--oodd-[a-z-]+)"', source))
+    assert options == set(re.findall(r"^\| `(--oodd-[a-z-]+)", DOCUMENT, re.MULTILINE))
+
+
+def own_check():
+    """Parse the commands of this project's own check of its reference scores."""
+    lines = re.findall(r"step \.venv/bin/(oodd-eval .*)", CHECK)
+    return [parse(line) for line in lines]
+
+
+def test_the_check_of_this_project_parses_and_is_two_sided():
+    runs = [o for o in own_check() if o.command == "run"]
+    comparisons = [o for o in own_check() if o.command == "compare"]
+    assert [o.detector for o in runs] == ["rf", "riqn,npn"]
+    assert len(comparisons) == 2
+    for options in comparisons:
+        assert options.two_sided
+        assert [parse_tolerance(t) for t in options.fail]
+
+
+def test_the_check_of_this_project_is_sound_shell():
+    bash = shutil.which("bash")
+    assert bash
+    subprocess.run([bash, "-n", ROOT / ".ci/run"], check=True)
+
+
+def test_the_reference_of_this_project_is_of_the_split_that_ships_and_checked_in_whole():
+    reference = read_figures(ROOT / "leaderboard/reference/mini.json")
+    ((conditions, cells),) = reference.boards.items()
+    assert conditions.key == (load_split("mini").digest, PROTOCOL, None)
+    assert all(figures.ok for figures in cells.values())
+    rf = {f"mini/{e}/{a}::rf[h=1,seed=0]" for e in ENVIRONMENTS for a in ANOMALIES}
+    assert rf <= cells.keys()
+    chosen = [expression(o.expression) for o in own_check() if o.command == "compare"]
+    assert all(any(wanted(cell) for wanted in chosen) for cell in cells)
