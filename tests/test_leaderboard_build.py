@@ -4,8 +4,6 @@ import csv
 import dataclasses
 import io
 import os
-import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +126,7 @@ def small_site(monkeypatch):
         (output / "index.html").write_text(" ".join(e.meta.id for e in given))
         return output / "index.html"
 
-    monkeypatch.setitem(sys.modules, "oodd_eval.site", types.SimpleNamespace(render=render))
+    monkeypatch.setattr(leaderboard_build.site, "render", render)
 
 
 def lines_of(text):
@@ -339,6 +337,12 @@ def test_further_seeds_from_another_entry_join_their_row_with_the_lowest_trust()
     (standing,) = section.ranks.standings
     assert standing.seeds == 2
     assert section.trust == {standing.entry: "re-scored"}
+
+
+def test_two_rows_with_the_same_name_are_refused():
+    records = [record("riqn", [0.5] * SEEDS, horizon=10), record("riqn[h=10]", [0.5] * SEEDS)]
+    with pytest.raises(ResultsError, match=r"both called 'riqn\[h=10\]'"):
+        ranked(records)
 
 
 # Text of others

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from oodd_eval import site
 from oodd_eval.errors import OutputError
 from oodd_eval.report import csv_tables
 from oodd_eval.report.leaderboard import sections
@@ -48,7 +49,7 @@ def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:
 
     Returns
     -------
-    The page, the tables and the site's first page, relative to `output`.
+    The page, the tables and the site, relative to `output`.
 
     Raises
     ------
@@ -58,8 +59,8 @@ def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:
         When the entries contradict one another.
     """
     found = sections(entries)
-    site = _build_site(entries, output)
-    files = {PAGE: page(found, site=site)}
+    address = _build_site(entries, output)
+    files = {PAGE: page(found, site=address)}
     for section in found:
         files[table_file(section, "ranking")] = csv_tables.ranking(section.ranks, section.trust)
         files[table_file(section, "cells")] = csv_tables.cells(section.ranks)
@@ -71,16 +72,12 @@ def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:
             path.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         raise OutputError(f"cannot write the leaderboard into {str(output)!r}: {error}") from None
-    return [*files, *([site] if site else [])]
+    return [*files, address]
 
 
 def _build_site(entries: Sequence[SubmittedEntry], output: Path) -> str:
-    """Render the site and return the address of its first page, relative to `output`."""
-    try:
-        from oodd_eval.site import render  # noqa: PLC0415  not part of every installation
-    except ImportError:
-        return ""
-    return render(entries, output / SITE).relative_to(output).as_posix()
+    """Render the site and return the address of its page, relative to `output`."""
+    return site.render(entries, output / SITE).relative_to(output).as_posix()
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -104,8 +101,8 @@ def differences(fresh: Path, existing: Path) -> list[str]:
 
 def _files(output: Path) -> set[str]:
     """Return the names of the files that builds write, and of none beside them."""
-    site = (path for path in (output / SITE).rglob("*") if path.is_file())
-    names = {path.relative_to(output).as_posix() for path in site} | _tables(output)
+    paths = (path for path in (output / SITE).rglob("*") if path.is_file())
+    names = {path.relative_to(output).as_posix() for path in paths} | _tables(output)
     return names | ({PAGE} if (output / PAGE).is_file() else set())
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import Contribution
 from oodd_eval.ranking import Cell, Ranking, Row, rank, win_rates
 from oodd_eval.records import NAN, Record
@@ -113,11 +114,17 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
     Raises
     ------
     ResultsError
-        When complete rows differ in their numbers of test trajectories.
+        When complete rows differ in their numbers of test trajectories, or two rows have one name.
     """
     by_row: dict[Entry, list[Record]] = {}
     for record in sorted(records, key=_order):
         by_row.setdefault(entry_of(record), []).append(record)
+    labels = Counter(entry.label for entry in by_row)
+    if twice := [label for label, n in labels.items() if n > 1]:
+        raise ResultsError(
+            f"two rows of a board are both called {twice[0]!r}, expected names and settings that "
+            "tell rows apart: give one of the detectors another name"
+        )
     cells = {(r.environment, r.anomaly) for r in records}
     states = {entry: _state(own, len(cells)) for entry, own in by_row.items()}
     rows = {e.label: _row(own) for e, own in by_row.items() if not states[e]}
