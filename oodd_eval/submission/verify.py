@@ -137,13 +137,19 @@ def _read_curves(directory: Path, records: Records, findings: Findings) -> dict[
     """Read and check ``curves.json``; None when it is not sound."""
     before = findings.count
     try:
-        text = read_bytes(directory / CURVES, MOST_BYTES[CURVES]).decode()
-        curves = check_curves(parse_json(text), CURVES)
+        plain = parse_json(read_bytes(directory / CURVES, MOST_BYTES[CURVES]).decode())
     except UnicodeDecodeError as error:
         findings.refuse(CURVES, "", f"is not UTF-8: {error.reason} at byte {error.start}")
         return None
-    except (ResultsError, OverflowError) as error:
-        findings.refuse(str(error), "", "")
+    except ResultsError as error:
+        findings.refuse(CURVES, "", str(error))
+        return None
+    try:
+        curves = check_curves(plain, CURVES)
+    except ResultsError as error:
+        # Its messages begin with the place: "curves.json: units[0].seed is False, ...".
+        place, _, message = str(error).removeprefix(f"{CURVES}: ").partition(" ")
+        findings.refuse(CURVES, place.removeprefix(CURVES).rstrip(":"), message)
         return None
     known = {record.cell: record for record in records.values() if record.ok}
     for i, unit in enumerate(curves["units"]):

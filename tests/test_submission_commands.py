@@ -1,0 +1,267 @@
+"""``leaderboard submit`` and ``leaderboard verify`` as they are used, and what they never do."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import helpers_plugins
+import pytest
+from helpers_submission import Draft
+
+from oodd_eval import cli
+from oodd_eval.submission.format import read_entries
+from oodd_eval.submission.submit import run_command
+
+
+def submit(submissions, root, *options):
+    return cli.main(
+        ["leaderboard", "submit", str(submissions.results), "--results", str(root),
+         "--split", str(submissions.split), *options]
+    )  # fmt: skip
+
+
+def verify(submissions, *paths):
+    return cli.main(
+        ["leaderboard", "verify", *map(str, paths), "--split", str(submissions.split)]
+    )  # fmt: skip
+
+
+def test_what_is_submitted_is_valid_and_complete(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--submitter", "A. Tester", "--scores") == 0
+    out = capsys.readouterr().out
+    assert "persistence-random-small: valid, 16 cells" in out
+    assert f"git add {tmp_path / 'persistence-random-small'}" in out
+    assert verify(submissions, tmp_path) == 0
+    (entry,) = read_entries(tmp_path)
+    assert entry.meta.id == entry.path.name == "persistence-random-small"
+    assert entry.meta.detectors == ["persistence", "random"]
+    assert entry.meta.submitter == "A. Tester"
+    assert [p["plugin"] for p in entry.meta.plugins] == ["trivial"]
+    assert len(entry.records) == 16
+    assert entry.curves is not None
+    assert len(list((entry.path / "scores").iterdir())) == 2
+
+
+def test_the_command_of_an_entry_selects_its_cells(submissions, capsys):
+    entry = json.loads((submissions.plain / "entry.json").read_text())
+    words = entry["command"].replace("small", str(submissions.split)).split()
+    assert words[:4] == ["oodd-eval", "run", "--detector", "persistence,random"]
+    assert cli.main([*words[1:], "--collect-only", "-q"]) == 0
+
+
+def test_the_command_names_parameters_and_splits_unlike_runs(submissions):
+    from dataclasses import replace
+
+    from oodd_eval.results import ResultsDirectory
+
+    records = ResultsDirectory(submissions.results).records()
+    wide = [
+        replace(r, provenance=r.provenance | {"overrides": {"width": 3, "kind": "a b"}})
+        for r in records if r.detector == "random"
+    ]  # fmt: skip
+    first, second = run_command([r for r in records if r.detector != "random"] + wide).split(" && ")
+    assert first.endswith(
+        "--detector persistence --env cartpole --split small --horizon 1 --seed 0"
+    )
+    assert second.endswith("--param width=3 --param 'kind=a b'")
+
+
+def test_an_existing_entry_is_never_overwritten(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--detector", "random") == 0
+    before = sorted(p.stat().st_mtime_ns for p in tmp_path.rglob("*"))
+    assert submit(submissions, tmp_path, "--detector", "random") == 4
+    assert "is there already" in capsys.readouterr().err
+    assert sorted(p.stat().st_mtime_ns for p in tmp_path.rglob("*")) == before
+
+
+def test_a_cell_that_another_entry_has_is_refused(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--detector", "random") == 0
+    assert submit(submissions, tmp_path, "--id", "both") == 1
+    out = capsys.readouterr().out
+    assert "cell: is in entry random-small too" in out
+    assert "nothing was written" in out
+    assert [p.name for p in tmp_path.iterdir()] == ["random-small"]
+
+
+def test_what_would_not_be_valid_is_not_written(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--title", "<b>mine</b>") == 1
+    assert "persistence-random-small: entry.json: title: contains '<'" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_detector_is_named(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--detector", "randon") == 4
+    assert "did you mean 'random'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["../x", "A", "a/b", ".hidden", "a..b"])
+def test_an_id_is_a_plain_name(submissions, tmp_path, name, capsys):
+    assert submit(submissions, tmp_path / "entries", "--id", name) == 4
+    assert "--id is" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_trust_levels_that_can_be_claimed(submissions, tmp_path, capsys):
+    claim = ("--detector", "random", "--trust")
+    assert submit(submissions, tmp_path, *claim, "re-scored") == 1
+    assert "trust: is 're-scored', but scores are not there" in capsys.readouterr().out
+    assert submit(submissions, tmp_path, *claim, "re-scored", "--scores", "--id", "a") == 0
+    shutil.rmtree(tmp_path / "a")
+    assert submit(submissions, tmp_path, *claim, "re-run", "--id", "b") == 1
+    assert "rerun: is null" in capsys.readouterr().out
+    by = ("--rerun-by", "the maintainers", "--rerun-how", "seed base 17")
+    assert submit(submissions, tmp_path, *claim, "re-run", "--id", "b", *by) == 0
+    (entry,) = read_entries(tmp_path)
+    assert entry.meta.rerun == {"by": "the maintainers", "how": "seed base 17"}
+
+
+def test_limited_results_are_no_entry(submissions, tmp_path, capsys):
+    from oodd_eval.api import evaluate
+
+    evaluate("clock", submissions.split, anomalies="iid", limit=2, output=tmp_path / "out")
+    code = cli.main(
+        ["leaderboard", "submit", str(tmp_path / "out"), "--results", str(tmp_path / "entries")]
+    )  # fmt: skip
+    assert code == 4
+    assert "used --limit 2" in capsys.readouterr().err
+
+
+def test_missing_anomalies_are_said_before_anything_is_written(submissions, tmp_path, capsys):
+    from oodd_eval.api import evaluate
+
+    evaluate("clock", submissions.split, anomalies="iid,drift", output=tmp_path / "out")
+    code = cli.main(
+        ["leaderboard", "submit", str(tmp_path / "out"), "--results", str(tmp_path / "entries")]
+    )  # fmt: skip
+    assert code == 1
+    assert "cartpole lacks calibration, shutdown" in capsys.readouterr().out
+    assert not list((tmp_path / "entries").iterdir())
+
+
+def test_a_failed_detector_can_be_submitted_with_its_reason(submissions, tmp_path, capsys):
+    home = tmp_path / "out"
+    shutil.copytree(submissions.results, home)
+    lines = [json.loads(line) for line in (home / "records.jsonl").read_text().splitlines()]
+    for line in lines:
+        if line["detector"] == "random":
+            line.update(
+                status="error", reason="TypeError: '<' not supported\x1b", metrics={},
+                per_trajectory={},
+            )  # fmt: skip
+    (home / "records.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    code = cli.main(
+        ["leaderboard", "submit", str(home), "--results", str(tmp_path / "entries"),
+         "--split", str(submissions.split), "--scores"]
+    )  # fmt: skip
+    assert code == 0
+    (entry,) = read_entries(tmp_path / "entries")
+    assert {r.reason for r in entry.records if not r.ok} == {"TypeError: '(' not supported "}
+
+
+def test_exit_codes_of_verify(submissions, tmp_path, capsys):
+    assert verify(submissions, submissions.plain) == 0
+    assert verify(submissions, tmp_path) == 5
+    assert verify(submissions, tmp_path / "nowhere") == 4
+    draft = Draft(submissions.plain, tmp_path)
+    draft.records[0]["group"] = "dynamics"
+    draft.write()
+    assert verify(submissions, draft.path) == 1
+    assert verify(submissions, submissions.full, draft.path) == 1
+    assert "1 valid, 1 refused" in capsys.readouterr().out
+
+
+def test_a_split_that_is_not_there_is_an_error_where_it_was_named(submissions, capsys):
+    code = cli.main(
+        ["leaderboard", "verify", str(submissions.plain), "--split", "/nowhere/at-all"]
+    )  # fmt: skip
+    assert code == 4
+    assert "/nowhere/at-all is no split" in capsys.readouterr().err
+
+
+def test_every_entry_of_a_directory_is_checked_and_nothing_else_may_lie_there(
+    submissions, tmp_path, capsys
+):
+    good = Draft(submissions.plain, tmp_path)
+    good.write()
+    (tmp_path / "README.md").write_text("about")
+    assert verify(submissions, tmp_path) == 0
+    (tmp_path / "run.sh").write_text("echo")
+    (tmp_path / "broken").mkdir()
+    capsys.readouterr()
+    assert verify(submissions, tmp_path) == 1
+    out = capsys.readouterr().out
+    assert "run.sh: is no entry" in out
+    assert "broken: entry.json: is missing" in out
+    assert "1 valid, 2 refused" in out
+
+
+def test_a_detectors_name_belongs_to_one_distribution(submissions, tmp_path, capsys):
+    first = Draft(submissions.plain, tmp_path)
+    first.write()
+    second = Draft(submissions.full, tmp_path)
+    second.entry["plugins"][0]["distribution"] = "oodd-other"
+    for record in second.records:
+        record.update(plugin="oodd-other:trivial", seed=1)
+        record["cell"] = record["cell"].replace("seed=0", "seed=1")
+    for path in (second.path / "scores", second.file("curves.json")):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    second.entry["files"] = {"records.jsonl": {}}
+    second.write()
+    assert verify(submissions, tmp_path) == 1
+    assert "a name stands for one detector" in capsys.readouterr().out
+
+
+def test_a_partial_entry_is_said_to_be_one(submissions, capsys):
+    assert verify(submissions, submissions.plain) == 0
+    assert "persistence[h=1,seed=0] is partial: 1 of 7 environments" in capsys.readouterr().out
+
+
+def test_few_problems_are_printed_unless_all_are_wanted(submissions, tmp_path, capsys):
+    draft = Draft(submissions.plain, tmp_path)
+    for record in draft.records:
+        record["metrics"]["auc"].update(low=0.123, high=0.124, n=1)
+    draft.write()
+    assert verify(submissions, draft.path) == 1
+    assert "  and " in capsys.readouterr().out
+    assert verify(submissions, draft.path, "-v") == 1
+    assert "  and " not in capsys.readouterr().out
+
+
+def test_verifying_imports_no_plugin(submissions, tmp_path, monkeypatch):
+    """An entry that names a plug-in which is installed here, and would be noticed if imported."""
+    site, marker = tmp_path / "site", tmp_path / "imported"
+    helpers_plugins.install(
+        monkeypatch, site, "evil",
+        f"""
+        Path({str(marker)!r}).touch()
+        raise SystemExit("imported")
+        """,
+    )  # fmt: skip
+    draft = Draft(submissions.full, tmp_path)
+    draft.entry["plugins"][0].update(distribution="oodd-evil", plugin="evil")
+    draft.entry["environment"]["packages"]["oodd-evil"] = "1.0"
+    for record in draft.records:
+        record["plugin"] = "oodd-evil:evil"
+    draft.write()
+    code = f"""
+import sys
+from importlib.metadata import entry_points
+assert "evil" in entry_points(group="oodd_eval").names
+from oodd_eval import cli
+arguments = ["leaderboard", "verify", {str(draft.path)!r}, "--split", {str(submissions.split)!r}]
+code = cli.main(arguments)
+loaded = {{name.partition(".")[0] for name in sys.modules}}
+known = {{"oodd_evil", "oodd_riqn", "oodd_rf", "oodd_npn", "oodd_mewma", "torch", "sklearn"}}
+print("LOADED", sorted(loaded & known), code)
+"""
+    path = os.pathsep.join([str(site), str(Path(cli.__file__).parents[1])])
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": path},
+    )  # fmt: skip
+    assert done.stdout.splitlines()[-1] == "LOADED [] 0", done.stdout + done.stderr
+    assert "every metric was recomputed" in done.stdout
+    assert not marker.exists()

@@ -1,0 +1,328 @@
+"""Tampered ``entry.json`` and files: each is refused with a message that names field or file."""
+
+import os
+
+import pytest
+from helpers_submission import Draft, assert_refused
+
+from oodd_eval.splits import published_digests
+
+MINI = published_digests()["mini"]
+
+
+def entry(**changes):
+    return lambda d: d.entry.update(changes)
+
+
+def environment(**changes):
+    return lambda d: d.entry["environment"].update(changes)
+
+
+def renamed_split(name, digest):
+    """Claim everywhere that the records are of another split."""
+
+    def change(d):
+        d.entry.update(split=name, split_digest=digest)
+        for r in d.records:
+            r.update(split=name, split_digest=digest, cell=r["cell"].replace("small", name))
+
+    return change
+
+
+def names_a_file(name):
+    return lambda d: d.entry["files"].update({name: {"sha256": "0" * 64, "bytes": 1}})
+
+
+def wrong_digest(d):
+    d.sealed = False
+    d.entry["files"]["records.jsonl"]["sha256"] = "0" * 64
+
+
+def wrong_size(d):
+    d.write()
+    d.sealed = False
+    d.entry["files"]["records.jsonl"]["bytes"] += 1
+    d.seal()
+
+
+def truth_as_size(d):
+    d.sealed = False
+    d.entry["files"]["records.jsonl"]["bytes"] = True
+
+
+FIELDS = {
+    "title-missing": (lambda d: d.entry.pop("title"), "title", "is missing"),
+    "title-empty": (entry(title=""), "title", "has 0 characters"),
+    "title-too-long": (entry(title="x" * 121), "title", "has 121 characters"),
+    "title-number": (entry(title=7), "title", "is 7, expected text"),
+    "html-in-title": (entry(title="<script>alert(1)</script>"), "title", "contains '<'"),
+    "html-in-submitter": (entry(submitter="a <b>"), "submitter", "contains '<'"),
+    "html-in-citation": (entry(citation="see <a href=x>"), "citation", "contains '<'"),
+    "link-in-caption": (entry(caption="[x](javascript:1)"), "caption", "contains ']('"),
+    "control-character": (entry(citation="a\x1b[31mred"), "citation", "control character '\\x1b'"),
+    "reversed-text": (entry(caption="a\u202eb"), "caption", "control character '\\u202e'"),
+    "two-lines": (entry(command="a\nb"), "command", "control character '\\n'"),
+    "javascript-url": (entry(url="javascript:alert(1)"), "url", "expected an http or https"),
+    "quote-in-url": (entry(url='https://a.org/"onclick="x'), "url", "expected an http or https"),
+    "unknown-field": (entry(script="x"), "script", "is no field"),
+    "html-in-field-name": (entry(**{"<b>": 1}), "<b>", "is no field"),
+    "schema-of-tomorrow": (entry(schema=2), "schema", "is 2, expected 1"),
+    "truth-as-schema": (entry(schema=True), "schema", "is True, expected 1"),
+    "protocol": (entry(protocol=99), "protocol", "is 99, expected 1"),
+    "truth-as-protocol": (entry(protocol=True), "protocol", "is True, expected 1"),
+    "created": (entry(created="2026-02-30"), "created", "expected a date"),
+    "id-of-another": (entry(id="another"), "id", "but the directory is"),
+    "id-path": (entry(id="../../x"), "id", "is '../../x'"),
+    "id-null": (entry(id=None), "id", "is None"),
+    "detectors-text": (entry(detectors="persistence"), "detectors", "not a list"),
+    "detectors-html": (entry(detectors=["<i>"]), "detectors[0]", "is '<i>'"),
+    "detectors-order": (entry(detectors=["random", "persistence"]), "detectors", "in order"),
+    "detectors-too-many": (
+        entry(detectors=["persistence", "random", "riqn"]), "detectors", "but the records are of",
+    ),
+    "trust-unknown": (entry(trust="gold"), "trust", "is 'gold'"),
+    "trust-too-high": (entry(trust="re-scored"), "trust", "scores are not there"),
+    "trust-run-by-nobody": (entry(trust="re-run"), "rerun", "say by whom and how"),
+    "run-again-but-reported": (
+        entry(rerun={"by": "A", "how": "B"}), "rerun", "must be null where trust is 'reported'",
+    ),
+    "rerun-without-how": (
+        entry(trust="re-run", rerun={"by": "A"}), "rerun.how", "is missing",
+    ),
+    "swapped-digest": (entry(split_digest="a" * 64), "split_digest", "the entry is of"),
+    "upper-case-digest": (entry(split_digest="A" * 64), "split_digest", "64 hexadecimal digits"),
+    "published-digest-renamed": (
+        renamed_split("small", MINI), "split", "this digest is that of 'mini'",
+    ),
+    "published-name-taken": (
+        renamed_split("mini", "1" * 64), "split_digest", "the published digest of 'mini' is",
+    ),
+    "name-not-published-yet": (
+        renamed_split("paper", "2" * 64), "split_digest", "no digest of 'paper' is published",
+    ),
+    "split-suffix": (renamed_split("mini@12345678", "3" * 64), "split", "split_digest is 33333333"),
+    "split-path": (renamed_split("../x", "3" * 64), "split", "is '../x'"),
+    "plugins-empty": (entry(plugins=[]), "plugins", "do not name oodd-eval:trivial"),
+    "plugins-text": (entry(plugins="trivial"), "plugins", "not a list"),
+    "plugin-source": (
+        lambda d: d.entry["plugins"][0].update(source_digest="e" * 64), "plugins",
+        "which no record is from",
+    ),
+    "plugin-twice": (
+        lambda d: d.entry["plugins"].append(d.entry["plugins"][0]), "plugins", "twice",
+    ),
+    "plugin-html": (
+        lambda d: d.entry["plugins"][0].update(distribution="<b>"), "plugins[0].distribution",
+        "is '<b>'",
+    ),
+    "python": (environment(python="9.9"), "environment.python", "the records were made with"),
+    "packages": (environment(packages=[]), "environment.packages", "expected a JSON object"),
+    "packages-html": (
+        environment(packages={"<b>": "1"}), "environment.packages.<b>", "expected",
+    ),
+    "numpy": (environment(packages={}), "environment.packages.numpy", "were made with"),
+    "file-above": (names_a_file("../../etc/passwd"), "files.../../etc/passwd", "no name of a file"),
+    "file-absolute": (names_a_file("/etc/passwd"), "files./etc/passwd", "no name of a file"),
+    "file-in-disguise": (names_a_file("scores/..h5"), "files.scores/..h5", "no name of a file"),
+    "file-absent": (names_a_file("curves.json"), "files.curves.json", "that is not there"),
+    "file-not-named": (entry(files={}), "files.records.jsonl", "is missing"),
+    "file-digest": (wrong_digest, "files.records.jsonl.sha256", "it was changed after"),
+    "file-size": (wrong_size, "files.records.jsonl.bytes", "but the file has"),
+    "truth-as-size": (truth_as_size, "files.records.jsonl.bytes", "is True"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FIELDS)
+def test_a_tampered_entry_is_refused_by_its_field(submissions, tmp_path, case):
+    tamper, field, message = FIELDS[case]
+    draft = Draft(submissions.plain, tmp_path)
+    tamper(draft)
+    assert_refused(draft.verdict(), field, message)
+
+
+def raw(name, content):
+    """Replace the content of a file, with fitting digests."""
+
+    def change(d):
+        d.write()
+        d.file(name).write_bytes(content(d.file(name).read_bytes()))
+        if name != "entry.json":
+            d.seal()
+
+    return change
+
+
+def sparse(name, size):
+    """Make a file huge without writing it."""
+
+    def change(d):
+        d.write()
+        with d.file(name).open("r+b") as file:
+            file.truncate(size)
+
+    return change
+
+
+def extra(name, content=b"x"):
+    def change(d):
+        d.write()
+        d.file(name).parent.mkdir(parents=True, exist_ok=True)
+        d.file(name).write_bytes(content)
+
+    return change
+
+
+def symlink(name):
+    def change(d):
+        d.write()
+        d.file(name).rename(d.path.parent / "elsewhere")
+        d.file(name).symlink_to(d.path.parent / "elsewhere")
+
+    return change
+
+
+def link_to_a_directory(d):
+    d.write()
+    d.file("scores").symlink_to("/etc")
+
+
+def pipe(d):
+    d.write()
+    d.file("records.jsonl").unlink()
+    os.mkfifo(d.file("records.jsonl"))
+
+
+def many_files(d):
+    d.write()
+    for i in range(2100):
+        d.file(f"{i}.txt").touch()
+
+
+def removed(name):
+    def change(d):
+        d.write()
+        d.file(name).unlink()
+
+    return change
+
+
+NESTED = b"[" * 100_000 + b"]" * 100_000
+
+FILES = {
+    "truncated": (raw("records.jsonl", lambda b: b[:-1]), "records.jsonl:16", "is cut off"),
+    "truncated-in-a-record": (
+        raw("records.jsonl", lambda b: b[: len(b) // 2]), "records.jsonl:", "is cut off",
+    ),
+    "no-records": (raw("records.jsonl", lambda _: b""), "records.jsonl", "has 0 records"),
+    "blank-line": (raw("records.jsonl", lambda b: b + b"\n"), "records.jsonl:17", "is not JSON"),
+    "other-line-ends": (
+        raw("records.jsonl", lambda b: b.replace(b"\n", b"\r\n")), "records.jsonl:1",
+        "control characters",
+    ),
+    "not-utf8-records": (
+        raw("records.jsonl", lambda b: b.replace(b"ok", b"\xff\xfe", 1)), "records.jsonl:1",
+        "is not UTF-8",
+    ),
+    "not-utf8-entry": (raw("entry.json", lambda b: b + b"\xff"), "entry.json", "is not UTF-8"),
+    "not-json": (raw("entry.json", lambda _: b"title: x"), "entry.json", "is not JSON"),
+    "a-list": (raw("entry.json", lambda _: b"[]"), "entry.json", "expected a JSON object"),
+    "a-number": (raw("records.jsonl", lambda _: b"1\n"), "records.jsonl:1", "a JSON object"),
+    "nested-entry": (raw("entry.json", lambda _: NESTED), "entry.json", "nested too deep"),
+    "nested-record": (
+        raw("records.jsonl", lambda _: NESTED + b"\n"), "records.jsonl:1", "nested too deep",
+    ),
+    "huge-number": (
+        raw("records.jsonl", lambda b: b.replace(b'"seed": 0', b'"seed": 1' + b"0" * 5000, 1)),
+        "records.jsonl:1", "is not JSON",
+    ),
+    "large-number": (
+        raw("records.jsonl", lambda b: b.replace(b'"seed": 0', b'"seed": 1' + b"0" * 400, 1)),
+        "seed", "expected a whole number",
+    ),
+    "infinite-number": (
+        raw("records.jsonl", lambda b: b.replace(b'"low": ', b'"low": 1e999, "x": ', 1)),
+        "metrics.auc.low", "is inf",
+    ),
+    "name-twice": (
+        raw("entry.json", lambda b: b[:-1] + b', "trust": "re-run"}'), "entry.json",
+        "'trust' stands twice",
+    ),
+    "huge-entry": (
+        raw("entry.json", lambda b: b + b" " * 300_000), "entry.json", "expected at most 250000",
+    ),
+    "huge-records": (sparse("records.jsonl", 10**9), "records.jsonl", "has 1000000000 bytes"),
+    "huge-line": (
+        raw("records.jsonl", lambda b: b.replace(b"{", b"{" + b" " * 5_000_000, 1)),
+        "records.jsonl:1", "characters",
+    ),
+    "script": (extra("install.py"), "install.py", "is no file of an entry"),
+    "hidden-file": (extra(".htaccess"), ".htaccess", "is no file of an entry"),
+    "pickle": (extra("scores/model.pkl", b"\x80\x04."), "scores/model.pkl", "no file of an entry"),
+    "directory": (extra("src/x.py"), "src", "is no file of an entry"),
+    "directory-in-scores": (extra("scores/a.h5/b"), "scores/a.h5", "is no plain file"),
+    "name-with-new-line": (extra("scores/a\nb.h5"), "scores/a\\nb.h5", "is no file of an entry"),
+    "name-with-html": (extra("scores/<b>.h5"), "scores/<b>.h5", "is no file of an entry"),
+    "many-files": (many_files, "entry", "holds more than"),
+    "linked-records": (symlink("records.jsonl"), "records.jsonl", "is a symbolic link"),
+    "linked-entry": (symlink("entry.json"), "entry.json", "is a symbolic link"),
+    "linked-directory": (link_to_a_directory, "scores", "is a symbolic link"),
+    "pipe": (pipe, "records.jsonl", "is no plain file"),
+    "records-removed": (removed("records.jsonl"), "records.jsonl", "is missing"),
+    "entry-removed": (removed("entry.json"), "entry.json", "is missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_tampered_files_are_refused_by_name(submissions, tmp_path, case):
+    tamper, name, message = FILES[case]
+    draft = Draft(submissions.plain, tmp_path)
+    tamper(draft)
+    assert_refused(draft.verdict(), name, message)
+
+
+def test_an_entry_that_is_a_link_is_refused(submissions, tmp_path):
+    from oodd_eval.submission.verify import verify_entry
+
+    link = tmp_path / submissions.plain.name
+    link.symlink_to(submissions.plain)
+    assert_refused(verify_entry(link), "entry", "is a link or a file")
+
+
+def test_all_files_together_are_bounded(submissions, tmp_path, monkeypatch):
+    from oodd_eval.submission import files
+
+    monkeypatch.setattr(files, "MOST_TOTAL_BYTES", 1000)
+    draft = Draft(submissions.plain, tmp_path)
+    assert_refused(draft.verdict(), "total size", "expected at most 1000")
+
+
+def test_messages_hold_no_control_characters(submissions, tmp_path):
+    draft = Draft(submissions.plain, tmp_path)
+    draft.entry.update({"id": "\x1b[2J", "\x1b[31mfield": 1, "detectors": ["\x07"]})
+    draft.entry["environment"]["packages"]["\x1b]0;x"] = "1"
+    draft.records[0]["metrics"]["\x1b[2J"] = {}
+    draft.records[1]["cell"] = "\x1b[2J"
+    extra("\x1b[2J.txt")(draft)
+    problems = draft.verdict().findings.problems
+    assert len(problems) >= 6
+    assert all(problem.text.isprintable() for problem in problems)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_damage_is_a_problem_and_never_a_crash(submissions, tmp_path, seed):
+    import numpy as np
+
+    rng = np.random.default_rng(seed)
+    draft = Draft(submissions.plain, tmp_path)
+    name = "entry.json" if seed % 3 == 0 else "records.jsonl"
+    content = bytearray(draft.file(name).read_bytes())
+    for _ in range(5):
+        at = int(rng.integers(len(content)))
+        content[at : at + int(rng.integers(3))] = rng.bytes(int(rng.integers(1, 4)))
+    draft.file(name).write_bytes(bytes(content))
+    draft.written = True
+    assert not draft.verdict().ok
+
+
+def test_an_undamaged_copy_passes(submissions, tmp_path):
+    assert Draft(submissions.plain, tmp_path).verdict().ok

@@ -1,0 +1,305 @@
+"""Entries with scores and curves: recomputed where they are sound, refused where they are not."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from helpers_submission import Draft, assert_refused
+
+KEY = "scores/persistence-cartpole-"
+"""How the one score file's name begins."""
+
+
+def scores_file(d):
+    (path,) = d.file("scores").iterdir()
+    return path
+
+
+def inside(change):
+    """Change the score file by a function of the opened file."""
+
+    def tamper(d):
+        with h5py.File(scores_file(d), "r+") as file:
+            change(file)
+
+    return tamper
+
+
+def number(part, at, value):
+    def change(file):
+        file[part]["scores"][at] = value
+
+    return inside(change)
+
+
+def replaced(name, **options):
+    """Replace a dataset by another."""
+
+    def change(file):
+        del file[name]
+        file.create_dataset(name, **options)
+
+    return inside(change)
+
+
+def cut_off(d):
+    path = scores_file(d)
+    path.write_bytes(path.read_bytes()[:-2000])
+
+
+def overwritten(content):
+    return lambda d: scores_file(d).write_bytes(content)
+
+
+def user_block(d):
+    path = scores_file(d)
+    content = b"\x80\x04import os".ljust(512, b"\0") + path.read_bytes()
+    path.write_bytes(content)
+
+
+def removed(d):
+    name = f"scores/{scores_file(d).name}"
+    scores_file(d).unlink()
+    del d.entry["files"][name]
+
+
+def unknown_file(d):
+    d.file("scores/other.h5").write_bytes(scores_file(d).read_bytes())
+    d.entry["files"]["scores/other.h5"] = {}
+
+
+def kept_elsewhere(file):
+    n = len(file["calibration/scores"])
+    del file["calibration/scores"]
+    file.create_dataset(
+        "calibration/scores", (n,), "f8", external=[("/etc/hostname", 0, h5py.h5f.UNLIMITED)]
+    )
+
+
+def virtual(file):
+    n = len(file["calibration/scores"])
+    del file["calibration/scores"]
+    layout = h5py.VirtualLayout((n,), "f8")
+    layout[:] = h5py.VirtualSource("/tmp/other.h5", "x", (n,))  # noqa: S108  never opened
+    file.create_virtual_dataset("calibration/scores", layout)
+
+
+def linked(link):
+    def change(file):
+        del file["calibration/scores"]
+        file["calibration/scores"] = link
+
+    return inside(change)
+
+
+def objects(file):
+    del file["calibration/scores"]
+    file.create_dataset("calibration/scores", data=["x"] * 5, dtype=h5py.string_dtype())
+
+
+def opaque(file):
+    del file["calibration/scores"]
+    file["calibration/scores"] = np.array([b"\x80\x04."] * 5, dtype="V3")
+
+
+def shorter(file):
+    """Take the last score of the last calibration trajectory away, consistently."""
+    scores, offsets = file["calibration/scores"][:-1], file["calibration/offsets"][:]
+    offsets[-1] -= 1
+    del file["calibration/scores"], file["calibration/offsets"]
+    file["calibration/scores"], file["calibration/offsets"] = scores, offsets
+
+
+def cycle(file):
+    file["test/again"] = file["test"]
+
+
+SCORES = {
+    "changed-score": (number("test/iid", 50, 99.0), "metrics.auc", "but the scores give"),
+    "changed-calibration": (
+        number("calibration", 5, 99.0), "metrics.far_twin.value", "but the scores give",
+    ),
+    "infinite-score": (number("test/iid", 50, np.inf), "test/iid/scores", "is infinite at t = 50"),
+    "undefined-in-the-middle": (
+        number("test/iid", 50, np.nan), "test/iid/scores", "after a defined score",
+    ),
+    "undefined-too-long": (
+        number("test/iid", slice(0, 30), np.nan), "test/iid/scores", "at most 20 undefined",
+    ),
+    "other-lengths": (inside(shorter), "test/iid", "does not fit the split"),
+    "single-precision": (
+        replaced("calibration/scores", data=np.zeros(9, np.float32)), "calibration/scores",
+        "has dtype <f4",
+    ),
+    "objects": (inside(objects), "calibration/scores", "has dtype |O"),
+    "opaque-bytes": (inside(opaque), "calibration/scores", "has dtype |V3"),
+    "two-dimensions": (
+        replaced("calibration/scores", data=np.zeros((3, 3))), "calibration/scores", "(3, 3)",
+    ),
+    "bomb": (
+        replaced(
+            "calibration/scores", shape=(10**9,), dtype="f8", chunks=(10**6,), compression="gzip"
+        ),
+        "calibration/scores", "has 1000000000 values",
+    ),
+    "other-filter": (
+        replaced("calibration/scores", data=np.zeros(9), compression="lzf"), "calibration/scores",
+        "is packed by filter",
+    ),
+    "offsets-that-fall": (
+        replaced("calibration/offsets", data=np.array([0, 50, 20])), "calibration/offsets",
+        "do not rise",
+    ),
+    "external-link": (
+        linked(h5py.ExternalLink("/etc/passwd", "/x")), "calibration/scores", "ExternalLink",
+    ),
+    "soft-link": (linked(h5py.SoftLink("/test")), "calibration/scores", "SoftLink"),
+    "kept-elsewhere": (inside(kept_elsewhere), "calibration/scores", "in other files"),
+    "virtual": (inside(virtual), "calibration/scores", "in other files"),
+    "cycle": (inside(cycle), "test/again", "is no part of a score file"),
+    "unknown-part": (
+        inside(lambda f: f.create_group("code")), "code", "is no part of a score file",
+    ),
+    "unknown-dataset": (
+        inside(lambda f: f["calibration"].create_dataset("x", data=b"x")), "calibration/x",
+        "is no dataset of a score file",
+    ),
+    "missing-part": (inside(lambda f: f.__delitem__("test/drift")), "test/drift", "is missing"),
+    "attribute-of-a-file": (
+        inside(lambda f: f.attrs.update(code="import os")), "attribute code", "expected a cost",
+    ),
+    "negative-cost": (
+        inside(lambda f: f.attrs.update(seconds_fit=-1.0)), "attribute seconds_fit", "at least 0",
+    ),
+    "attribute-of-data": (
+        inside(lambda f: f["calibration/scores"].attrs.update(x=1)), "calibration/scores",
+        "has attributes",
+    ),
+    "user-block": (user_block, "userblock", "512 bytes"),
+    "cut-off": (cut_off, KEY, "is damaged or no HDF5 file"),
+    "pickle-as-scores": (overwritten(b"\x80\x04K\x01."), KEY, "is damaged or no HDF5 file"),
+    "empty-file": (overwritten(b""), KEY, "is damaged or no HDF5 file"),
+    "removed": (removed, "files", "names a file"),
+    "of-no-record": (unknown_file, "scores/other.h5", "belongs to no record"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SCORES)
+def test_tampered_scores_are_refused_by_their_field(submissions, tmp_path, case):
+    tamper, field, message = SCORES[case]
+    draft = Draft(submissions.full, tmp_path)
+    tamper(draft)
+    draft.write()
+    if case == "removed":
+        # The file is gone altogether: an entry without scores is one that is reported.
+        assert draft.verdict(submissions.split).ok
+        draft.entry["trust"] = "re-scored"
+        draft.seal()
+        field, message = "trust", "scores are not there"
+    assert_refused(draft.verdict(submissions.split), field, message)
+
+
+def curves(change):
+    """Change the content of ``curves.json``."""
+
+    def tamper(d):
+        content = json.loads(d.file("curves.json").read_text())
+        change(content)
+        d.file("curves.json").write_text(json.dumps(content))
+
+    return tamper
+
+
+def unit(**changes):
+    return curves(lambda c: c["units"][0].update(changes))
+
+
+CURVES = {
+    "rate": (
+        curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 0.0123)),
+        "units[0].roc.tpr[3]", "but the scores give",
+    ),
+    "rate-above-one": (
+        curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 1.5)), "units[0].roc.tpr[3]",
+        "is 1.5",
+    ),
+    "other-cell": (unit(cell="small/cartpole/iid::x[h=1,seed=0]"), "units[0].cell", "no record"),
+    "other-detector": (unit(detector="riqn"), "units[0].detector", "in the record of its cell"),
+    "html": (unit(detector="<script>"), "units[0].detector", "in the record of its cell"),
+    "truth-as-seed": (unit(seed=False), "units[0].seed", "is False"),
+    "unknown-field": (unit(code="x"), "units[0]", "unknown ['code']"),
+    "no-unit": (curves(lambda c: c["units"].pop()), "units", "curves are of all evaluated cells"),
+    "unit-twice": (curves(lambda c: c["units"].append(c["units"][0])), "units[8].cell", "before"),
+    "index": (
+        curves(lambda c: c["units"][0]["example"].update(index=999)), "units[0].example.index",
+        "no test trajectory",
+    ),
+    "not-a-number": (
+        curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, float("nan"))), "curves.json",
+        "NaN is no JSON number",
+    ),
+    "schema": (curves(lambda c: c.update(schema=2)), "schema", "is 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CURVES)
+def test_tampered_curves_are_refused_by_their_field(submissions, tmp_path, case):
+    tamper, field, message = CURVES[case]
+    draft = Draft(submissions.full, tmp_path)
+    tamper(draft)
+    assert_refused(draft.verdict(submissions.split), field, message)
+
+
+def test_scores_confirm_every_metric(submissions):
+    from oodd_eval.submission.verify import verify_entry
+
+    verdict = verify_entry(submissions.full, split=submissions.split)
+    assert verdict.ok
+    assert verdict.rescored
+    assert any("qualifies for 're-scored'" in note for note in verdict.findings.notes)
+
+
+@pytest.mark.parametrize("name", ["auc_matched", "far", "missed_at_1pct", "delay_null"])
+def test_scores_catch_a_consistent_lie(submissions, tmp_path, name):
+    draft = Draft(submissions.full, tmp_path)
+    record = draft.records[0]
+    top = record["per_trajectory"][name][0]
+    top[0] = 0.0 if top[0] else 1.0
+    draft.consistent(0, name)
+    verdict = draft.verdict(submissions.split)
+    assert_refused(verdict, f"metrics.{name}.value", "but the scores give")
+
+
+def test_a_pooled_metric_is_caught_too(submissions, tmp_path):
+    draft = Draft(submissions.full, tmp_path)
+    draft.records[0]["metrics"]["fpr95"]["value"] *= 0.5
+    assert_refused(draft.verdict(submissions.split), "metrics.fpr95.value", "the scores give")
+
+
+def test_a_calibrated_rule_that_the_scores_do_not_support_is_refused(submissions, tmp_path):
+    draft = Draft(submissions.full, tmp_path)
+    for record in draft.records:
+        for part in ("metrics", "per_trajectory"):
+            for name in list(record[part]):
+                if name.endswith("_at_1pct"):
+                    del record[part][name]
+    assert_refused(draft.verdict(submissions.split), "metrics.far_at_1pct", "is missing")
+
+
+def test_without_the_split_nothing_is_recomputed_and_this_is_said(submissions, tmp_path):
+    draft = Draft(submissions.full, tmp_path)
+    draft.entry["trust"] = "re-scored"
+    verdict = draft.verdict()
+    assert verdict.ok
+    assert not verdict.rescored
+    notes = " ".join(verdict.findings.notes)
+    assert "nothing recomputed" in notes
+    assert "could not be confirmed" in notes
+
+
+def test_a_split_of_another_digest_is_not_used(submissions, tmp_path, tiny_split):
+    draft = Draft(submissions.full, tmp_path)
+    verdict = draft.verdict(tiny_split)
+    assert not verdict.rescored
+    assert any("here has digest" in note for note in verdict.findings.notes)
