@@ -25,19 +25,23 @@ _NETWORK: Final = frozenset(
     }
 )
 
-_CHANGES: Final = frozenset(
-    {
-        "os.link",
-        "os.mkdir",
-        "os.remove",
-        "os.rename",
-        "os.rmdir",
-        "os.symlink",
-        "os.truncate",
-        "sqlite3.connect",
-    }
-)
-"""Events that change what is on disk; the path is their first argument, a second one their second.
+_CHANGES: Final = {
+    "os.link": (1,),
+    "os.mkdir": (0,),
+    "os.remove": (0,),
+    "os.rename": (0, 1),
+    "os.rmdir": (0,),
+    "os.symlink": (1,),
+    "os.truncate": (0,),
+    "shutil.rmtree": (0,),
+    "sqlite3.connect": (0,),
+}
+"""Events that change what is on disk, and which of their arguments are the paths that change."""
+
+_RELATIVE: Final = {"os.remove": 1, "os.rmdir": 1, "shutil.rmtree": 1}
+"""Where an argument tells that a path is relative to an open directory.
+
+Emptying a directory removes what is in it in this way; it is seen as a whole before.
 """
 
 _WRITING: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -56,16 +60,15 @@ _installed = False
 
 
 @contextlib.contextmanager
-def auditing() -> Iterator[Events]:
+def auditing(events: Events) -> Iterator[None]:
     """Record events, of all threads, and refuse connections, until the block is left."""
     global _current, _installed  # noqa: PLW0603  an audit hook is the process's, for ever
     if not _installed:
         sys.addaudithook(_hook)
         _installed = True
-    events, before = Events(), _current
-    _current = events
+    _current, before = events, _current
     try:
-        yield events
+        yield
     finally:
         _current = before
 
@@ -78,8 +81,10 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         if flags is not None and flags & _WRITING:
             _note(path)
     elif event in _CHANGES:
-        for path in arguments[:2]:
-            _note(path)
+        relative = _RELATIVE.get(event)
+        if relative is None or arguments[relative] in (None, -1):
+            for index in _CHANGES[event]:
+                _note(arguments[index])
     elif event in _NETWORK and (address := _address(event, arguments)):
         _current.network.append(address)
         raise ConnectionRefusedError(f"no network during a check: {event} {address}")

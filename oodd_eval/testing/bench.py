@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.detector import Detector, DetectorSpec, Scores
 from oodd_eval.errors import ContractError
+from oodd_eval.testing.audit import Events
 from oodd_eval.testing.problem import Problem
 from oodd_eval.testing.witness import Watched, settings, watch
 from oodd_eval.trajectory import Trajectory
@@ -96,11 +97,16 @@ class Bench:
     ----------
     problem
         Trajectories to fit on and to score.
+    events
+        What was done to files and the network in all checks so far.
+    settings_before
+        Settings of the process before the first of them.
     """
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.problem = Problem(subject.horizon)
+        self.events = Events()
         self.settings_before = settings()
         self._made: CheckFailedError | None = None
         self._fitted: Detector | CheckFailedError | None = None
@@ -205,13 +211,15 @@ def doing(what: str) -> Iterator[None]:
     Raises
     ------
     CheckFailedError
-        ``<what> raised <type>: <message> (<file>:<line>)``.
+        ``<what> raised <type>: <message> (<file>:<line>)``, or that it called ``sys.exit``.
     """
     try:
         yield
     except (CheckFailedError, CheckSkipped):
         raise
-    except (Exception, SystemExit) as error:
+    except SystemExit as error:
+        raise CheckFailedError(f"{what} {reason_of(error)}") from error
+    except Exception as error:
         raise CheckFailedError(f"{what} raised {reason_of(error)}") from error
 
 

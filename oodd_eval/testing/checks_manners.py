@@ -5,11 +5,14 @@ All of them judge one run that is watched from all sides (`oodd_eval.testing.wit
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
+from pathlib import Path
 
-from oodd_eval.testing.bench import Bench, CheckFailedError
+from oodd_eval.testing.bench import Bench, CheckFailedError, CheckSkipped
 from oodd_eval.testing.kit import check
 from oodd_eval.testing.problem import EPISODES
+from oodd_eval.testing.witness import outside
 from oodd_eval.worker import reason_of
 
 MOST_SECONDS = 120.0
@@ -64,11 +67,15 @@ def warnings(bench: Bench) -> None:
 @check
 def network(bench: Bench) -> None:
     """The network is not asked for."""
+    # All that was done so far counts: what is there after a first fit is not fetched again.
+    with contextlib.suppress(CheckSkipped):
+        bench.events.network += bench.watched().network
     _none(
-        bench.watched().network,
+        list(dict.fromkeys(bench.events.network)),
         "the factory, fit or score asked the network for",
         "a detector comes with all that it needs",
     )
+    bench.fitted()
 
 
 @check
@@ -76,7 +83,7 @@ def files(bench: Bench) -> None:
     """Files are written in the user's cache directory alone, or gone in the end."""
     seen = bench.watched()
     _none(
-        seen.written,
+        list(dict.fromkeys([*outside(bench.events.written, Path.cwd()), *seen.written])),
         "the factory, fit or score wrote",
         "write below XDG_CACHE_HOME (default ~/.cache), or to temporary files that are removed",
     )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from oodd_eval.testing.audit import auditing
 from oodd_eval.testing.bench import Bench, Factory, Subject, doing
 
 
@@ -61,7 +62,7 @@ class Check:
         with warnings.catch_warnings():
             # They are the matter of the check 'warnings'.
             warnings.simplefilter("ignore")
-            with doing("the detector"):
+            with auditing(bench.events), doing("the detector"):
                 self.judge(bench)
 
     def __str__(self) -> str:

@@ -11,12 +11,14 @@ checks run anywhere, in seconds.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from oodd_eval.metrics import Floats
 from oodd_eval.trajectory import Trajectory
 
 SENSORS: Final = 3
@@ -58,21 +60,7 @@ class Problem:
         sensors
             Sensors, D. Another number is another system.
         """
-        n = self.rows if rows is None else rows
-        turn = np.array([[np.cos(_TURN), -np.sin(_TURN)], [np.sin(_TURN), np.cos(_TURN)]])
-        push = np.array([[0.2, 0.0], [0.1, 0.2]])
-        system = np.random.default_rng(sensors)
-        mixing = system.normal(size=(2, sensors))
-        scale = 10.0 ** system.integers(-1, 2, size=sensors)
-        rng = np.random.default_rng([key, sensors])
-        state = rng.normal(size=2)
-        actions = rng.uniform(-1, 1, size=(n - 1, ACTIONS))
-        states = [state]
-        for action in actions:
-            state = _DECAY * turn @ state + push @ action + 0.1 * rng.normal(size=2)
-            states.append(state)
-        seen = np.array(states) @ mixing + 0.05 * rng.normal(size=(n, sensors))
-        return Trajectory(scale * seen, actions)
+        return Trajectory(*_system(key, self.rows if rows is None else rows, sensors))
 
     def training(self, sensors: int = SENSORS, first: int = 1000) -> list[Trajectory]:
         """Return nominal episodes of equal length to fit on."""
@@ -98,6 +86,23 @@ class Problem:
             wild = twin.observations + spread * noise
             found.append((Trajectory(wild, twin.actions), twin, onset))
         return found
+
+
+@functools.lru_cache(maxsize=256)
+def _system(key: int, rows: int, sensors: int) -> tuple[Floats, Floats]:
+    """Return observations (rows, D) and actions (rows - 1, A) of one nominal episode."""
+    system = np.random.default_rng(sensors)
+    mixing = system.normal(size=(2, sensors))
+    scale = 10.0 ** system.integers(-1, 2, size=sensors)
+    turn = np.array([[np.cos(_TURN), -np.sin(_TURN)], [np.sin(_TURN), np.cos(_TURN)]])
+    push = np.array([[0.2, 0.0], [0.1, 0.2]])
+    rng = np.random.default_rng([key, sensors])
+    actions = rng.uniform(-1, 1, size=(rows - 1, ACTIONS))
+    states = [rng.normal(size=2)]
+    for action in actions:
+        states.append(_DECAY * turn @ states[-1] + push @ action + 0.1 * rng.normal(size=2))
+    noise = 0.05 * rng.normal(size=(rows, sensors))
+    return scale * (np.array(states) @ mixing + noise), actions
 
 
 def altered_from(trajectory: Trajectory, row: int) -> Trajectory:

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Final
 
-from oodd_eval.channel import Channel, ChannelClosedError
+from oodd_eval.channel import Channel, ChannelClosedError, ChannelGarbledError
 from oodd_eval.processes import Child
 from oodd_eval.testing.report import Result
 
@@ -58,13 +58,14 @@ def supervise(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]:
     """
     rest, deaths = list(request.checks), 0
     while rest:
-        last = None
-        for last in _one_process(replace(request, checks=list(rest)), limits):
-            yield last
-            rest.remove(last.name)
+        died = ""
+        for result in _one_process(replace(request, checks=list(rest)), limits):
+            yield result
+            rest.remove(result.name)
+            died = result.name
         deaths += 1
-        if last is None or last.name in GATES or deaths == MOST_DEATHS:
-            reason = f"not tried: check '{last.name}' ended its process" if last else ""
+        if died in GATES or deaths == MOST_DEATHS:
+            reason = f"not tried: check '{died}' ended its process"
             yield from (Result(name, "skipped", reason) for name in rest)
             return
 
@@ -84,10 +85,12 @@ def _one_process(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]
             yield _result(channel.receive(), name)
     except _LimitPassedError as passed:
         ending = str(passed)
-    except (ChannelClosedError, BrokenPipeError, ValueError):
-        # A detector may have closed the pipe, or written into it.
+    except ChannelGarbledError:
+        ending = "wrote into the pipe to the harness"
+    except (ChannelClosedError, BrokenPipeError):
+        # A detector may have closed the pipe and gone on.
         gone = child.wait_for_exit(seconds=1.0)
-        ending = "" if gone else "broke off the conversation with the harness"
+        ending = "" if gone else "closed the pipe to the harness"
     else:
         return
     finally:
@@ -132,7 +135,7 @@ class _Watch:
 
 
 def _result(message: dict[str, Any], name: str) -> Result:
-    """Return the result of a check as it was sent; ValueError for anything else."""
+    """Return the result of a check as it was sent."""
     if set(message) != {field.name for field in fields(Result)} or message["name"] != name:
-        raise ValueError(f"expected the result of {name}, got {message!r:.80}")
+        raise ChannelGarbledError(f"expected the result of {name}, got {message!r:.80}")
     return Result(**message)

@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -54,7 +54,7 @@ class Watched:
     network
         Addresses asked for; connections were refused.
     written
-        Paths written to outside the places that are allowed; see `watch`.
+        Paths written to outside the places that are allowed; see `outside`.
     random
         Global generators whose state changed: ``"random"``, ``"numpy.random"``, ``"torch"``.
     threads
@@ -81,9 +81,8 @@ class Watched:
 def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Watched:
     """Do some work and see what it does beside.
 
-    It is done in an empty working directory and with a temporary directory of its own. Allowed are
-    writes to the user's cache directory, to ``__pycache__``, to devices, and to temporary files
-    that are gone in the end. The process is put back into the state before.
+    It is done in an empty working directory and with a temporary directory of its own. Afterwards
+    the process is put back into the state before.
 
     Parameters
     ----------
@@ -96,7 +95,7 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Watched:
     running_before = _running()
     with contextlib.ExitStack() as stack:
         here = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="oodd-check-")))
-        temporary = stack.enter_context(_places(here))
+        stack.enter_context(_places(here))
         generators = stack.enter_context(_fresh_generators())
         threads = stack.enter_context(_sentinel_threads())
         printed = stack.enter_context(_captured())
@@ -104,7 +103,8 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Watched:
         warnings.simplefilter("always")
         memory = _Memory()
         start = time.perf_counter()
-        with auditing() as events:
+        events = Events()
+        with auditing(events):
             try:
                 work()
             except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
@@ -118,7 +118,7 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Watched:
         seen.warnings = [f"{w.category.__name__}: {' '.join(str(w.message).split())}"
                          for w in caught or []]  # fmt: skip
         seen.network = events.network
-        seen.written = _outside(events, here, temporary)
+        seen.written = outside([*events.written, *_left(here)], here / "work")
         seen.printed = printed()
     seen.running = [name for _, name in sorted(_running() - running_before)]
     return seen
@@ -169,8 +169,8 @@ def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def _places(here: Path) -> Iterator[Path]:
-    """Work in an empty directory, with another one for temporary files; yield the latter."""
+def _places(here: Path) -> Iterator[None]:
+    """Work in an empty directory, with another one for temporary files."""
     work, temporary = here / "work", here / "temporary"
     work.mkdir()
     temporary.mkdir()
@@ -180,7 +180,7 @@ def _places(here: Path) -> Iterator[Path]:
     tempfile.tempdir = str(temporary)
     os.chdir(work)
     try:
-        yield temporary
+        yield
     finally:
         os.chdir(before)
         tempfile.tempdir = tempdir
@@ -298,20 +298,26 @@ def _resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def _outside(events: Events, here: Path, temporary: Path) -> list[str]:
-    """Return the paths written to that are not allowed, each once."""
+def _left(place: Path) -> list[Path]:
+    return [path for path in sorted(place.rglob("*")) if path.is_file()]
+
+
+def outside(written: Iterable[Path], here: Path) -> list[str]:
+    """Return the paths that must not be written to, each once, relative to `here` if below it.
+
+    Allowed are the user's cache directory, byte code, devices, and temporary files that are gone.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    left = [p for p in sorted(here.rglob("*")) if p.is_file()]
-    outside = [
+    temporary = Path(tempfile.gettempdir())
+    found = [
         path
-        for path in [*events.written, *left]
+        for path in written
         if "__pycache__" not in path.parts
         and not path.is_relative_to(cache)
         and path.parts[:2] not in {("/", "dev"), ("/", "proc")}
         and not (path.is_relative_to(temporary) and not path.exists())
     ]
-    names = [str(p.relative_to(here / "work")) if p.is_relative_to(here / "work") else str(p)
-             for p in outside]  # fmt: skip
+    names = [str(p.relative_to(here) if p.is_relative_to(here) else p) for p in found]
     return list(dict.fromkeys(names))
 
 

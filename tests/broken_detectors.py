@@ -1,0 +1,742 @@
+"""A good detector, and one that is broken in one way for every check of the conformance kit."""
+
+import contextlib
+import dataclasses
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import warnings
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from oodd_eval import DetectorSpec, Trajectory
+from oodd_eval.errors import NotFittedError, TrajectoryError
+
+
+class Good:
+    """Mean size of the change over one horizon, in whole quarters of the usual spread.
+
+    Whole numbers, so that messages do not depend on the last digit of a computation.
+    """
+
+    def __init__(self, *, seed=0, horizon=1, power=1.0):
+        self.seed, self.horizon, self.power = seed, horizon, power
+        self.std_ = None
+
+    def fit(self, nominal):
+        rows = np.concatenate([x.observations for x in nominal]).astype(np.float64)
+        std = rows.std(axis=0)
+        self.std_ = np.where(std < 1e-6, 1.0, std)
+        self.reset()
+
+    def score(self, x):
+        if self.std_ is None:
+            raise NotFittedError("score was called before fit")
+        if x.observation_dim != len(self.std_):
+            raise TrajectoryError(f"fitted on {len(self.std_)} sensors, got {x.observation_dim}")
+        z = x.observations / self.std_
+        scores = np.full(len(x), np.nan)
+        h = self.horizon
+        scores[h:] = np.round(4 * self.power * np.abs(z[h:] - z[:-h]).mean(axis=1))
+        return scores
+
+    def score_many(self, trajectories):
+        return [self.score(x) for x in trajectories]
+
+    def reset(self):
+        self.seen, self.done = [], []
+
+    def update(self, observation, action=None):
+        self.seen.append(observation)
+        if action is not None:
+            self.done.append(action)
+        actions = np.array(self.done) if self.done else np.empty((0, 1))
+        return float(self.score(Trajectory(self.seen, actions))[-1])
+
+    def save(self, directory):
+        np.savez(directory / "state.npz", std=self.std_)
+
+    def load(self, directory):
+        with np.load(directory / "state.npz", allow_pickle=False) as state:
+            self.std_ = state["std"]
+        self.reset()
+
+
+GOOD = DetectorSpec("good", Good, "", parameters={"power": 1.0}, fit_ignores=("horizon",))
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A spec, the check it must fail, the message, and the checks that fail with it.
+
+    In the message ``<n>`` stands for a number and ``<...>`` for any text.
+    """
+
+    check: str
+    spec: DetectorSpec
+    message: str
+    also: frozenset = frozenset()
+
+
+BROKEN = {}
+
+
+def breaks(check, message, *, also=(), **changes):
+    """Register a broken detector: the class below, with changes of the spec."""
+
+    def register(factory):
+        spec = dataclasses.replace(GOOD, factory=factory, **changes)
+        BROKEN[f"{check}-{factory.__name__}"] = Broken(check, spec, message, frozenset(also))
+        return factory
+
+    return register
+
+
+# How it is made, and what it says
+
+
+@breaks(
+    "factory",
+    "the factory returned NoScore without a method score: expected an object with fit(nominal) and "
+    "score(trajectory)",
+    parameters={},
+)
+class NoScore:
+    def __init__(self, *, seed, horizon): ...
+
+    def fit(self, nominal): ...
+
+
+@breaks(
+    "factory",
+    "the factory, called with seed=0, horizon=1, raised TypeError: NoHorizon.__init__() got an "
+    "unexpected keyword argument 'horizon' (<...>)",
+)
+class NoHorizon(Good):
+    def __init__(self, *, seed):
+        super().__init__(seed=seed)
+
+
+@breaks(
+    "unknown-parameter",
+    "the factory accepted no_such_parameter=1 without a word: expected a TypeError or ValueError, "
+    "so that a misspelt parameter is not taken for a setting",
+)
+class TakesAnything(Good):
+    def __init__(self, *, seed=0, horizon=1, power=1.0, **_):
+        super().__init__(seed=seed, horizon=horizon, power=power)
+
+
+@breaks("fits", "fit raised RuntimeError: no mood (broken_detectors.py:<n>)")
+class NoMood(Good):
+    def fit(self, nominal):
+        raise RuntimeError("no mood")
+
+
+@breaks("fits", "fit called sys.exit(3)")
+class Exits(Good):
+    def fit(self, nominal):
+        sys.exit(3)
+
+
+@breaks(
+    "declared-parameters",
+    "scores change when the declared defaults (power=2.0) are spelt out: at t = 1 it is <n> "
+    "instead of <n>; expected the defaults of the spec to be those of the factory",
+    parameters={"power": 2.0},
+)
+class OtherDefault(Good): ...
+
+
+@breaks(
+    "declared-parameters",
+    "the factory, called with seed=0, horizon=1, power=1.0, strength=2, raised TypeError: "
+    "Good.__init__() got an unexpected keyword argument 'strength' (<...>)",
+    parameters={"power": 1.0, "strength": 2},
+)
+class NoSuchParameter(Good): ...
+
+
+@breaks(
+    "not-fitted",
+    "score before fit raised AttributeError: 'NoneType' object has no attribute 'sum' "
+    "(broken_detectors.py:<n>): expected oodd_eval.errors.NotFittedError or a message that speaks "
+    "of fit",
+)
+class Unprepared(Good):
+    def score(self, x):
+        self.std_.sum()
+        return super().score(x)
+
+
+@breaks(
+    "not-fitted",
+    "score before fit returned scores, other ones than after it: expected "
+    "oodd_eval.errors.NotFittedError",
+)
+class ScoresUnfitted(Good):
+    def score(self, x):
+        return np.zeros(len(x)) if self.std_ is None else super().score(x)
+
+
+@breaks(
+    "wrong-dimension",
+    "score, fitted on 3 sensors and given 7, returned scores: expected a ValueError that names "
+    "both",
+)
+class LooksAtTheFirst(Good):
+    def score(self, x):
+        d = len(self.std_) if self.std_ is not None else 0
+        return super().score(Trajectory(x.observations[:, :d] if d else x.observations, x.actions))
+
+
+@breaks(
+    "wrong-dimension",
+    "score, fitted on 3 sensors and given 7, raised ValueError: bad shape "
+    "(broken_detectors.py:<n>): expected a ValueError that names both numbers",
+)
+class Taciturn(Good):
+    def score(self, x):
+        if self.std_ is not None and x.observation_dim != len(self.std_):
+            raise ValueError("bad shape")
+        return super().score(x)
+
+
+# Scores
+
+
+@breaks(
+    "shape",
+    "score returned shape (80,) for 81 observations: expected (81,), one score per observation",
+)
+class OneShort(Good):
+    def score(self, x):
+        return super().score(x)[1:]
+
+
+@breaks("dtype", "score returned float32 scores, expected float64")
+class Single(Good):
+    def score(self, x):
+        return super().score(x).astype(np.float32)
+
+
+@breaks("dtype", "score returned list, expected a numpy array")
+class PlainList(Good):
+    def score(self, x):
+        return super().score(x).tolist()
+
+
+@breaks(
+    "finite",
+    "the score at t = 30 of 81 is nan: expected finite scores but for one leading block of NaN",
+)
+class LateNan(Good):
+    def score(self, x):
+        scores = super().score(x)
+        scores[30:31] = np.nan
+        return scores
+
+
+@breaks(
+    "finite",
+    "the score at t = 40 of 81 is inf: expected finite scores but for one leading block of NaN",
+)
+class Overflows(Good):
+    def score(self, x):
+        scores = super().score(x)
+        return np.where(scores > 25, np.inf, scores)
+
+
+@breaks(
+    "warm-up",
+    "the first 3 scores are NaN, but with horizon 1 and warm_up 0 at most 1 may be: declare "
+    "warm_up = 3, or pad",
+)
+class SecretWarmUp(Good):
+    def score(self, x):
+        scores = super().score(x)
+        scores[:3] = np.nan
+        return scores
+
+
+@breaks(
+    "warm-up",
+    "warm_up is 9, but only the first 1 scores are NaN: declare what is left undefined",
+)
+class BraggingWarmUp(Good):
+    warm_up = 9
+
+
+@breaks("warm-up", "warm_up is 50, expected an int between 0 and 20")
+class LongWarmUp(Good):
+    warm_up = 50
+
+
+@breaks("horizon", "with horizon 4 the first 8 scores are NaN: expected at most 4")
+class TwiceTheHorizon(Good):
+    def score(self, x):
+        scores = super().score(x)
+        scores[: 2 * self.horizon if self.horizon > 1 else 0] = np.nan
+        return scores
+
+
+@breaks(
+    "gross-anomaly",
+    "an episode whose sensors go wild scores above its nominal twin in 0% of pairs, expected at "
+    "least 75%: scores seem to point the other way: negate them",
+)
+class Reversed(Good):
+    def score(self, x):
+        return -super().score(x)
+
+
+# The same answer to the same question
+
+
+@breaks(
+    "same-seed",
+    "a second detector of seed 0, fitted on the same trajectories, has other scores: at t = <n> "
+    "it is <n> instead of <n>; draw all randomness from the seed",
+)
+class ReadsTheGlobalState(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.std_ *= 1 + np.random.get_state()[1][0] % 1000 / 2000  # noqa: NPY002
+
+
+@breaks(
+    "refit",
+    "a detector that was fitted on something else before has other scores: at t = 1 it is <n> "
+    "instead of <n>; fit has to begin anew",
+)
+class Remembers(Good):
+    fits = 0
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.fits += 1
+
+    def score(self, x):
+        return super().score(x) + max(self.fits - 1, 0)
+
+
+@breaks(
+    "order",
+    "scores of a trajectory change with what was scored before: at t = 1 it is <n> instead of <n>; "
+    "score must not keep anything",
+    also={"score-many", "causality", "prefix"},
+)
+class Shocked(Good):
+    """Scores one more after it has seen something wild."""
+
+    shock = 0
+
+    def score(self, x):
+        scores = super().score(x) + self.shock
+        self.shock = int(np.nanmax(scores, initial=0) > 25)
+        return scores
+
+
+@breaks(
+    "score-many",
+    "score_many of 5 trajectories differs from score: at t = 1 it is <n> instead of <n>",
+)
+class MindsTheCompany(Good):
+    def score_many(self, trajectories):
+        return [self.score(x) + len(trajectories) - 1 for x in trajectories]
+
+
+@breaks("score-many", "score_many returned 4 score arrays for 5 trajectories")
+class LosesOne(Good):
+    def score_many(self, trajectories):
+        return super().score_many(trajectories[1:])
+
+
+@breaks("inputs-unchanged", "fit changed the list of trajectories that it was given")
+class Shuffles(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        if isinstance(nominal, list):
+            nominal.reverse()
+
+
+@breaks("inputs-unchanged", "fit changed the arrays of a trajectory", also={"read-only"})
+class Rescales(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        for x in nominal:
+            x.observations.flags.writeable = True
+            x.observations[:] = np.abs(x.observations)
+
+
+@breaks(
+    "read-only",
+    "fit raised ValueError: cannot set WRITEABLE flag to True of this array "
+    "(broken_detectors.py:<n>)",
+)
+class Unlocks(Good):
+    def fit(self, nominal):
+        for x in nominal:
+            x.observations.flags.writeable = True
+        super().fit(nominal)
+
+
+# Time
+
+
+@breaks(
+    "causality",
+    "scores before t = 2 change when the episode goes on otherwise from there: at t = 1 it is <n> "
+    "instead of <n>; a score may use nothing after its time",
+    also={"prefix", "streaming"},
+)
+class LooksAhead(Good):
+    def score(self, x):
+        scores = super().score(x)
+        return np.append(scores[:1], np.append(scores[2:], scores[-1:]))[: len(x)]
+
+
+@breaks(
+    "prefix",
+    "the first 1 of 81 observations alone have other scores: at t = 0 it is 0 instead of nan",
+    also={"streaming"},
+)
+class KnowsTheLength(Good):
+    def score(self, x):
+        return super().score(x) if len(x) > 1 else np.zeros(1)
+
+
+@breaks(
+    "streaming",
+    "update differs from score of the whole episode: at t = 11 it is <n> instead of <n>",
+)
+class Hurried(Good):
+    def update(self, observation, action=None):
+        return super().update(observation, action) + (len(self.seen) > 11)
+
+
+@breaks(
+    "streaming",
+    "update differs from score of the whole episode: at t = 1 it is <n> instead of <n>",
+)
+class CountsEpisodes(Good):
+    episodes = -1
+
+    def reset(self):
+        super().reset()
+        self.episodes += 1
+
+    def update(self, observation, action=None):
+        return super().update(observation, action) + self.episodes
+
+
+@breaks("streaming", "has only one of reset and update: expected both, or none")
+class HalfStreaming(Good):
+    reset = None
+
+    def fit(self, nominal):
+        self.reset = lambda: None
+        super().fit(nominal)
+        del self.reset
+
+    def load(self, directory):
+        self.reset = lambda: None
+        super().load(directory)
+        del self.reset
+
+
+# Edges
+
+
+@breaks(
+    "short-trajectories",
+    "score of an episode of 1 observation raised IndexError: <...> (broken_detectors.py:<n>)",
+    also={"prefix", "streaming"},
+)
+class NeedsTwo(Good):
+    def score(self, x):
+        scores = super().score(x)
+        x.observations[1]
+        return scores
+
+
+@breaks(
+    "constant-trajectory",
+    "an episode in which nothing moves has the score nan at t = 1: expected finite ones",
+)
+class DividesByTheSpread(Good):
+    def score(self, x):
+        still = len(x) > 3 and not np.ptp(x.observations, axis=0).any()
+        return super().score(x) * (np.nan if still else 1)
+
+
+@breaks(
+    "constant-sensor",
+    "an episode with a sensor that stands still has the score nan at t = 1: expected finite ones",
+)
+class DividesByZero(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        rows = np.concatenate([x.observations for x in nominal])
+        self.std_ = rows.std(axis=0, dtype=np.float64)
+
+
+@breaks(
+    "unequal-lengths", "fit raised ValueError: all input arrays must have the same shape (<...>)"
+)
+class Stacks(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        np.stack([x.observations for x in nominal])
+
+
+# Files
+
+
+@breaks(
+    "save-and-load",
+    "a detector that loaded a saved fit differs: at t = <n> it is <n> instead of <n>",
+    also={"shared-fit"},
+)
+class SavesHalf(Good):
+    def save(self, directory):
+        np.savez(directory / "state.npz", std=np.ones_like(self.std_))
+
+
+@breaks("save-and-load", "save wrote no file into the directory that it was given",
+        also={"shared-fit", "saved-files"})  # fmt: skip
+class SavesNothing(Good):
+    def save(self, directory): ...
+
+
+@breaks(
+    "save-and-load",
+    "load raised FileNotFoundError: <...>",
+    also={"shared-fit"},
+)
+class LoadsElsewhere(Good):
+    def load(self, directory):
+        (directory / "elsewhere").read_bytes()
+
+
+@breaks(
+    "shared-fit",
+    "a fit of horizon 1, loaded for horizon 3, differs from a fit of horizon 3: at t = 3 it is <n> "
+    "instead of <n>; it must not be in fit_ignores",
+)
+class FitsItsHorizon(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.std_ = self.std_ / self.horizon
+
+
+class Pickles(Good):
+    """Saves one file more than the good one."""
+
+    extra, content = "", b""
+
+    def save(self, directory):
+        super().save(directory)
+        (directory / self.extra).write_bytes(self.content)
+
+
+WROTE = "save wrote {}: expected JSON, npz without objects, or safetensors"
+
+
+@breaks("saved-files", WROTE.format("model.pkl, a pickle by its name"))
+class PicklesOpenly(Pickles):
+    extra, content = "model.pkl", b"anything"
+
+
+@breaks("saved-files", WROTE.format("model.bin, a pickle by its first bytes"))
+class PicklesSecretly(Pickles):
+    extra, content = "model.bin", b"\x80\x04N."
+
+
+@breaks("saved-files", WROTE.format("extra.npz, which holds Python objects in a.npy"))
+class SavesObjects(Good):
+    def save(self, directory):
+        super().save(directory)
+        np.savez(directory / "extra.npz", a=np.array([{}], dtype=object))
+
+
+@breaks("saved-files", WROTE.format("model.pt, which holds the pickle model/data.pkl"))
+class SavesLikeTorch(Good):
+    def save(self, directory):
+        super().save(directory)
+        with zipfile.ZipFile(directory / "model.pt", "w") as archive:
+            archive.writestr("model/data.pkl", b"\x80\x02N.")
+
+
+# Manners
+
+ENDS, STARTED = [], []
+"""Events that end threads, and processes, for those who clean up."""
+
+
+@breaks(
+    "random-state",
+    "fit or score changed the state of the global generator of numpy.random: use "
+    "numpy.random.default_rng(seed), or a generator of one's own",
+)
+class Seeds(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        np.random.seed(self.seed)  # noqa: NPY002
+
+
+@breaks(
+    "thread-settings",
+    "fit or score changed OMP_NUM_THREADS: 3 -> 1: the number of threads is the user's",
+)
+class SetsThreads(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        os.environ["OMP_NUM_THREADS"] = "1"
+
+
+@breaks(
+    "global-settings",
+    "fit or score changed recursion limit: <n> -> 4321: leave, or put back, what is global",
+)
+class SetsTheLimit(Good):
+    def score(self, x):
+        sys.setrecursionlimit(4321)
+        return super().score(x)
+
+
+@breaks(
+    "global-settings",
+    "fit or score changed working directory: <...>work -> /: leave, or put back, what is global",
+)
+class Wanders(Good):
+    def score(self, x):
+        os.chdir("/")
+        return super().score(x)
+
+
+@breaks("leftovers", "left running: thread pump: end what was started")
+class LeavesAThread(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        ENDS.append(threading.Event())
+        threading.Thread(target=ENDS[-1].wait, name="pump").start()
+
+
+@breaks("leftovers", "left running: process <n> (sleep): end what was started")
+class LeavesAProcess(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        STARTED.append(subprocess.Popen(["sleep", "60"]))
+
+
+@breaks("quiet", "fit or score printed 8 characters, first 'fitting': expected none")
+class Prints(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        print("fitting")  # noqa: T201
+
+
+@breaks("quiet", "fit or score printed 4 characters, first 'deep': expected none")
+class PrintsBelow(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        os.write(2, b"deep")
+
+
+@breaks(
+    "warnings",
+    "fit or score warned: UserWarning: it is late: mend or silence what is expected",
+)
+class Warns(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        warnings.warn("it is late", stacklevel=1)
+
+
+@breaks(
+    "network",
+    "the factory, fit or score asked the network for 127.0.0.1:9: a detector comes with all that "
+    "it needs",
+)
+class PhonesHome(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        with contextlib.suppress(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", 9), timeout=0.1).close()
+
+
+@breaks(
+    "network",
+    "the factory, fit or score asked the network for weights.example:443: a detector comes with "
+    "all that it needs",
+)
+class FetchesOnce(Good):
+    fetched = False
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        if not FetchesOnce.fetched:
+            FetchesOnce.fetched = True
+            with contextlib.suppress(ConnectionRefusedError):
+                socket.getaddrinfo("weights.example", 443)
+
+
+ADVICE = "write below XDG_CACHE_HOME (default ~/.cache), or to temporary files that are removed"
+
+
+@breaks("files", f"the factory, fit or score wrote model.bin: {ADVICE}")
+class WritesHere(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        Path("model.bin").write_bytes(b"x")
+
+
+@breaks("files", f"the factory, fit or score wrote model.bin: {ADVICE}")
+class WritesHereOnce(Good):
+    written = False
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        if not WritesHereOnce.written:
+            WritesHereOnce.written = True
+            Path("model.bin").write_bytes(b"x")
+
+
+@breaks(
+    "files",
+    "in an empty working directory it raised FileNotFoundError: <...>: relative paths depend on "
+    "where the user stands",
+)
+class ReadsHere(Good):
+    """Reads a file that lies where the tests stand."""
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        Path("here.txt").read_text()
+
+
+@breaks(
+    "time-budget",
+    "fit and score took <n> s on 12 episodes of 81 observations: expected at most 0.2 s",
+)
+class Slow(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        time.sleep(0.25)
+
+
+@breaks(
+    "memory-budget",
+    "fit and score took <n> MB on 12 episodes of 81 observations: expected at most 100 MB",
+)
+class Fat(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        np.ones(25 * 10**6).sum()

@@ -1,0 +1,238 @@
+"""``oodd-eval check``: exit codes, what is printed, and detectors that end their process."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import cli
+from oodd_eval.testing import detector_checks
+
+NAMES = [check.name for check in detector_checks()]
+
+PLUGIN = """
+import ctypes
+from oodd_eval.errors import NotFittedError, TrajectoryError
+
+class Fine(Good):
+    fitted = None
+    def __init__(self, *, seed=0, horizon=1, power=1.0):
+        self.power = power
+    def fit(self, nominal):
+        self.fitted = nominal[0].observation_dim
+    def score(self, x):
+        if self.fitted is None: raise NotFittedError("call fit before score")
+        if x.observation_dim != self.fitted:
+            raise TrajectoryError(f"fitted on {self.fitted} sensors, got {x.observation_dim}")
+        return super().score(x)
+
+class CrashesOnShort(Fine):
+    def score(self, x):
+        if len(x) == 1:
+            print("last words", flush=True)
+            os.kill(os.getpid(), signal.SIGSEGV)
+        return super().score(x)
+
+class HangsOnConstant(Fine):
+    def score(self, x):
+        if self.fitted and not np.ptp(x.observations, axis=0).any() and len(x) > 5: time.sleep(600)
+        return super().score(x)
+
+class Crashes(Fine):
+    def fit(self, nominal): ctypes.string_at(0)
+
+class ExitsOften(Fine):
+    scored = 0
+    def score(self, x):
+        self.scored += 1
+        if self.scored == 3: os._exit(7)
+        return super().score(x)
+
+class Grows(Fine):
+    def fit(self, nominal): self.rows = np.ones(10**8); time.sleep(600)
+
+class Garbles(Fine):
+    def score(self, x):
+        for descriptor in range(3, 30):
+            try: os.write(descriptor, b"garbage" * 10)
+            except OSError: pass
+        return super().score(x)
+
+class ClosesAll(Fine):
+    def fit(self, nominal):
+        os.closerange(0, 100); time.sleep(600)
+
+class Raises(Fine):
+    def score(self, x): raise RuntimeError("no mood")
+
+@hookimpl
+def oodd_detectors():
+    found = {k: v for k, v in globals().items() if isinstance(v, type) and issubclass(v, Fine)}
+    spec = DetectorSpec("needy", Fine, "", requires=("no_such",), extra="oodd-x[y]")
+    return [spec, *(DetectorSpec(k.lower(), v, "", parameters={"power": 1.0})
+            for k, v in found.items())]
+"""
+
+
+@pytest.fixture
+def check(monkeypatch, tmp_path, capsys):
+    """Call ``oodd-eval check``: exit code, standard output and error."""
+    install(monkeypatch, tmp_path, "checked", PLUGIN)
+
+    def call(*arguments):
+        code = cli.main(["check", *arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def statuses(out):
+    return {
+        m[2]: m[1]
+        for m in re.finditer(r"^(passed|FAILED|skipped|xfailed) +(\S+)", out, re.MULTILINE)
+    }
+
+
+def test_a_conforming_detector_is_exit_code_0_with_a_line_per_check(check):
+    code, out, err = check("fine")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0] == "fine of oodd-checked 1.0, horizon 1, seed 0"
+    assert list(statuses(out)) == NAMES
+    assert set(statuses(out).values()) == {"passed", "skipped"}
+    assert re.search(
+        rf"^{len(NAMES)} checks: \d+ passed, \d+ skipped in \d+\.\d s$", out, re.MULTILINE
+    )
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_failing_check_is_exit_code_1(check):
+    code, out, _ = check("clock", "-k", "anomaly or shape")
+    assert code == 1
+    assert statuses(out) == {"shape": "passed", "gross-anomaly": "FAILED"}
+    assert "2 checks: 1 passed, 1 failed in" in out
+
+
+def test_a_failure_may_be_expected(check):
+    arguments = ["clock", "-k", "anomaly", "--expect", "gross-anomaly=it is a clock"]
+    code, out, _ = check(*arguments)
+    assert code == 0
+    assert "it is a clock [an episode" in " ".join(out.split())
+
+
+def test_an_expected_failure_that_passes_is_exit_code_1(check):
+    code, out, _ = check("fine", "-k", "shape", "--expect", "shape=why not")
+    assert code == 1
+    assert "XPASSED  shape" in out
+
+
+def test_quiet_prints_failures_and_the_summary(check):
+    _, out, _ = check("clock", "-q")
+    assert out.startswith("FAILED   gross-anomaly\n")
+    assert list(statuses(out)) == ["gross-anomaly"]
+
+
+def test_verbose_prints_where_a_detector_raised(check):
+    _, out, _ = check("raises", "-v", "-k", "fits")
+    assert "Traceback" in out
+    assert 'raise RuntimeError("no mood")' in out
+    assert "Traceback" not in check("raises", "-k", "fits")[1]
+
+
+def test_horizon_and_parameters_reach_the_detector(check):
+    code, out, _ = check("fine", "--horizon", "1,7", "--param", "power=2", "-k", "shape")
+    assert code == 0
+    assert [line for line in out.splitlines() if line.startswith("fine")] == [
+        f"fine of oodd-checked 1.0, horizon {h}, seed 0, power 2" for h in (1, 7)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fin"], "unknown detector 'fin': did you mean 'fine'"),
+        (["fine", "--param", "x=1"], "unknown parameter of fine 'x'"),
+        (["fine", "--param", "x"], "--param 'x', expected NAME=VALUE"),
+        (["fine", "--expect", "ordr=x"], "unknown check 'ordr': did you mean 'order'"),
+        (["fine", "--horizon", "0"], "--horizon is '0', expected whole numbers of at least 1"),
+        (["fine", "--seed", "-1"], "--seed is -1, expected at least 0"),
+        (["fine", "--timeout", "soon"], "'soon' is not a time"),
+        (["needy"], 'needs no_such: pip install "oodd-x[y]"'),
+    ],
+)
+def test_what_cannot_be_carried_out_is_exit_code_4(check, arguments, message):
+    code, out, err = check(*arguments)
+    assert (code, out) == (4, "")
+    assert message in err
+
+
+def test_nothing_selected_is_exit_code_5(check):
+    code, out, err = check("fine", "-k", "zzz")
+    assert (code, out) == (5, "")
+    assert err == "oodd-eval: no check matches -k 'zzz'\n"
+
+
+# Detectors that end, or keep, the process in which they are checked
+
+
+def test_a_crash_fails_the_check_it_was_in_and_the_others_go_on(check):
+    code, out, _ = check("crashesonshort", "-v")
+    assert code == 1
+    found = statuses(out)
+    assert list(found) == NAMES
+    assert {n for n, s in found.items() if s == "FAILED"} == {"prefix", "short-trajectories"}
+    assert out.count("the process was killed by SIGSEGV") == 2
+    assert "last words" in out
+
+
+def test_a_hang_is_ended_by_the_limit(check):
+    code, out, _ = check("hangsonconstant", "-k", "constant or shape", "--timeout", "4")
+    assert code == 1
+    assert statuses(out) == {
+        "shape": "passed", "constant-trajectory": "FAILED", "constant-sensor": "passed",
+    }  # fmt: skip
+    assert "the process was not done after 4 s (--timeout)" in " ".join(out.split())
+
+
+def test_a_crash_in_fit_is_told_once(check):
+    code, out, _ = check("crashes")
+    assert code == 1
+    assert [n for n, s in statuses(out).items() if s == "FAILED"] == ["fits"]
+    assert "killed by SIGSEGV" in out
+    assert "not tried: check 'fits' ended its process" in out
+
+
+def test_after_three_dead_processes_the_rest_are_not_tried(check):
+    code, out, _ = check("exitsoften")
+    assert code == 1
+    assert list(statuses(out)) == NAMES
+    failed = [n for n, s in statuses(out).items() if s == "FAILED"]
+    assert failed == ["wrong-dimension", "shape", "finite"]
+    assert "not tried: check 'finite' ended its process" in out
+    assert out.count("the process ended with exit code 7") == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("grows", r"the process held \d+ MB, more than 300 MB \(--memory\)"),
+        ("garbles", r"the process wrote into the pipe to the harness"),
+        ("closesall", r"the process closed the pipe to the harness"),
+    ],
+)
+def test_other_ways_to_misuse_the_process_are_named(check, name, message):
+    code, out, _ = check(name, "-k", "fits", "--memory", "300MB", "--timeout", "60")
+    assert code == 1
+    assert re.search(message, " ".join(out.split()))
+
+
+def test_help_imports_no_check():
+    code = (
+        "import sys\nfrom oodd_eval.cli import main\nmain(['check', '--help'])\n"
+        "sys.exit(int('oodd_eval.testing' in sys.modules or 'numpy' in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--expect NAME=REASON" in done.stdout
