@@ -76,7 +76,7 @@ def load_split(name: str | Path) -> Split:
     if str(name) in SPLITS:
         raise SplitNotFoundError(
             f"split {str(name)!r} is not on this machine: build it with "
-            f"`oodd-eval data build {name}`"
+            f"`oodd-eval data build {name}`, or fetch a copy with `oodd-eval data fetch`"
         )
     raise UnknownNameError("split", str(name), {*known, *SPLITS})
 
@@ -117,6 +117,12 @@ class TrajectorySet(Sequence[Trajectory]):
 
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[i] for i in range(len(self)))
+
+    def rewards(self, index: int) -> NDArray[np.float32]:
+        """Rewards of one trajectory, of shape (T,)."""
+        i = range(len(self))[index]
+        found: NDArray[np.float32] = self._data["rewards"][self._offsets[i] : self._offsets[i + 1]]
+        return found
 
     @property
     def returns(self) -> NDArray[np.float64]:

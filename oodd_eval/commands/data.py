@@ -1,4 +1,4 @@
-"""``oodd-eval data``: build, verify and describe splits."""
+"""``oodd-eval data``: build, verify, fetch, export and describe splits."""
 
 from __future__ import annotations
 
@@ -91,6 +91,42 @@ def verify(options: argparse.Namespace) -> int:
         "as they should be"
     )
     return int(wrong > 0)
+
+
+def fetch(options: argparse.Namespace) -> int:
+    """Carry out ``data fetch``; what an earlier call has brought is kept."""
+    from oodd_eval.transfer.fetch import fetch as bring  # noqa: PLC0415  reads archives and the web
+
+    console = make_console()
+
+    def progress(file: str) -> None:
+        if options.verbosity >= 0:
+            console.print(f"{file}  verified")
+
+    output = Path(options.output) if options.output else None
+    found = bring(options.place, output=output, digest=options.digest, progress=progress)
+    split, there = found.split, " already" if found.already else ""
+    console.print(f"split {split.name}, digest {split.digest}, is{there} in {split.path}")
+    return 0
+
+
+def export(options: argparse.Namespace) -> int:
+    """Carry out ``data export``."""
+    from oodd_eval.transfer import minari  # noqa: PLC0415  writes HDF5
+
+    console = make_console()
+    split = load_split(_place(options.name))
+    written = minari.export(
+        split,
+        Path(options.output),
+        environments=select("environment", options.env, split.environments),
+        progress=lambda name: console.print(name) if options.verbosity >= 0 else None,
+    )
+    console.print(
+        f"{len(written)} datasets in {options.output}: Minari finds them with "
+        f"MINARI_DATASETS_PATH={options.output}"
+    )
+    return 0
 
 
 def info(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from oodd_eval.options import Commands, Parser, command
 
 def add(commands: Commands[Parser]) -> None:
     """Add ``data`` and its actions."""
-    data = commands.add_parser("data", help="build, verify and describe splits")
+    data = commands.add_parser("data", help="build, verify, fetch and export splits")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
     build = command(actions, "build", "data:build", "record a split (needs the extra sim)")
     add = build.add_argument
@@ -22,5 +22,16 @@ def add(commands: Commands[Parser]) -> None:
     add("--output", metavar="DIR", help="directory of the split (default: where splits are found)")
     verify = command(actions, "verify", "data:verify", "compare a split with its digests")
     verify.add_argument("name", help="name or path of a split")
+    fetch = command(actions, "fetch", "data:fetch", "verify a copy of a split and install it")
+    add = fetch.add_argument
+    add("place", metavar="FILE|DIR|URL", help="a split's directory, or a tar or zip archive of it")
+    add("--digest", metavar="SHA256", help="the split's digest; another one is refused")
+    add("--output", metavar="DIR", help="directory of the split (default: where splits are found)")
+    export = command(actions, "export", "data:export", "write a split in another project's format")
+    add = export.add_argument
+    add("name", help="name or path of a split")
+    add("--format", required=True, choices=["minari"], help="minari: one dataset a part")
+    add("--output", required=True, metavar="DIR", help="root of the datasets")
+    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
     info = command(actions, "info", "data:info", "describe a split")
     info.add_argument("name", help="name or path of a split")

@@ -1,0 +1,643 @@
+"""Fetching takes over nothing that is not as the manifest says; exports are what Minari opens."""
+
+import fcntl
+import functools
+import http.server
+import importlib.util
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import threading
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers_split import make_split
+
+from oodd_eval import load_split
+from oodd_eval.cli import main
+from oodd_eval.errors import (
+    DigestError,
+    OutputError,
+    SplitError,
+    SplitNotFoundError,
+    UsageError,
+)
+from oodd_eval.splits import SHIPPED, split_directories
+from oodd_eval.splits_format import environment_digest, split_digest
+from oodd_eval.transfer import minari
+from oodd_eval.transfer.fetch import fetch
+
+
+@pytest.fixture
+def home(monkeypatch, tmp_path):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def copy(tiny_split, tmp_path):
+    """A copy of the tiny split that a test may damage."""
+    return Path(shutil.copytree(tiny_split, tmp_path / "copy"))
+
+
+def pack(directory, archive, folder="tiny/"):
+    """Write a tar or zip archive of a split's directory."""
+    files = sorted(directory.iterdir())
+    if archive.suffix == ".zip":
+        with zipfile.ZipFile(archive, "w") as packed:
+            for file in files:
+                packed.write(file, folder + file.name)
+    else:
+        mode = "w:gz" if archive.name.endswith("gz") else "w"
+        with tarfile.open(archive, mode) as packed:
+            for file in files:
+                packed.add(file, folder + file.name)
+    return archive
+
+
+def is_installed(home, tiny_split):
+    split = load_split("tiny")
+    return (
+        split.path == home / "tiny"
+        and split.digest == load_split(tiny_split).digest
+        and all(check.ok for check in split.verify())
+        and sorted(p.name for p in home.iterdir()) == ["tiny"]
+        and len(list((home / "tiny").iterdir())) == 3
+    )
+
+
+# Where from
+
+
+@pytest.mark.parametrize("archive", ["", "x.tar", "x.tar.gz", "x.tgz", "x.zip", "no-suffix"])
+@pytest.mark.parametrize("scheme", ["", "file://"])
+def test_a_split_is_fetched_from_a_directory_or_an_archive(
+    tiny_split, home, tmp_path, archive, scheme
+):
+    place = pack(tiny_split, tmp_path / archive) if archive else tiny_split
+    assert not fetch(f"{scheme}{place}").already
+    assert is_installed(home, tiny_split)
+
+
+def test_an_archive_may_have_no_folder(tiny_split, home, tmp_path):
+    fetch(str(pack(tiny_split, tmp_path / "x.tar", folder="")))
+    assert is_installed(home, tiny_split)
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Serves files, with ranges; may break off, and writes down what it was asked for."""
+
+    def do_GET(self):
+        server = self.server
+        begin = self.headers.get("Range")
+        server.asked.append((self.path, begin))
+        try:
+            content = Path(self.translate_path(self.path)).read_bytes()
+        except OSError:
+            self.send_error(404)
+            return
+        if begin and server.ranges:
+            start = int(begin.removeprefix("bytes=").removesuffix("-"))
+            if start >= len(content):
+                self.send_error(416)
+                return
+            content = content[start:]
+            self.send_response(206)
+        else:
+            self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        most = server.breaks.pop(0) if server.breaks and not self.path.endswith("json") else None
+        self.wfile.write(content[:most])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def web(tmp_path):
+    """A web server on loopback whose root is ``tmp_path/www``."""
+    (tmp_path / "www").mkdir()
+    handler = functools.partial(Handler, directory=str(tmp_path / "www"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        server.asked, server.breaks, server.ranges = [], [], True
+        server.root = tmp_path / "www"
+        server.address = f"http://127.0.0.1:{server.server_address[1]}"
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def test_a_split_is_fetched_from_a_web_directory(tiny_split, home, web):
+    shutil.copytree(tiny_split, web.root / "tiny")
+    fetch(f"{web.address}/tiny/")
+    assert is_installed(home, tiny_split)
+    assert [path for path, _ in web.asked] == [
+        "/tiny/manifest.json", "/tiny/cartpole.h5", "/tiny/hopper.h5",
+    ]  # fmt: skip
+
+
+def test_an_archive_is_fetched_from_the_web(tiny_split, home, web):
+    pack(tiny_split, web.root / "tiny.tar.gz")
+    fetch(f"{web.address}/tiny.tar.gz")
+    assert is_installed(home, tiny_split)
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+@pytest.mark.parametrize("kind", ["directory", "archive"])
+def test_a_download_that_broke_off_goes_on(tiny_split, home, web, ranges, kind):
+    web.ranges = ranges
+    if kind == "archive":
+        size = pack(tiny_split, web.root / "tiny.tar").stat().st_size
+        place, web.breaks = f"{web.address}/tiny.tar", [size - 5000]
+    else:
+        shutil.copytree(tiny_split, web.root / "tiny")
+        size = (tiny_split / "cartpole.h5").stat().st_size
+        place, web.breaks = f"{web.address}/tiny", [size - 5000]
+    with pytest.raises(SplitError, match=r"broke off .*run the same command again"):
+        fetch(place)
+    assert split_directories().keys() == {"mini"}
+    fetch(place)
+    assert is_installed(home, tiny_split)
+    assert f"bytes={size - 5000}-" in {begin for _, begin in web.asked}
+
+
+def test_files_that_are_there_and_whole_are_not_fetched_again(tiny_split, home, web):
+    shutil.copytree(tiny_split, web.root / "tiny")
+    web.breaks = [None, 100]
+    with pytest.raises(SplitError, match="broke off"):
+        fetch(f"{web.address}/tiny")
+    web.asked.clear()
+    fetch(f"{web.address}/tiny")
+    assert [path for path, _ in web.asked] == ["/tiny/manifest.json", "/tiny/hopper.h5"]
+    assert is_installed(home, tiny_split)
+
+
+def test_what_is_not_on_the_server_is_named(home, web):
+    with pytest.raises(SplitNotFoundError, match=r"/none/manifest\.json answers 404"):
+        fetch(f"{web.address}/none")
+    assert not list(home.iterdir())
+
+
+def test_a_server_that_does_not_answer_is_named(home, web):
+    with pytest.raises(SplitError, match=r"http://127\.0\.0\.1:9/x\.tar cannot be reached"):
+        fetch("http://127.0.0.1:9/x.tar")
+
+
+@pytest.mark.parametrize("place", ["ftp://h/x.tar", "s3://bucket/x"])
+def test_other_schemes_are_refused(home, place):
+    with pytest.raises(UsageError, match=r"expected http://, https:// or file://"):
+        fetch(place)
+
+
+def test_nothing_at_the_place_is_said(home):
+    with pytest.raises(SplitNotFoundError, match="there is nothing at /no/such"):
+        fetch("/no/such")
+
+
+# What is refused; after each of these nothing is installed.
+
+
+def edit(directory, change):
+    """Change a manifest and make its digests fit, as somebody would who wants to deceive."""
+    file = directory / "manifest.json"
+    manifest = json.loads(file.read_text())
+    change(manifest)
+    digests = {
+        e: environment_digest({g: f["sha256"] for g, f in entry["groups"].items()})
+        for e, entry in manifest["environments"].items()
+    }
+    manifest["digest"] = split_digest(digests, manifest["definition"])
+    file.write_text(json.dumps(manifest))
+
+
+def rename_file(manifest):
+    manifest["environments"]["hopper"]["file"] = "../../hopper.h5"
+
+
+def rename_split(manifest):
+    manifest["name"] = "../elsewhere"
+
+
+def hide_split(manifest):
+    manifest["name"] = ".fetch"
+
+
+def unknown_environment(manifest):
+    manifest["environments"]["pong"] = manifest["environments"].pop("hopper")
+
+
+def more_transitions(manifest):
+    manifest["environments"]["hopper"]["groups"]["train"]["transitions"] += 1
+
+
+def huge(manifest):
+    manifest["environments"]["hopper"]["groups"]["train"]["transitions"] = 10**12
+
+
+def fewer_groups(manifest):
+    del manifest["environments"]["hopper"]["groups"]["test/iid"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (rename_file, r"names the file '../../hopper.h5' for hopper, expected 'hopper.h5'"),
+        (rename_split, "names the split '../elsewhere', which is no name"),
+        (hide_split, "names the split '.fetch', which is no name"),
+        (unknown_environment, "unknown environment 'pong'"),
+        (more_transitions, r"hopper.h5, train has 6 trajectories with \d+ transitions, expected"),
+        (huge, "the manifest says 1000000000000 transitions for hopper, train"),
+        (fewer_groups, "hopper.h5 holds the groups .*test/iid.*, expected"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_is_refused(copy, home, change, message):
+    edit(copy, change)
+    with pytest.raises(SplitError, match=message):
+        fetch(str(copy))
+    assert not list(home.glob("*/manifest.json"))
+    assert not (home.parent / "elsewhere").exists()
+
+
+def test_an_edited_manifest_is_refused(copy, home):
+    file = copy / "manifest.json"
+    file.write_text(file.read_text().replace('"train": 6', '"train": 7'))
+    with pytest.raises(SplitError, match="it was edited"):
+        fetch(str(copy))
+
+
+@pytest.mark.parametrize("kind", ["directory", "tar"])
+def test_changed_content_is_refused_with_both_digests(copy, home, tmp_path, kind):
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        file["train/observations"][5, 5] += 1
+    place = pack(copy, tmp_path / "x.tar") if kind == "tar" else copy
+    with pytest.raises(DigestError, match=r"hopper.h5, group train: .*expected \w{64}, found"):
+        fetch(str(place))
+    assert split_directories().keys() == {"mini"}
+
+
+@pytest.mark.parametrize("keep", [0, 100, -50])
+def test_a_cut_off_file_is_refused(copy, home, keep):
+    file = copy / "hopper.h5"
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(SplitError, match=r"hopper\.h5"):
+        fetch(str(copy))
+
+
+def test_a_missing_file_is_named(copy, home):
+    (copy / "hopper.h5").unlink()
+    with pytest.raises(SplitNotFoundError, match=r"copy holds no hopper\.h5"):
+        fetch(str(copy))
+
+
+def test_a_file_longer_than_its_sizes_allow_is_refused_before_it_fills_the_disk(copy, home):
+    with (copy / "hopper.h5").open("ab") as file:
+        file.truncate(10**9)  # a sparse file takes no room here
+    with pytest.raises(SplitError, match=r"hopper\.h5 has more than the \d{8} bytes that"):
+        fetch(str(copy))
+    assert not list(home.rglob("hopper*"))
+
+
+def test_another_digest_than_the_expected_one_is_refused(tiny_split, home):
+    with pytest.raises(DigestError, match=r"has the digest \w{64}, expected 0000"):
+        fetch(str(tiny_split), digest="0" * 64)
+    assert not list(home.iterdir())
+    fetch(str(tiny_split), digest=load_split(tiny_split).digest)
+    assert is_installed(home, tiny_split)
+
+
+def external_link(file, outside):
+    file["extra"] = h5py.ExternalLink(str(outside), "/x")
+
+
+def soft_link(file, outside):
+    file["extra"] = h5py.SoftLink("/train")
+
+
+def external_storage(file, outside):
+    file.create_dataset("extra", (1,), "u1", external=[(str(outside), 0, 1)])
+
+
+def virtual(file, outside):
+    layout = h5py.VirtualLayout((1,), "u1")
+    layout[:] = h5py.VirtualSource(str(outside), "x", (1,))
+    file.create_virtual_dataset("extra", layout)
+
+
+@pytest.mark.parametrize("trick", [external_link, soft_link, external_storage, virtual])
+def test_a_file_that_leads_to_others_is_refused(copy, home, tmp_path, trick):
+    (tmp_path / "outside").write_bytes(b"secret")
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        trick(file, tmp_path / "outside")
+    with pytest.raises(SplitError, match=r"points elsewhere|in another file"):
+        fetch(str(copy))
+
+
+def member(name, *, kind=tarfile.REGTYPE, link=""):
+    info = tarfile.TarInfo(name)
+    info.type, info.linkname, info.size = kind, link, 0 if link else 1
+    return info
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        (member("../../escaped"), r"the path '\.\./\.\./escaped': refused"),
+        (member("/etc/escaped"), "the path '/etc/escaped': refused"),
+        (member("tiny/..\\escaped"), "escaped': refused"),
+        (member("tiny/x", kind=tarfile.SYMTYPE, link="/etc/passwd"), "is no plain file: refused"),
+        (member("tiny/x", kind=tarfile.LNKTYPE, link="tiny/hopper.h5"), "is no plain file"),
+        (member("tiny/x", kind=tarfile.CHRTYPE, link="x"), "is no plain file"),
+        (member("tiny/hopper.h5"), "'tiny/hopper.h5' twice: refused"),
+        (member("other/manifest.json"), r"holds 2 files named manifest\.json, expected one"),
+    ],
+)
+def test_an_archive_with_tricks_is_refused(tiny_split, home, tmp_path, info, message):
+    archive = pack(tiny_split, tmp_path / "x.tar")
+    with tarfile.open(archive, "a") as packed:
+        packed.addfile(info, io.BytesIO(b"x"))
+    with pytest.raises(SplitError, match=message):
+        fetch(str(archive))
+    assert not list(home.iterdir())
+    assert not list(tmp_path.rglob("escaped"))
+
+
+def test_a_zip_with_tricks_is_refused(tiny_split, home, tmp_path):
+    archive = pack(tiny_split, tmp_path / "x.zip")
+    link = zipfile.ZipInfo("tiny/link")
+    link.external_attr = 0o120777 << 16
+    for name in (link, "../escaped"):
+        bad = shutil.copy(archive, tmp_path / "bad.zip")
+        with zipfile.ZipFile(bad, "a") as packed:
+            packed.writestr(name, "/etc/passwd")
+        with pytest.raises(SplitError, match="refused"):
+            fetch(str(bad))
+
+
+@pytest.mark.parametrize("name", ["x.tar", "x.tar.gz", "x.zip"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_cut_off_archive_is_refused(tiny_split, home, tmp_path, name, share):
+    archive = pack(tiny_split, tmp_path / name)
+    content = archive.read_bytes()
+    archive.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(SplitError):
+        fetch(str(archive))
+    assert not list(home.glob("*/manifest.json"))
+
+
+# What is there already
+
+
+def test_a_second_fetch_finds_it_there(tiny_split, home):
+    fetch(str(tiny_split))
+    before = (home / "tiny" / "hopper.h5").stat().st_mtime_ns
+    assert fetch(str(tiny_split)).already
+    assert (home / "tiny" / "hopper.h5").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("file", ["hopper.h5", "manifest.json"])
+def test_a_damaged_copy_is_replaced(tiny_split, home, file):
+    fetch(str(tiny_split))
+    damaged = home / "tiny" / file
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    if file == "manifest.json":
+        with pytest.raises(UsageError, match="exists and is not this split: remove it"):
+            fetch(str(tiny_split))
+    else:
+        fetch(str(tiny_split))
+        assert is_installed(home, tiny_split)
+
+
+def test_another_split_of_the_same_name_stays(tiny_split, home, tmp_path):
+    make_split(home / "tiny", ["hopper"], seed_base=8)
+    kept = load_split("tiny").digest
+    with pytest.raises(UsageError, match="exists and is not this split: remove it, or name"):
+        fetch(str(tiny_split))
+    assert load_split("tiny").digest == kept
+    fetch(str(tiny_split), output=tmp_path / "beside" / "tiny")
+    assert load_split(tmp_path / "beside" / "tiny").digest == load_split(tiny_split).digest
+
+
+def test_a_shipped_split_is_there_already(home):
+    found = fetch(str(SHIPPED / "mini"))
+    assert found.already
+    assert found.split.path == SHIPPED / "mini"
+
+
+def test_a_shipped_name_cannot_be_taken(home, tmp_path):
+    fake = make_split(tmp_path / "mini", ["hopper"], name="mini")
+    with pytest.raises(UsageError, match="comes with the package, and this is another one"):
+        fetch(str(fake))
+
+
+def test_two_fetches_of_the_same_do_not_meet(tiny_split, home):
+    fetch(str(tiny_split))
+    staging = []
+    real = Path.mkdir
+
+    def noting(self, *arguments, **settings):
+        staging.append(self)
+        return real(self, *arguments, **settings)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "mkdir", noting)
+        fetch(str(tiny_split))
+    (place,) = {p for p in staging if p.parent.name == ".fetch"}
+    place.mkdir(parents=True)
+    descriptor = os.open(place, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(OutputError, match="another process is fetching the same"):
+            fetch(str(tiny_split))
+    finally:
+        os.close(descriptor)
+
+
+def test_a_home_that_cannot_be_written_is_named(tiny_split, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "file" / "home"))
+    with pytest.raises(OutputError, match="home' cannot be written to"):
+        fetch(str(tiny_split))
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from oodd_eval.transfer import fetch
+
+at, real = int(sys.argv[2]), Path.{method}
+def counting(self, *arguments):
+    global at
+    at -= 1
+    if at < 0:
+        os.kill(os.getpid(), 9)
+    return real(self, *arguments)
+Path.{method} = counting
+fetch.fetch(sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize(("method", "times"), [("replace", 3), ("rename", 1)])
+def test_a_killed_fetch_installs_nothing_and_the_next_one_goes_on(
+    tiny_split, home, tmp_path, method, times
+):
+    for at in range(times):
+        done = subprocess.run(
+            [sys.executable, "-c", KILLED.format(method=method), str(tiny_split), str(at)],
+            check=False,
+        )
+        assert done.returncode == -9
+        assert split_directories().keys() == {"mini"}
+    fetch(str(tiny_split))
+    assert is_installed(home, tiny_split)
+
+
+def test_the_command_line_fetches_and_says_where(tiny_split, home, capsys):
+    assert main(["data", "fetch", str(tiny_split)]) == 0
+    assert main(["data", "fetch", "-q", str(tiny_split)]) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert "cartpole.h5 verified hopper.h5 verified split tiny, digest " in output
+    assert "is already in" in output
+    assert main(["data", "fetch", "/no/such"]) == 4
+
+
+# Minari
+
+
+@pytest.fixture(scope="module")
+def exported(tiny_split, tmp_path_factory):
+    root = tmp_path_factory.mktemp("minari")
+    assert (
+        main(["data", "export", str(tiny_split), "--format", "minari", "--output", str(root)]) == 0
+    )
+    return root
+
+
+OPEN = """
+import json, os, sys, warnings
+import numpy as np
+warnings.simplefilter("error")
+import minari
+
+found = {}
+for name in minari.list_local_datasets():
+    dataset = minari.load_dataset(name)
+    episodes = list(dataset)
+    assert len(dataset) == dataset.total_episodes == len(episodes)
+    assert dataset.total_steps == sum(len(e) for e in episodes)
+    for e in episodes:
+        repr(e)
+        assert all(row in dataset.observation_space for row in e.observations)
+        assert all(row in dataset.action_space for row in e.actions)
+    metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+    found[name] = {
+        "spaces": [repr(dataset.observation_space), repr(dataset.action_space)],
+        "steps": [len(e) for e in episodes],
+        "sums": [[float(e.observations.sum()), float(e.actions.sum()), float(e.rewards.sum())]
+                 for e in episodes],
+        "ends": [[int(e.terminations.sum()), int(e.truncations.sum()),
+                  bool(e.terminations[-1] | e.truncations[-1])] for e in episodes],
+        "metadata": [{k: v if isinstance(v, str) else int(v) for k, v in m.items()}
+                     for m in metadata],
+    }
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def opened(exported):
+    """What Minari itself reads, in a process of its own."""
+    if importlib.util.find_spec("minari") is None:
+        pytest.skip("needs minari")
+    done = subprocess.run(
+        [sys.executable, "-c", OPEN], capture_output=True, text=True, check=False,
+        env={**os.environ, "MINARI_DATASETS_PATH": str(exported)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_minari_lists_a_dataset_for_every_part(opened):
+    parts = ["train", "calibration", "test-nominal", "test-iid", "test-drift", "test-shutdown",
+             "test-calibration", "test-wind-l2r", "test-wind-r2l", "test-gravity",
+             "test-components"]  # fmt: skip
+    expected = {f"oodd/tiny/{e}/{p}-v0" for e in ("cartpole", "hopper") for p in parts}
+    assert set(opened) == expected
+
+
+def test_minari_knows_the_spaces(opened):
+    assert opened["oodd/tiny/cartpole/train-v0"]["spaces"] == [
+        "Box(-inf, inf, (4,), float32)", "Discrete(2)",
+    ]  # fmt: skip
+    assert opened["oodd/tiny/hopper/train-v0"]["spaces"] == [
+        "Box(-inf, inf, (15,), float32)", "Box(-1.0, 1.0, (3,), float32)",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("environment", ["cartpole", "hopper"])
+@pytest.mark.parametrize("part", ["train", "calibration", "nominal", "gravity"])
+def test_minari_reads_the_numbers_of_the_split(opened, tiny_split, environment, part):
+    data = load_split(tiny_split).environment(environment)
+    named = {"train": data.train, "calibration": data.calibration, "nominal": data.twins}
+    expected = named.get(part) or data.anomalous(part)
+    name = part if part in {"train", "calibration"} else f"test-{part}"
+    found = opened[f"oodd/tiny/{environment}/{name}-v0"]
+    assert found["steps"] == expected.lengths.tolist()
+    for sums, x, rewards in zip(found["sums"], expected, expected.returns, strict=True):
+        actions = x.actions if environment == "hopper" else x.actions[:, 1]
+        np.testing.assert_allclose(
+            sums, [x.observations.sum(), actions.sum(), rewards], rtol=1e-4, atol=1e-4
+        )
+    # The synthetic split ends by its cap alone.
+    assert found["ends"] == [[0, 1, True]] * len(expected)
+    assert [m["seed"] for m in found["metadata"]] == expected.seeds.tolist()
+    if part == "gravity":
+        assert [m["onset"] for m in found["metadata"]] == expected.onsets.tolist()
+        assert [m["anomaly"] for m in found["metadata"]] == ["gravity"] * len(expected)
+        assert [json.loads(m["parameters"]) for m in found["metadata"]] == expected.parameters
+    else:
+        assert "onset" not in found["metadata"][0]
+    data.close()
+
+
+def test_an_ended_episode_is_terminated_and_a_capped_one_truncated(tmp_path):
+    split = make_split(tmp_path / "s", ["cartpole"])
+
+    class Ended(type(load_split(split).environment("cartpole").train)):
+        terminated = property(lambda self: np.arange(len(self)) % 2 == 0)
+
+    data = load_split(split).environment("cartpole")
+    part = Ended(data._file, "train")
+    minari._write(tmp_path / "d" / "x-v0", "x-v0", "train", "cartpole", part, load_split(split))
+    with h5py.File(tmp_path / "d" / "x-v0" / "data" / "main_data.hdf5") as file:
+        for i in range(len(part)):
+            episode, last = file[f"episode_{i}"], int(part.lengths[i]) - 1
+            assert np.flatnonzero(episode["terminations"]).tolist() == [last] * (i % 2 == 0)
+            assert np.flatnonzero(episode["truncations"]).tolist() == [last] * (i % 2)
+    data.close()
+
+
+def test_an_export_does_not_overwrite(tiny_split, exported):
+    with pytest.raises(OutputError, match="exists: remove it, or export to another directory"):
+        minari.export(load_split(tiny_split), exported, environments=["hopper"])
+
+
+def test_a_failed_export_leaves_no_half_dataset(tiny_split, tmp_path, monkeypatch):
+    def fail(group, i, *_, **__):
+        if i == 3:
+            raise OSError("disk full")
+
+    monkeypatch.setattr(minari, "_episode", fail)
+    with pytest.raises(OutputError, match="cannot be written to: disk full"):
+        minari.export(load_split(tiny_split), tmp_path, environments=["hopper"])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not list((tmp_path / "oodd" / "tiny" / "hopper").iterdir())
