@@ -1,5 +1,7 @@
 """riqn, riqn-ms, n-riqn and npn: loss, learned distributions, rollouts, and the score contract."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.training import (
     Schedule,
     arrange,
+    descend,
     predict,
     quantile_huber,
     quantile_huber_slope,
@@ -19,7 +22,7 @@ from scipy.stats import ks_2samp
 
 from oodd_eval import Trajectory
 from oodd_eval.detector import check_scores
-from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
 from oodd_eval.prediction import GRID, FeatureScale, quantile_levels
 
 FACTORIES = {"riqn": riqn, "riqn-ms": riqn_ms, "n-riqn": n_riqn, "npn": npn}
@@ -145,13 +148,12 @@ def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):
         levels = quantile_levels(seed, range(t, t + 1), horizon, made.members, samples, a.features)
         total = 0.0
         for e in range(made.members):
-            pick = {n: p[e] for n, p in made.named_parameters()}
             streams = [list(rows[: t - horizon + 1]) for _ in range(samples)]
             for k in range(horizon):
                 following = []
                 for m in range(samples):
                     index = levels[0, k, e, m] if a.quantiles else None
-                    following.append(one_step(made, pick, streams[m], index))
+                    following.append(one_step(made, e, streams[m], index))
                 if mean_sampling and k < horizon - 1:
                     following = [np.mean(following, axis=0)] * samples
                 for stream, row in zip(streams, following, strict=True):
@@ -161,8 +163,18 @@ def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):
     return np.array(errors)
 
 
-def one_step(made, p, stream, index):
+def one_step(made, e, stream, index):
+    d = made.architecture.features
+    if made.architecture.per_feature:  # one network after the other, each for its own sensor
+        change = [change_of(made, e * d + i, stream, index, [i])[0] for i in range(d)]
+    else:
+        change = change_of(made, e, stream, index, range(d))
+    return stream[-1] + made.unit.numpy() * np.array(change, np.float32)
+
+
+def change_of(made, network, stream, index, sensors):
     a, h = made.architecture, made.architecture.units
+    p = {n: p[network] for n, p in made.named_parameters()}
 
     def dense(x, name):
         return x @ p[name] + p[f"{name}_bias"][0]
@@ -180,14 +192,14 @@ def one_step(made, p, stream, index):
         candidate = torch.tanh(gates[2 * h :] + reset * recurrent[2 * h :])
         memory = (1 - update) * candidate + update * memory
     z = torch.relu(dense(memory, "second")) + f
-    out = np.zeros(a.features, np.float32)
-    for d in range(a.features):
+    out = []
+    for column, d in enumerate(sensors):
         phi = torch.ones(h)
         if index is not None:
             tau = (index[d] + 0.5) / GRID
             phi = torch.relu(dense(torch.cos(torch.pi * torch.arange(a.cosines) * tau), "cosine"))
-        out[d] = (z * phi) @ p["out"][:, d] + p["out_bias"][0, d]
-    return stream[-1] + made.unit.numpy() * out
+        out.append(float((z * phi) @ p["out"][:, column] + p["out_bias"][0, column]))
+    return out
 
 
 @pytest.mark.parametrize("horizon", [1, 3])
@@ -198,8 +210,11 @@ def one_step(made, p, stream, index):
         ({}, True),
         ({"recurrent": False, "window": 3}, False),
         ({"quantiles": False}, False),
+        ({"per_feature": True}, False),
+        ({"per_feature": True}, True),
+        ({"per_feature": True, "quantiles": False}, False),
     ],
-    ids=["riqn", "riqn-ms", "n-riqn", "npn"],
+    ids=["riqn", "riqn-ms", "n-riqn", "npn", "per-feature", "per-feature-ms", "per-feature-npn"],
 )
 def test_rollouts_equal_a_slow_loop_sample_for_sample(architecture, mean_sampling, horizon):
     made = network(2, features=2, random_head=True, units=8, cosines=5, **architecture)
@@ -323,3 +338,110 @@ def test_levels_depend_on_seed_and_time_alone():
     whole = quantile_levels(3, range(10), 2, 2, 4, 3)
     assert np.array_equal(whole[4:6], quantile_levels(3, range(4, 6), 2, 2, 4, 3))
     assert not np.array_equal(whole, quantile_levels(4, range(10), 2, 2, 4, 3))
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_a_network_per_sensor_learns(name):
+    made = FACTORIES[name](seed=0, horizon=1, **{**SMALL, "updates": 60}, trunk="per-feature")
+    made.fit(waves(20))
+    losses = np.array(made.history_)
+    assert losses.shape[1] == 2 * 3
+    assert losses.min(axis=0).mean() < 0.8 * losses[0].mean()
+
+
+def test_streamed_scores_equal_batch_scores(fitted):
+    for episode in (waves(1, 40, seed=9)[0], waves(1, 2, seed=4)[0]):
+        fitted.reset()
+        streamed = [fitted.update(row) for row in episode.observations]
+        assert np.allclose(streamed, fitted.score(episode), rtol=1e-5, atol=0, equal_nan=True)
+
+
+def test_a_live_episode_ends_with_a_reset(fitted):
+    episode = waves(1, 12, seed=9)[0]
+    fitted.reset()
+    fitted.update(episode.observations[5])
+    fitted.reset()
+    again = [fitted.update(row) for row in episode.observations]
+    assert np.allclose(again, fitted.score(episode), rtol=1e-5, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("row", [np.zeros(2), np.full(3, np.nan), np.zeros((1, 3))])
+def test_a_live_observation_of_another_shape_is_refused(fitted, row):
+    fitted.reset()
+    with pytest.raises(TrajectoryError, match=r"fitted on 3 sensors and given an observation"):
+        fitted.update(row)
+
+
+@pytest.mark.parametrize("trunk", ["shared", "per-feature"])
+@pytest.mark.parametrize("name", FACTORIES)
+def test_a_loaded_fit_scores_as_the_saved_one(name, trunk, tmp_path):
+    episode = waves(1, 30, seed=9)[0]
+    saved = FACTORIES[name](seed=1, horizon=1, trunk=trunk, **SMALL).fit(waves())
+    saved.save(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"state.json", "weights.safetensors"}
+    loaded = FACTORIES[name](seed=1, horizon=1, trunk=trunk, **SMALL)
+    loaded.load(tmp_path)
+    assert np.array_equal(loaded.score(episode), saved.score(episode), equal_nan=True)
+    assert loaded.history_ == saved.history_
+
+
+def test_one_fit_serves_other_horizons_and_samples(tmp_path):
+    episode = waves(1, 30, seed=9)[0]
+    other = {**SMALL, "samples": 3}
+    riqn(seed=1, horizon=1, **SMALL).fit(waves()).save(tmp_path)
+    loaded = riqn(seed=1, horizon=4, **other)
+    loaded.load(tmp_path)
+    fresh = riqn(seed=1, horizon=4, **other).fit(waves())
+    assert np.array_equal(loaded.score(episode), fresh.score(episode), equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: (d / "weights.safetensors").write_bytes(b"x" * 40), "cannot be read"),
+        (lambda d: (d / "weights.safetensors").unlink(), "cannot be read"),
+        (lambda d: (d / "state.json").write_text("[]"), "cannot be read"),
+        (lambda d: (d / "state.json").write_text('{"format": 1}'), "cannot be read"),
+        (lambda d: edit(d, mean=[0.0]), "holds 1 means"),
+        (lambda d: edit(d, format=2), "'format': 2"),
+        (lambda d: edit(d, members=3), "'members': 3"),
+    ],
+)
+def test_damaged_fits_are_refused(damage, message, tmp_path):
+    npn(seed=1, horizon=1, **SMALL).fit(waves()).save(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(FittedStateError, match=message):
+        npn(seed=1, horizon=1, **SMALL).load(tmp_path)
+
+
+def edit(directory, **changes):
+    file = directory / "state.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def test_a_fit_of_another_kind_is_refused(tmp_path):
+    npn(seed=1, horizon=1, **SMALL).fit(waves()).save(tmp_path)
+    with pytest.raises(FittedStateError, match="'quantiles': False"):
+        riqn(seed=1, horizon=1, **SMALL).load(tmp_path)
+
+
+@pytest.mark.parametrize("trunk", ["shared", "per-feature"])
+def test_no_tensor_is_left_behind_on_the_cpu(trunk):
+    # The meta device refuses to mix with the CPU's tensors, as a GPU does, and is on any machine.
+    made = network(2, features=3, per_feature=trunk == "per-feature").to("meta").requires_grad_()
+    assert made.device.type == "meta"
+    assert made.table().is_meta
+    x = torch.empty(2, 5, 4, 3, device="meta")
+    tau = torch.empty(2, 8, device="meta")
+    mask = torch.ones(2, 5, 4, dtype=torch.bool, device="meta")
+    memory = descend(made, x, x, mask, made.start(4), tau, torch.ones(2, device="meta"))
+    assert memory.is_meta
+    assert all(p.grad is not None and p.grad.is_meta for p in made.parameters())
+
+
+def test_an_absent_gpu_is_named():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(UsageError, match="device of detector 'riqn': expected auto or cpu"):
+        riqn(seed=0, horizon=1, device="cuda")
+    assert riqn(seed=0, horizon=1, device="auto").settings.place == "cpu"

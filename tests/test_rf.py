@@ -8,11 +8,12 @@ import pytest
 
 from oodd_eval import Trajectory
 from oodd_eval.detector import check_scores
-from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
 from oodd_eval.prediction import FeatureScale
 
 pytest.importorskip("sklearn")
 from oodd_rf import make_rf, oodd_detectors
+from oodd_rf.detector import SETTINGS
 from oodd_rf.windows import Rows
 
 SMALL = {"members": 3, "trees": 4, "leaves": 60, "rows": 400, "draws": 200}
@@ -62,7 +63,7 @@ def test_scores_are_those_of_a_slow_loop(horizon):
             for _ in range(horizon):
                 window = [known[max(len(known) - 1 - lag, 0)] for lag in range(member.window)]
                 features = np.concatenate(window)[None].astype(np.float32)
-                trees = [tree.predict(features)[0] for tree in member.forest.estimators_]
+                trees = [tree.predict(features)[0, :, 0] for tree in member.trees]
                 known.append(known[-1] + np.mean(trees, axis=0))
             errors.append(np.mean(np.abs(z[t] - known[t])))
         expected[t] = np.mean(errors)
@@ -110,9 +111,8 @@ def test_same_seed_gives_the_same_bits_and_another_seed_does_not(rf):
 def test_members_differ_in_seed_window_and_settings(rf):
     members = fitted(members=6).members_
     assert [m.window for m in members] == [4, 3, 2, 1, 4, 3]
-    forests = [m.forest for m in members]
-    assert len({f.random_state for f in forests}) == 6
-    assert len({(f.max_features, f.min_samples_leaf) for f in forests}) == 5
+    assert len({m.trees[0].threshold.tobytes() for m in members}) == 6
+    assert len(set(SETTINGS)) == 5
 
 
 def test_refit_forgets():
@@ -154,11 +154,56 @@ def test_single_sensor_fits():
 
 
 def test_size_of_training_and_trees_is_bounded():
-    rf = make_rf(members=1, trees=2, leaves=8, rows=30, draws=20).fit(NOMINAL)
-    for tree in rf.members_[0].forest.estimators_:
-        assert tree.tree_.n_leaves <= 8
-        assert tree.tree_.weighted_n_node_samples[0] == 20
-    assert rf.members_[0].forest._n_samples == 30
+    for draws, drawn in ((20, 20), (100, 30)):
+        rf = make_rf(members=1, trees=2, leaves=8, rows=30, draws=draws).fit(NOMINAL)
+        for tree in rf.members_[0].trees:
+            assert tree.n_leaves <= 8
+            assert tree.weighted_n_node_samples[0] == drawn
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_streamed_scores_equal_batch_scores(horizon):
+    rf = fitted(horizon=horizon)
+    for x in (episode(90, n=12), episode(91, n=2)):
+        rf.reset()
+        streamed = [rf.update(row) for row in x.observations]
+        np.testing.assert_allclose(streamed, rf.score(x), rtol=1e-12)
+
+
+@pytest.mark.parametrize("d", [1, 3])
+def test_a_loaded_fit_scores_as_the_saved_one(d, tmp_path):
+    episodes = [episode(seed, d=d) for seed in range(3)]
+    saved = make_rf(**SMALL).fit(episodes)
+    saved.save(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"state.json", "arrays.npz"}
+    loaded = make_rf(**SMALL)
+    loaded.load(tmp_path)
+    np.testing.assert_array_equal(loaded.score(episodes[0]), saved.score(episodes[0]))
+    other = make_rf(horizon=4, **SMALL)
+    other.load(tmp_path)
+    again = make_rf(horizon=4, **SMALL).fit(episodes)
+    np.testing.assert_array_equal(other.score(episodes[0]), again.score(episodes[0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("0.left", lambda a: a.__setitem__(0, 10**6)),
+        ("0.right", lambda a: a.__setitem__(0, 0)),
+        ("0.feature", lambda a: a.__setitem__(0, 99)),
+        ("0.threshold", lambda a: a.__setitem__(0, np.nan)),
+        ("0.counts", lambda a: a.__setitem__(0, 3)),
+        ("0.leaves", lambda a: a.__setitem__(0, np.inf)),
+    ],
+)
+def test_damaged_trees_are_refused(name, damage, tmp_path):
+    make_rf(**SMALL).fit(NOMINAL).save(tmp_path)
+    with np.load(tmp_path / "arrays.npz") as stored:
+        arrays = {n: stored[n].copy() for n in stored.files}
+    damage(arrays[name])
+    np.savez(tmp_path / "arrays.npz", **arrays)
+    with pytest.raises(FittedStateError, match=r"saved (array|tree|forest)|a saved"):
+        make_rf(**SMALL).load(tmp_path)
 
 
 def test_scoring_before_fit_is_refused():

@@ -21,8 +21,11 @@ from oodd_eval.prediction import quantile_levels
 from oodd_torch.network import Ensemble
 from oodd_torch.training import arrange, predict
 
-ROWS = 16_384
-"""Rollouts of one network that are computed together: bounds memory."""
+ROWS = 4096
+"""Forecasts of one network that are computed together at horizon 1: bounds memory."""
+
+ROLLOUTS = 1024
+"""The same at larger horizons, where arrays that fit the processor's cache are quicker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,8 @@ class Forecaster:
         target = torch.from_numpy(truth).to(network.device)
         x = x.expand(network.members, -1, -1, -1)  # (E, T, B, W * D)
         memory = network.start(len(rows))
-        chunk = max(1, ROWS // (len(rows) * self.width * (1 if horizon > 1 else 4)))
+        together = ROWS if horizon == 1 else ROLLOUTS // self.width
+        chunk = max(1, together // len(rows))
         parts = []
         for start in range(0, longest - horizon, chunk):
             stop = min(start + chunk, longest - horizon)
@@ -175,12 +179,13 @@ def rollouts(
 
     window, f, state = repeat(x), repeat(f), repeat(state)  # (E or K, C * R * B, ...)
     samples = _sample(network, window, f, state, levels, 0, table, (c, width, b))
+    cell = network.cell() if a.recurrent and horizon > 1 else None
     for step in range(1, horizon):
         fed = samples if width > 1 else samples.mean(3, keepdim=True)  # (E, C, B, R, D)
         newest = fed.transpose(2, 3).reshape(e, c * width * b, d)
         window = torch.cat([newest, window[..., :-d]], dim=2)
         f = network.inputs(window)
-        state = network.step(f, state) if a.recurrent else f
+        state = f if cell is None else cell(f, state)
         samples = _sample(network, window, f, state, levels, step, table, (c, width, b))
     return samples, memory
 

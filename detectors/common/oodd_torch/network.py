@@ -57,6 +57,30 @@ class Architecture:
         return 1 if self.per_feature else self.features
 
 
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A GRU's weights for many single steps: one product for both gates, two for the candidate.
+
+    Everything else works in place. A rollout's step is bound by passes over arrays larger than the
+    cache, and this way needs half of those of `Ensemble.gate`.
+    """
+
+    gates: Tensor  # (K, 2H, 2H): reset and update from input and memory
+    gates_bias: Tensor
+    new: Tensor  # (K, H, H): candidate from the input
+    new_bias: Tensor
+    old: Tensor  # (K, H, H): candidate from the memory
+    old_bias: Tensor
+
+    def __call__(self, f: Tensor, memory: Tensor) -> Tensor:
+        """One step: (K, B, H) and (K, B, H) to the new memory (K, B, H)."""
+        both = torch.cat([f, memory], 2)
+        reset, update = torch.bmm(both, self.gates).add_(self.gates_bias).sigmoid_().chunk(2, 2)
+        old = torch.bmm(memory, self.old).add_(self.old_bias)
+        candidate = torch.bmm(f, self.new).add_(self.new_bias).addcmul_(reset, old).tanh_()
+        return candidate.lerp_(memory, update)
+
+
 class Ensemble(torch.nn.Module):
     """E networks of the paper's appendix B side by side.
 
@@ -130,9 +154,17 @@ class Ensemble(torch.nn.Module):
         """First layer: (E, B, W * D) to (K, B, H)."""
         return torch.relu(torch.baddbmm(self.first_bias, self.spread(x), self.first))
 
-    def step(self, f: Tensor, memory: Tensor) -> Tensor:
-        """One step of the GRU: (K, B, H) and (K, B, H) to the new memory (K, B, H)."""
-        return self.gate(torch.baddbmm(self.gru_in_bias, f, self.gru_in), memory)
+    def cell(self) -> Cell:
+        """Return the GRU laid out for rollouts; without gradients."""
+        h = self.architecture.units
+        return Cell(
+            gates=torch.cat([self.gru_in[..., : 2 * h], self.gru[..., : 2 * h]], 1),
+            gates_bias=(self.gru_in_bias + self.gru_bias)[..., : 2 * h],
+            new=self.gru_in[..., 2 * h :].contiguous(),
+            new_bias=self.gru_in_bias[..., 2 * h :],
+            old=self.gru[..., 2 * h :].contiguous(),
+            old_bias=self.gru_bias[..., 2 * h :],
+        )
 
     def gate(self, projected: Tensor, memory: Tensor) -> Tensor:
         """One step of the GRU from the projected input (K, B, 3H)."""

@@ -31,5 +31,6 @@ def oodd_detectors() -> list[DetectorSpec]:
             },
             requires=("sklearn",),
             extra="oodd-eval[reference]",
+            fit_ignores=("horizon",),
         )
     ]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,47 +13,18 @@ from numpy.typing import NDArray
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, UsageError
 from oodd_eval.prediction import FeatureScale
+from oodd_eval.storage import load_state, save_state, take
+from oodd_rf.forest import Forest
 from oodd_rf.windows import Floats, Indices, Rows
 
-if TYPE_CHECKING:
-    from sklearn.ensemble import RandomForestRegressor
+KIND: Final = "rf/1"
+"""What is saved, and the version of its layout."""
 
 BATCH: Final = 8192
 """Windows that are rolled out together: bounds the memory of scoring."""
 
 SETTINGS: Final = ((1 / 3, 2), (1 / 3, 1), (1 / 2, 2), (2 / 3, 3), (1 / 4, 1))
 """``max_features`` and ``min_samples_leaf`` of the members, repeated after the last."""
-
-
-@dataclass(frozen=True, slots=True)
-class Member:
-    """One fitted forest and the number of observations that it looks at."""
-
-    forest: RandomForestRegressor
-    window: int
-
-    def forecast(self, history: NDArray[np.float32], horizon: int) -> Floats:
-        """Roll the forest out, each prediction being the newest observation of the next window.
-
-        Parameters
-        ----------
-        history : float32 array of shape (B, W, D)
-            Standardized observations, newest first.
-        horizon
-            Steps to predict ahead, h.
-
-        Returns
-        -------
-        float64 array of shape (B, D)
-            The observation h steps after the newest one.
-        """
-        predicted: Floats
-        for _ in range(horizon):
-            difference = self.forest.predict(history.reshape(len(history), -1))  # (B, D)
-            predicted = history[:, 0] + difference.reshape(history[:, 0].shape)
-            newest = predicted[:, None].astype(np.float32)
-            history = np.concatenate([newest, history[:, :-1]], axis=1)
-        return predicted
 
 
 class RandomForestDetector:
@@ -120,8 +92,9 @@ class RandomForestDetector:
         self.leaves = _integer("leaves", leaves, 2)
         self.rows = _integer("rows", rows, 1)
         self.draws = _integer("draws", draws, 1)
-        self.members_: list[Member] = []
+        self.members_: list[Forest] = []
         self.scale_: FeatureScale
+        self.reset()
 
     def fit(self, nominal: Sequence[Trajectory]) -> RandomForestDetector:
         """Fit the forests to one-step transitions of nominal trajectories, whatever the horizon.
@@ -134,7 +107,75 @@ class RandomForestDetector:
         self.scale_ = FeatureScale.fit(nominal)
         stacked = Rows.stack(nominal, self.scale_)
         self.members_ = [self._fit_member(stacked, i) for i in range(self.members)]
+        self.reset()
         return self
+
+    def save(self, directory: Path) -> None:
+        """Write the forests into a directory, as plain arrays and JSON.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        """
+        self._check_fitted()
+        arrays = {"mean": self.scale_.mean, "std": self.scale_.std}
+        for i, member in enumerate(self.members_):
+            arrays |= {f"{i}.{name}": array for name, array in member.arrays().items()}
+        save_state(directory, kind=KIND, settings=self._settings, arrays=arrays)
+
+    def load(self, directory: Path) -> None:
+        """Take over forests that `save` wrote; the horizon may be another.
+
+        Raises
+        ------
+        FittedStateError
+            When the files are missing, damaged, or of other forests.
+        """
+        arrays = load_state(directory, kind=KIND, settings=self._settings)
+        mean = take(arrays, "mean", (None,))
+        self.scale_ = FeatureScale(mean, take(arrays, "std", mean.shape))
+        self.members_ = [
+            Forest.of(
+                {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"{i}.")},
+                self._window_of(i),
+                len(mean),
+            )
+            for i in range(self.members)
+        ]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new live episode."""
+        self._latest: deque[NDArray[np.float32]] = deque(maxlen=self.window)
+        self._awaited: deque[Floats] = deque()
+
+    def update(
+        self,
+        observation: NDArray[np.float32],
+        action: NDArray[np.float32] | None = None,  # noqa: ARG002  the contract's name
+    ) -> float:
+        """Return the score of the next observation of a live episode, NaN for t < horizon.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            When the observation has another number of sensors, or a value that is not finite.
+        """
+        self._check_fitted()
+        row = self.scale_.row(observation)
+        score = float("nan")
+        if len(self._awaited) == self.horizon:
+            score = float(np.abs(row - self._awaited.popleft()).mean(axis=1).mean())
+        if not self._latest:
+            self._latest.extend([row] * self.window)
+        self._latest.appendleft(row)
+        history = np.stack(self._latest)[None]  # (1, W, D)
+        forecasts = [m.forecast(history[:, : m.window], self.horizon) for m in self.members_]
+        self._awaited.append(np.concatenate(forecasts))  # (e, D)
+        return score
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon.
@@ -153,10 +194,7 @@ class RandomForestDetector:
 
         Every window is predicted on its own, so the scores are those of `score`, bit for bit.
         """
-        if not self.members_:
-            raise NotFittedError(
-                "detector 'rf' was asked for scores before fit: fit it on nominal trajectories"
-            )
+        self._check_fitted()
         if not trajectories:
             return []
         stacked = Rows.stack(trajectories, self.scale_)
@@ -167,14 +205,27 @@ class RandomForestDetector:
             scores[batch] = self._errors(stacked, batch)
         return np.split(scores, np.cumsum([len(x) for x in trajectories])[:-1])
 
-    def _fit_member(self, stacked: Rows, i: int) -> Member:
+    def _check_fitted(self) -> None:
+        if not self.members_:
+            raise NotFittedError(
+                "detector 'rf' was asked for scores before fit: fit it on nominal trajectories"
+            )
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        return {"members": self.members, "window": self.window}
+
+    def _window_of(self, i: int) -> int:
+        return self.window - i % self.window
+
+    def _fit_member(self, stacked: Rows, i: int) -> Forest:
         from sklearn.ensemble import RandomForestRegressor  # noqa: PLC0415  an optional extra
 
         rng = np.random.default_rng([self.seed, i])
         rows = stacked.with_history(1)
         if len(rows) > self.rows:
             rows = np.sort(rng.choice(rows, self.rows, replace=False))
-        window = self.window - i % self.window
+        window = self._window_of(i)
         max_features, min_samples_leaf = SETTINGS[i % len(SETTINGS)]
         history = stacked.window(rows - 1, window)  # (N, W, D)
         difference = stacked.values[rows].astype(np.float64) - history[:, 0]  # (N, D)
@@ -190,7 +241,7 @@ class RandomForestDetector:
         # With a single sensor scikit-learn wants a vector of targets.
         target = difference if difference.shape[1] > 1 else difference[:, 0]
         forest.fit(history.reshape(len(rows), -1), target)
-        return Member(forest, window)
+        return Forest([tree.tree_ for tree in forest.estimators_], window)
 
     def _errors(self, stacked: Rows, batch: Indices) -> Floats:
         """Return the mean absolute error of the members' forecasts of the rows of a batch."""
