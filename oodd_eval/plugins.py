@@ -145,7 +145,7 @@ class Plugins:
     def spec_forms(self) -> list[tuple[str, str, str]]:
         """Return who makes detectors of names with a colon: plug-in, origin, and which names."""
         return [
-            (name, f"{_distribution(point)} {_version(point)}", first_line(call))
+            (name, f"{_distribution(point)} {_version(point)}", first_line(call).removesuffix("."))
             for name, point, call in self._makers()
         ]
 
@@ -172,7 +172,7 @@ class Plugins:
                     f"{describe(error)}"
                 ) from error
             if isinstance(spec, DetectorSpec) and ":" in spec.name:
-                return _offer(spec, point, self.manager.get_plugin(name).__name__)
+                return _offer(spec, point, point.module)
             if spec is not None:
                 raise PluginError(
                     f"plug-in {name!r} of {_distribution(point)} made {spec!r:.80} of {text!r}, "

@@ -59,10 +59,19 @@ class Browser:
         body = {"script": script, "args": list(arguments)}
         return self._call("POST", f"{self._session}/execute/sync", body)
 
+    def wait_for(self, condition, seconds=10):
+        """Wait until an expression is true in the page."""
+        until = time.monotonic() + seconds
+        while not self.run(f"return Boolean({condition})"):
+            if time.monotonic() > until:
+                raise TimeoutError(f"never became true: {condition}")
+            time.sleep(0.02)
+
     def texts(self, selector):
         """Visible texts of all elements that match."""
         return self.run(
-            "return [...document.querySelectorAll(arguments[0])].map((e) => e.innerText.trim())",
+            "const found = [...document.querySelectorAll(arguments[0])];"
+            "return found.map((e) => (e.innerText ?? e.textContent).trim())",
             selector,
         )
 
@@ -86,10 +95,12 @@ class Browser:
         self.run(script, name, text)
 
     def press(self, *names):
-        """Press keys one after the other on whatever has the focus."""
-        actions = [
-            {"type": kind, "value": KEYS[name]} for name in names for kind in ("keyDown", "keyUp")
-        ]
+        """Press keys, or chords such as ``shift+tab``, on whatever has the focus."""
+        actions = []
+        for chord in names:
+            keys = [KEYS[name] for name in chord.split("+")]
+            actions += [{"type": "keyDown", "value": key} for key in keys]
+            actions += [{"type": "keyUp", "value": key} for key in reversed(keys)]
         body = {"actions": [{"type": "key", "id": "keyboard", "actions": actions}]}
         self._call("POST", f"{self._session}/actions", body)
 

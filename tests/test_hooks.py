@@ -130,7 +130,7 @@ def test_list_tells_which_names_with_a_colon_there_are(monkeypatch, tmp_path, ca
     assert main(["list", "detectors"]) == 0
     lines = capsys.readouterr().out.splitlines()
     (line,) = [line for line in lines if line.startswith("(maker)")]
-    assert " ".join(line.split()) == "(maker) oodd-maker 1.0 mine:N: a detector of the number N."
+    assert " ".join(line.split()) == "(maker) oodd-maker 1.0 mine:N: a detector of the number N"
 
 
 def test_a_name_with_a_colon_that_nobody_knows_is_an_error(monkeypatch, tmp_path):

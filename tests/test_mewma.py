@@ -11,7 +11,7 @@ from oodd_mewma.forecast import Moments, product, regressors
 
 from oodd_eval import Trajectory
 from oodd_eval.detector import check_scores
-from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
+from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
 
 A1 = np.array([[0.5, 0.2, 0.0], [-0.3, 0.6, 0.1], [0.0, 0.1, 0.4]])
 A2 = np.array([[-0.2, 0.0, 0.1], [0.0, -0.3, 0.0], [0.1, 0.0, 0.2]])
@@ -364,3 +364,32 @@ def test_scoring_needs_numpy_alone():
         "sys.exit(bool({'sklearn', 'scipy', 'torch'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+@pytest.mark.parametrize("make", [make_mewma, make_mewma_a])
+def test_streamed_scores_equal_batch_scores(make, horizon):
+    made = make(horizon=horizon).fit(NOMINAL)
+    for x in (episode(90), episode(91, n=3), episode(92)[:1]):
+        made.reset()
+        streamed = [made.update(x.observations[0])]
+        streamed += [made.update(o, a) for o, a in zip(x.observations[1:], x.actions, strict=True)]
+        np.testing.assert_allclose(streamed, made.score(x), rtol=1e-9, atol=1e-9)
+
+
+def test_a_live_chart_with_actions_asks_for_them():
+    made = make_mewma_a().fit(NOMINAL)
+    made.update(NOMINAL[0].observations[0])
+    with pytest.raises(TrajectoryError, match=r"'mewma-a' was given an action None, expected"):
+        made.update(NOMINAL[0].observations[1])
+
+
+@pytest.mark.parametrize("make", [make_mewma, make_mewma_a])
+def test_a_loaded_fit_scores_as_the_saved_one(make, tmp_path):
+    saved = make(horizon=2).fit(NOMINAL)
+    saved.save(tmp_path)
+    loaded = make(horizon=2)
+    loaded.load(tmp_path)
+    np.testing.assert_array_equal(loaded.score(episode(90)), saved.score(episode(90)))
+    with pytest.raises(FittedStateError, match="'horizon': 2"):
+        make(horizon=3).load(tmp_path)

@@ -101,3 +101,24 @@ def test_persistence_before_fit_says_so():
 
 def test_the_three_are_offered():
     assert [spec.name for spec in oodd_detectors()] == ["random", "persistence", "clock"]
+
+
+@pytest.mark.parametrize("made", [Random, Persistence, Clock])
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_streamed_scores_equal_batch_scores(made, horizon):
+    rng = np.random.default_rng(0)
+    x = Trajectory(rng.normal(size=(12, 2)), np.zeros((11, 1)))
+    detector = made(seed=4, horizon=horizon).fit([x])
+    for _ in range(2):
+        detector.reset()
+        streamed = [detector.update(row) for row in x.observations]
+        np.testing.assert_array_equal(streamed, detector.score(x))
+
+
+def test_a_loaded_persistence_scores_as_the_saved_one(tmp_path):
+    x = Trajectory(np.random.default_rng(0).normal(size=(12, 2)), np.zeros((11, 1)))
+    saved = Persistence(horizon=2).fit([x])
+    saved.save(tmp_path)
+    loaded = Persistence(horizon=2)
+    loaded.load(tmp_path)
+    np.testing.assert_array_equal(loaded.score(x), saved.score(x))

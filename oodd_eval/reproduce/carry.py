@@ -6,6 +6,7 @@ run reads them. A batch is a plan of a few minutes for `oodd_eval.runner.run`.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
@@ -88,11 +89,9 @@ class Watch:
         if record.ok and not resumed:
             self._costs.append(record)
         if self.tell:
-            took = "kept" if resumed else duration(record.seconds_fit + record.seconds_score)
-            state = "" if record.ok else f"  {record.status}: {record.reason}"
             self.tell(
                 f"[{self.complete}/{len(self.works)}] {'/'.join(key)}  "
-                f"{took if record.ok else ''}{state}  ({duration(self.remaining())} left)"
+                f"{_came_of(record, resumed=resumed)}  ({duration(self.remaining())} left)"
             )
 
     @property
@@ -116,6 +115,13 @@ class Watch:
         done = {w.fit for key, w in self._works.items() if key in self.finished}
         seconds = remaining_seconds(self.open(), {*self.fitted, *done})
         return self.factor() * seconds / self.jobs
+
+
+def _came_of(record: Record, *, resumed: bool) -> str:
+    if not record.ok:
+        return f"{record.status}: {record.reason}"
+    took = record.seconds_fit + record.seconds_score
+    return "kept" if resumed else "ok" if math.isnan(took) else duration(took)
 
 
 def carry_out(

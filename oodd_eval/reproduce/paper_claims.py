@@ -75,10 +75,10 @@ def _models() -> list[Claim]:
 
 def _groups_of_anomalies() -> list[Claim]:
     place = "section 4.2, Impact of High-Level Anomaly Types; Table 5"
-    named = [(label, (Setup(detector),)) for detector, label in MODELS.items()]
+    named = [(detector, label, (Setup(detector),)) for detector, label in MODELS.items()]
     each = [
         Claim(
-            f"sensor-above-dynamics-{label.lower()}",
+            f"sensor-above-dynamics-{name}",
             f"Sensor anomalies give {label} a higher AUC than dynamics anomalies",
             place,
             "sensor minus dynamics, Δ = 1",
@@ -87,7 +87,7 @@ def _groups_of_anomalies() -> list[Claim]:
             BETTER,
             EVERYWHERE,
         )
-        for label, setups in [*named, ("the four models", MODEL_SETUPS)]
+        for name, label, setups in [*named, ("models", "the four models", MODEL_SETUPS)]
     ]
     return [
         *each,

@@ -35,7 +35,12 @@ ENTRY_FIELDS: Final = (
 )  # fmt: skip
 """What the site says of an entry."""
 
-SUFFIXES: Final = {"": "", "at_1pct": " at 1 %", "at_01pct": " at 0.1 %"}
+SUFFIXES: Final = {"": "", "at_1pct": "1 %", "at_01pct": "0.1 %"}
+"""Targets of calibrated thresholds by the suffix of their metrics."""
+
+_ORDER: Final = {
+    (e, a): (i, j) for i, e in enumerate(ENVIRONMENTS) for j, a in enumerate(ANOMALIES)
+}
 
 _PAPER = Path(__file__).parents[1] / "paper" / "tables.json"
 
@@ -65,9 +70,7 @@ def site_data(entries: Sequence[SubmittedEntry]) -> tuple[Json, list[Json]]:
     ResultsError
         When entries contradict one another, or curves cannot be read.
     """
-    units = {
-        entry.meta.id: read_curves(entry.curves)["units"] for entry in entries if entry.curves
-    }
+    units = {entry.meta.id: read_curves(entry.curves)["units"] for entry in entries if entry.curves}
     curves: list[Json] = []
     shown = [_board(section, units, curves) for section in sections(entries)]
     names = dict.fromkeys(name for board in shown for name in board["metrics"])
@@ -89,12 +92,14 @@ def site_data(entries: Sequence[SubmittedEntry]) -> tuple[Json, list[Json]]:
 
 def _metric(name: str) -> Json:
     base, _, suffix = name.partition("_at_")
-    suffix = f"at_{suffix}" if suffix else ""
-    kind = "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate"
+    target = SUFFIXES[f"at_{suffix}" if suffix else ""]
+    title = TITLES.get(base, base) + (f" at {target}" if target else "")
+    meaning = METRICS.get(base, "smallest threshold that meets the target on calibration data")
+    under = f"; with a false-alarm rate calibrated to {target}" if base in METRICS else ""
     return {
-        "title": TITLES.get(base, base) + SUFFIXES[suffix],
-        "meaning": METRICS.get(base, "smallest threshold that meets the target"),
-        "kind": kind,
+        "title": title[0].upper() + title[1:],
+        "meaning": meaning + (under if target else ""),
+        "kind": "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate",
         "higher": base in HIGHER_IS_BETTER,
     }
 
@@ -163,10 +168,15 @@ def _row(
         "cost": {name: _short(getattr(cost, name)) for name in ("fit", "step", "peak")},
         "trust": section.trust[row],
         "entries": [{name: getattr(meta, name) for name in ENTRY_FIELDS} for meta in sources],
-        "cells": [_cell(r, names) for r in records],
+        "cells": [_cell(r, names) for r in sorted(records, key=_place)],
         "intervals": _intervals(records, names, chosen),
         "curves": len(curves) - 1 if own else None,
     }
+
+
+def _place(record: Record) -> tuple[int, int, int]:
+    """Order of the benchmark: environment, anomaly, seed."""
+    return (*_ORDER[record.environment, record.anomaly], record.seed)
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:
@@ -210,8 +220,8 @@ def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
 
 
 def _short(value: float | None) -> float | None:
-    """Round to five digits, finer than anything printed; None for what is undefined."""
+    """Round to six digits, finer than anything printed; None for what is undefined."""
     if value is None or not math.isfinite(value):
         return None
-    near = float(f"{value:.5g}")
+    near = float(f"{value:.6g}")
     return int(near) if near.is_integer() else near

@@ -1,7 +1,7 @@
 """Intervals of means over the selections of cells that the site's filters can make.
 
 The page computes means itself, from the values of single cells; an interval needs the bootstrap,
-and so is computed here for the selections that matter.
+and so is computed here, for every selection there can be.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ _weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
 
 
 def selections(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """Return the selections of cells that have intervals, by key.
+    """Return the selections of cells that filters can make, by key.
 
     A key is ``environments|anomalies``: for the one ``all``, a family or an environment, for the
-    other ``all``, a group or, with all environments, an anomaly.
+    other ``all``, a group or an anomaly.
 
     Examples
     --------
     >>> sorted(selections([("hopper", "iid")]))[:3]
     ['all|all', 'all|iid', 'all|sensor']
+    >>> len(selections([("hopper", "iid")]))
+    9
     """
     environments: dict[str, set[str]] = {}
     anomalies: dict[str, set[str]] = {}
@@ -46,7 +48,6 @@ def selections(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
         f"{some}|{others}": [(e, a) for e, a in cells if e in environments[some] and a in named]
         for some in environments
         for others, named in anomalies.items()
-        if some == "all" or others not in ANOMALIES
     }
     return {key: chosen for key, chosen in found.items() if chosen}
 
@@ -71,7 +72,8 @@ def selection_intervals(
 
     Returns
     -------
-    By key; selections with a failed cell, or without an interval, are left out.
+    By key; selections with a failed cell, or without an interval, are left out, and so are those
+    of one record, which has its own.
     """
     draws: dict[tuple[int, str, str], NDArray[np.float64]] = {}
     for r in records:
@@ -88,7 +90,8 @@ def selection_intervals(
             for seed in seeds
             if any((seed, *cell) in draws for cell in cells)
         ]
-        if by_seed and not failed.intersection(cells):
+        one = len(seeds) == len(cells) == 1
+        if by_seed and not one and not failed.intersection(cells):
             means = np.array(by_seed)
             drawn = np.random.default_rng(0).integers(len(means), size=means.shape)
             low, high = percentiles(np.take_along_axis(means, drawn, axis=0).mean(axis=0))

@@ -37,18 +37,39 @@ def smooth(residuals: Floats, weights: Sequence[float]) -> Floats:
     >>> smooth(np.array([[3.0], [3.0]]), [1.0])[0].tolist()
     [[3.0], [3.0]]
     """
-    n, d = residuals.shape
-    weight = np.asarray(weights, dtype=np.float64)[:, None]  # (W, 1)
-    keep = 1.0 - weight
-    smoothed = np.empty((n, len(weight), d))
-    z = np.zeros((len(weight), d))
-    for t, u in enumerate(residuals):
-        z = keep * z + weight * u
-        smoothed[t] = z
-    # A running product, not a power: its first n factors are the same however many follow.
-    forgotten = np.cumprod(np.broadcast_to(keep**2, (n, len(weight), 1)), axis=0)
-    smoothed /= np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
-    return np.ascontiguousarray(smoothed.swapaxes(0, 1))
+    return Smoother(weights, residuals.shape[1])(residuals)
+
+
+class Smoother:
+    """`smooth` in parts: what is passed goes on where the last call ended.
+
+    Parameters
+    ----------
+    weights
+        W values of the weight.
+    sensors
+        Sensors, D.
+    """
+
+    def __init__(self, weights: Sequence[float], sensors: int) -> None:
+        self._weight = np.asarray(weights, dtype=np.float64)[:, None]  # (W, 1)
+        self._z = np.zeros((len(weights), sensors))
+        self._forgotten = np.ones((len(weights), 1))
+
+    def __call__(self, residuals: Floats) -> Floats:
+        """Return the next N scaled, weighted residuals, (W, N, D), from residuals (N, D)."""
+        weight, keep = self._weight, 1.0 - self._weight
+        smoothed = np.empty((len(residuals), *self._z.shape))
+        for t, u in enumerate(residuals):
+            self._z = keep * self._z + weight * u
+            smoothed[t] = self._z
+        # A running product, not a power: its first n factors are the same however many follow.
+        factors = np.broadcast_to(keep**2, (len(residuals), *keep.shape))
+        forgotten = self._forgotten * np.cumprod(factors, axis=0)
+        if len(residuals):
+            self._forgotten = forgotten[-1]
+        smoothed /= np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
+        return np.ascontiguousarray(smoothed.swapaxes(0, 1))
 
 
 def whitening(covariance: Floats, shrinkage: float) -> Floats:

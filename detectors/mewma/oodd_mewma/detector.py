@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
-from oodd_mewma.chart import Floats, distance, smooth, whitening
+from oodd_eval.storage import load_state, save_state, take
+from oodd_mewma.chart import Floats, Smoother, distance, smooth, whitening
 from oodd_mewma.forecast import Moments, first_forecast, product, regressors
 
 CONSTANT: Final = 1e-6
@@ -20,6 +23,10 @@ CONSTANT: Final = 1e-6
 
 FOLDS: Final = 5
 """Parts of the nominal trajectories, each judged by what was learnt from the others."""
+
+
+KIND: Final = "mewma/1"
+"""What is saved, and the version of its layout."""
 
 
 class MewmaDetector:
@@ -100,6 +107,7 @@ class MewmaDetector:
             raise self._wrong("weights", "a list of at least one number", weights)
         self.weights = tuple(self._number("weights", w, most=1.0) for w in weights)
         self._widths: tuple[int, int] | None = None
+        self.reset()
 
     def fit(self, nominal: Sequence[Trajectory]) -> MewmaDetector:
         """Learn the forecast, then where its accumulated residuals lie.
@@ -160,7 +168,93 @@ class MewmaDetector:
         pooled = np.concatenate(distances, axis=1)  # (W, N)
         self.distance_mean_ = pooled.mean(axis=1, keepdims=True)
         self.distance_std_ = _scale(pooled.std(axis=1, keepdims=True))
+        self.reset()
         return self
+
+    def save(self, directory: Path) -> None:
+        """Write what was learnt into a directory, as plain arrays and JSON.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        """
+        self._fitted_widths()
+        arrays = {
+            "observation_scale": np.stack(self.observation_scale_),
+            "action_scale": np.stack(self.action_scale_),
+            "coefficients": self.coefficients_,
+            "residual_scale": self.residual_scale_,
+            "whitening": np.stack(self.whitening_),
+            "distance_mean": self.distance_mean_,
+            "distance_std": self.distance_std_,
+        }
+        save_state(directory, kind=KIND, settings=self._settings, arrays=arrays)
+
+    def load(self, directory: Path) -> None:
+        """Take over what `save` wrote.
+
+        Raises
+        ------
+        FittedStateError
+            When the files are missing, damaged, or of a chart with other parameters.
+        """
+        arrays = load_state(directory, kind=KIND, settings=self._settings)
+        sensors, w = take(arrays, "observation_scale", (2, None)), len(self.weights)
+        actions = take(arrays, "action_scale", (2, None))
+        d, a = sensors.shape[1], actions.shape[1]
+        inputs = self.order * (d + (a if self.actions else 0)) + 1
+        self.observation_scale_ = sensors[0], sensors[1]
+        self.action_scale_ = actions[0], actions[1]
+        self.coefficients_ = take(arrays, "coefficients", (inputs, d))
+        self.residual_scale_ = take(arrays, "residual_scale", (d,))
+        self.whitening_ = list(take(arrays, "whitening", (w, d, d)))
+        self.distance_mean_ = take(arrays, "distance_mean", (w, 1))
+        self.distance_std_ = take(arrays, "distance_std", (w, 1))
+        self._widths = d, a
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new live episode."""
+        self._now = 0
+        self._rows: deque[NDArray[np.float32]] = deque(maxlen=self._first + 1)
+        self._commands: deque[NDArray[np.float32]] = deque(maxlen=self._first)
+        self._smoother: Smoother | None = None
+
+    def update(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> float:
+        """Return the score of the next observation of a live episode, NaN for t < horizon.
+
+        Parameters
+        ----------
+        observation : array of shape (D,)
+        action : array of shape (A,), optional
+            Commanded since the previous observation. `mewma-a` needs it from the second
+            observation on.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            When a shape is not that of `fit`, a value is not finite, or an action is missing.
+        """
+        d, a = self._fitted_widths()
+        row = self._live("an observation", observation, d)
+        command = np.zeros(a, np.float32)
+        if self.actions and self._now:
+            command = self._live("an action", action, a)
+        if self._now:
+            self._commands.append(command)
+        self._rows.append(row)
+        t, self._now = self._now, self._now + 1
+        if t < self._first:
+            return float("nan") if t < self.horizon else 0.0
+        latest = Trajectory(np.stack(self._rows), np.stack(self._commands))
+        self._smoother = self._smoother or Smoother(self.weights, d)
+        smoothed = self._smoother(self._clipped(latest, self.coefficients_))
+        return float(self._standardized(self._distances(smoothed, self.whitening_))[0])
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon.
@@ -172,15 +266,11 @@ class MewmaDetector:
         TrajectoryError
             When sensors or actions have another width than those of `fit`.
         """
-        if self._widths is None:
-            raise NotFittedError(
-                f"detector {self._name!r} was asked for scores before fit: fit it on nominal "
-                "trajectories"
-            )
+        widths = self._fitted_widths()
         found = (trajectory.observation_dim, trajectory.action_dim)
-        if found != self._widths:
+        if found != widths:
             raise TrajectoryError(
-                f"detector {self._name!r} was fitted on (sensors, action columns) {self._widths} "
+                f"detector {self._name!r} was fitted on (sensors, action columns) {widths} "
                 f"and asked to score a trajectory of {found}: score trajectories of the "
                 "environment that it was fitted on"
             )
@@ -189,9 +279,35 @@ class MewmaDetector:
         if trajectory.transitions >= self._first:
             smoothed = self._smoothed(trajectory, self.coefficients_)
             distances = self._distances(smoothed, self.whitening_)
-            standardized = (distances - self.distance_mean_) / self.distance_std_
-            scores[self._first :] = standardized.max(axis=0)
+            scores[self._first :] = self._standardized(distances)
         return scores
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "actions": self.actions,
+            "horizon": self.horizon,
+            "order": self.order,
+            "clip": self.clip,
+            "weights": self.weights,
+        }
+
+    def _fitted_widths(self) -> tuple[int, int]:
+        if self._widths is None:
+            raise NotFittedError(
+                f"detector {self._name!r} was asked for scores before fit: fit it on nominal "
+                "trajectories"
+            )
+        return self._widths
+
+    def _live(self, what: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
+        found = np.asarray(np.nan if values is None else values, dtype=np.float32)
+        if found.shape != (width,) or not np.isfinite(found).all():
+            raise TrajectoryError(
+                f"detector {self._name!r} was given {what} {'None' if values is None else found}, "
+                f"expected {width} finite numbers"
+            )
+        return found
 
     def _targets(self, x: Trajectory) -> Floats:
         mean, std = self.observation_scale_
@@ -211,8 +327,16 @@ class MewmaDetector:
 
     def _smoothed(self, x: Trajectory, coefficients: Floats) -> Floats:
         """Return the scaled, exponentially weighted, clipped residuals: (W, N, D)."""
+        return smooth(self._clipped(x, coefficients), self.weights)
+
+    def _clipped(self, x: Trajectory, coefficients: Floats) -> Floats:
         residuals = self._residuals(x, coefficients) / self.residual_scale_
-        return smooth(np.clip(residuals, -self.clip, self.clip), self.weights)
+        return np.clip(residuals, -self.clip, self.clip)
+
+    def _standardized(self, distances: Floats) -> Floats:
+        """Return the largest standardized distance of every step: (W, N) to (N,)."""
+        standardized: Floats = (distances - self.distance_mean_) / self.distance_std_
+        return np.asarray(standardized.max(axis=0))
 
     def _whitening(self, covariances: Floats) -> list[Floats]:
         return [whitening(c, self.shrinkage) for c in covariances]

@@ -1,5 +1,11 @@
 // What the columns of the main table are: one list for each of its views.
 
+/** Values that others are read beside: large or small, they are no merit in a row. */
+const BESIDE = ["auc_null", "auc_placebo", "delay_null"];
+
+/** Whether a metric's best value is marked: delays at different false-alarm rates do not compare. */
+const isMarked = (metric, kind) => !BESIDE.includes(metric) && (kind === "percent" || metric.includes("_at_"));
+
 const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
 
 /** A column of a metric's mean; `within` narrows the selection. */
@@ -12,6 +18,7 @@ function metricColumn(board, metric, options = {}) {
     unit: kind === "rate" ? "" : unit,
     hint: options.hint ?? meaning,
     better: higher ? "higher" : "lower",
+    marked: isMarked(metric, kind),
     kind,
     interval: options.interval ?? false,
     of: (row, selection) => mean(board, row, metric, { ...selection, ...options.within }),
@@ -20,7 +27,7 @@ function metricColumn(board, metric, options = {}) {
 
 /** A column of a plain number of a row. */
 function plainColumn(key, title, unit, hint, of, options = {}) {
-  return { key, title, unit, hint, better: "lower", plain: true, of: (row) => ({ value: of(row), cells: 1 }), ...options };
+  return { key, title, unit, hint, better: "lower", plain: true, marked: true, of: (row) => ({ value: of(row), cells: 1 }), ...options };
 }
 
 function paperColumn(metric, title, unit, kind) {
@@ -33,7 +40,7 @@ function paperColumn(metric, title, unit, kind) {
 }
 
 const RANK = plainColumn(
-  "rank", "Rank", "", "1 + the number of rows that are significantly better over all cells",
+  "rank", "Rank", "", "1 plus the number of rows that are significantly better over all cells",
   (row) => row.rank, { digits: 0 },
 );
 
@@ -90,7 +97,7 @@ const LISTS = {
   calibrated: {
     title: "Calibrated alarms",
     columns: (board) => ["at_1pct", "at_01pct"].flatMap((suffix) =>
-      ["delay_censored", "delay", "missed", "far_twin", "far"]
+      ["delay_censored", "missed", "far_twin", "delay", "far"]
         .map((m) => `${m}_${suffix}`)
         .filter((m) => board.metrics.includes(m))
         .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),

@@ -33,21 +33,22 @@ function summary(board, row) {
   };
   return element("dl", { class: "cards" },
     card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched?.meaning),
-    card("Rank", row.rank ?? UNDEFINED, row.rank ? `of ${board.rows.filter((r) => r.rank).length}, ties ${row.ties}` : row.state),
+    card("Rank", row.rank ?? UNDEFINED, row.rank ? `of ${board.rows.filter((r) => r.rank).length} ranked${row.ties && `, tie groups ${row.ties}`}` : row.state),
     card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc?.meaning),
     card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay?.meaning),
     card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin?.meaning),
     card("Cost", `${brief(row.cost.fit, 2)} s`, `per fit; ${brief(row.cost.step, 2)} \u00b5s per step, ${brief(row.cost.peak, 2)} MB`));
 }
 
-/** Mix two colours, `share` of the second. */
-const mixed = (a, b, share) => `rgb(${a.map((v, i) => Math.round(v + (b[i] - v) * share)).join(" ")})`;
-
+/** Colours of a matched AUC: from white at chance to teal at 1, or to orange at 0. */
 function colours(value) {
   if (!isNumber(value)) return {};
   const far = Math.min(1, Math.abs(value - 0.5) * 2);
   const end = value >= 0.5 ? [14, 98, 116] : [178, 84, 24];
-  return { back: mixed([255, 255, 255], end, 0.9 * far), front: far > 0.55 ? "#fff" : "#1d2733" };
+  const back = [255, 255, 255].map((v, i) => Math.round(v + (end[i] - v) * 0.9 * far));
+  // White or black, whichever stands out more.
+  const [r, g, b] = back.map((v) => (v / 255) ** 2.2);
+  return { back: `rgb(${back.join(" ")})`, front: 0.2126 * r + 0.7152 * g + 0.0722 * b > 0.179 ? "#000" : "#fff" };
 }
 
 /** Matched AUC by environment and anomaly; every value is a link to its cell. */
@@ -104,7 +105,7 @@ function cellPart(board, row, cell) {
     return show(found.value, kind) + unit + interval;
   };
   const sentence = element("p", {},
-    `${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}; delay ${text("delay")}, ` +
+    `What changes: ${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}; delay ${text("delay")}, ` +
     `against ${text("delay_null")} from false alarms alone; missed ${text("missed")}; ` +
     `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`);
   const curves = row.curves === null ? null : curvesOf(row)[`${cell.environment}/${cell.anomaly}`];

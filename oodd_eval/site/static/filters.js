@@ -24,11 +24,11 @@ function drawFilters() {
     select("anomaly", "Anomaly", anomalies),
     select("horizon", "Horizon", [["all", "All horizons"], ...horizons.map((h) => [String(h), `\u0394 = ${h}`])]),
     select("inputs", "Inputs", [["all", "All inputs"], ...inputs.map((i) => [i, i.replace("+", " + ")])]),
+    element("fieldset", { class: "views" }, element("legend", {}, "Columns"), views),
     element("label", { class: "check" }, element("input", {
       type: "checkbox", name: "trivial", checked: state.trivial,
       onchange: (event) => { state.trivial = event.target.checked; drawTable(); },
     }), " trivial rows"),
-    element("fieldset", { class: "views" }, element("legend", {}, "Columns"), views),
   );
 }
 
@@ -49,7 +49,7 @@ function choose(name) {
   return (event) => {
     state[name] = event.target.value;
     if (name === "group") state.anomaly = "all";
-    if (name === "view") Object.assign(state, { sort: "", ascending: false });
+    if (name === "view") Object.assign(state, { sort: "auc_matched", ascending: false });
     if (name === "board" || name === "group") {
       drawFilters();
       document.querySelector(`#filters [name="${name}"]`).focus();

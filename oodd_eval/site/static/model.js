@@ -46,11 +46,6 @@ function mean(board, row, metric, selection = EVERYTHING) {
   return found;
 }
 
-/** Whether means over a selection can have intervals; one of single cells and seeds always can. */
-function hasIntervals(board, selection) {
-  return board.rows.some((row) => isNumber(mean(board, row, "auc_matched", selection).low));
-}
-
 /**
  * The paper's digits for a row, averaged over the selected environments and groups.
  *

@@ -32,23 +32,35 @@ function bentTicks(unit, from, to) {
   return [...kept.map((t) => -t).reverse(), 0, ...kept].filter((t) => t >= from && t <= to);
 }
 
-/** An empty chart with axes: `x` and `y` are {range, ticks, label, bend}. */
+/** Ticks that are at least `room` apart where they are drawn. */
+function apart(values, position, room) {
+  const kept = [];
+  for (const value of values) {
+    if (!kept.length || Math.abs(position(value) - position(kept.at(-1))) >= room) kept.push(value);
+  }
+  return kept;
+}
+
+/** An empty chart with axes: `x` and `y` are {range, ticks, label, bend}; no label, no text. */
 function chart(name, x, y, options = {}) {
-  const { width = 440, height = 300, left = 58, right = 14, top = 12, bottom = 44 } = options;
+  const { width = 440, height = 300, left = 58, right = 14, top = 12, bottom = x.label ? 44 : 26 } = options;
   const sx = scale(x.range, [left, width - right], x.bend);
   const sy = scale(y.range, [height - bottom, top], y.bend);
+  const [across, up] = [apart(x.ticks, sx, 30), apart(y.ticks, sy, 13)];
   const drawing = shape("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": name, class: options.class },
     shape("g", { class: "grid" },
-      x.ticks.map((t) => shape("line", { x1: sx(t), x2: sx(t), y1: top, y2: height - bottom })),
-      y.ticks.map((t) => shape("line", { x1: left, x2: width - right, y1: sy(t), y2: sy(t) }))),
+      across.map((t) => shape("line", { x1: sx(t), x2: sx(t), y1: top, y2: height - bottom })),
+      up.map((t) => shape("line", { x1: left, x2: width - right, y1: sy(t), y2: sy(t) }))),
     shape("g", { class: "axis" },
-      x.ticks.map((t) => shape("text", { x: sx(t), y: height - bottom + 16, "text-anchor": "middle" }, brief(t))),
-      y.ticks.map((t) => shape("text", { x: left - 7, y: sy(t) + 4, "text-anchor": "end" }, brief(t))),
-      shape("text", { class: "label", x: (left + width - right) / 2, y: height - 6, "text-anchor": "middle" }, x.label),
+      across.map((t) => shape("text", { x: sx(t), y: height - bottom + 16, "text-anchor": "middle" }, brief(t))),
+      up.map((t) => shape("text", { x: left - 7, y: sy(t) + 4, "text-anchor": "end" }, brief(t))),
+      x.label && shape("text", { class: "label", x: (left + width - right) / 2, y: height - 6, "text-anchor": "middle" }, x.label),
       shape("text", {
         class: "label", "text-anchor": "middle",
         transform: `translate(14 ${(top + height - bottom) / 2}) rotate(-90)`,
       }, y.label)));
+  // Drawn at most a little larger than designed, so that letters are alike in all charts.
+  drawing.style.maxWidth = `${Math.round(1.3 * width)}px`;
   return { drawing, sx, sy, left, right: width - right, top, bottom: height - bottom };
 }
 
@@ -88,7 +100,7 @@ function rocFigure(roc, area) {
   if (!roc.fpr.length) return element("p", { class: "note" }, "No ROC curve: no trajectory has scores of both classes.");
   const unit = { range: [0, 1], ticks: [0, 0.2, 0.4, 0.6, 0.8, 1] };
   const plot = chart("ROC curve", { ...unit, label: "false-positive rate" }, { ...unit, label: "true-positive rate" },
-    { width: 340, height: 320 });
+    { width: 330, height: 320 });
   plot.drawing.append(
     line(plot, [0, 1], [0, 1], NULL),
     line(plot, [0, ...roc.fpr], [0, ...roc.tpr], ANOMALOUS));
@@ -108,12 +120,11 @@ function delayFigure(points, calibrated) {
   if (!points.far.length) return element("p", { class: "note" }, "No curve: no score of the twins is defined.");
   const x = farAxis(points.far);
   const high = Math.max(1, ...points.delay_censored, ...points.null_censored) * 1.05;
-  const plot = chart("Delay against false-alarm rate", x, { range: [0, high], ticks: ticks(0, high), label: "delay (steps)" }, { height: 230, bottom: 28 });
-  plot.drawing.querySelectorAll(".label")[0].remove();
+  const plot = chart("Delay against false-alarm rate", { ...x, label: null }, { range: [0, high], ticks: ticks(0, high), label: "delay (steps)" }, { height: 210 });
   plot.drawing.append(
     line(plot, points.far, points.null_censored, TWIN),
     line(plot, points.far, points.delay_censored, ANOMALOUS));
-  const missed = chart("Missed trajectories against false-alarm rate", x, { range: [0, 1], ticks: [0, 0.5, 1], label: "missed" }, { height: 122 });
+  const missed = chart("Missed trajectories against false-alarm rate", x, { range: [0, 1], ticks: [0, 0.5, 1], label: "missed" }, { height: 110 });
   missed.drawing.append(line(missed, points.far, points.missed, ANOMALOUS));
   const legend = [[ANOMALOUS, "anomalous trajectories"], [TWIN, "nominal twins: what false alarms alone give"]];
   const at = points.threshold.indexOf(DATA.threshold);
@@ -127,7 +138,7 @@ function delayFigure(points, calibrated) {
     legend.push(["calibrated", "threshold calibrated to a false-alarm rate of 1 %"]);
   }
   return figure([plot.drawing, missed.drawing], legend,
-    "Mean delay from the onset to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. Left is stricter: fewer false alarms, longer delay.",
+    "Mean delay from the onset to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. The scale of false-alarm rates is a square root. Left is stricter: fewer false alarms, longer delay.",
     () => numbersTable({
       "threshold": points.threshold, "false-alarm rate": points.far, "delay (steps)": points.delay_censored,
       "missed": points.missed, "twins\u2019 delay (steps)": points.null_censored,
@@ -153,25 +164,26 @@ function trajectoryFigure(example) {
   const rows = (list) => list.map((_, i) => example.start + i);
   const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
   const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
-  const wide = { width: 920, height: 210, class: "wide" };
+  const wide = { width: 920, class: "wide" };
   const onset = (plot, text) => shape("g", { class: "onset" },
     shape("line", { x1: plot.sx(example.onset), x2: plot.sx(example.onset), y1: plot.top, y2: plot.bottom }),
-    text && shape("text", { x: plot.sx(example.onset) + 5, y: plot.top + 11 }, `onset \u03c4 = ${example.onset}`));
+    text && shape("text", { x: plot.sx(example.onset), y: plot.top - 6, "text-anchor": "middle" }, `onset \u03c4 = ${example.onset}`));
 
-  const scores = chart("Scores", x, axisOf([...example.scores, ...example.twin], 1, "score (s.d.)"), { ...wide, bottom: 26 });
-  scores.drawing.querySelectorAll(".label")[0].remove();
+  const scoreAxis = axisOf([...example.scores, ...example.twin], 1, "score (s.d.)");
+  const cusumAxis = axisOf([...example.cusum, ...example.twin_cusum], DATA.threshold, "CUSUM");
+  const scores = chart("Scores", { ...x, label: null }, scoreAxis, { ...wide, height: 210, top: 22 });
   scores.drawing.append(onset(scores, true),
     line(scores, rows(example.twin), example.twin, TWIN),
     line(scores, rows(example.scores), example.scores, ANOMALOUS));
 
-  const statistics = [...example.cusum, ...example.twin_cusum];
-  const cusum = chart("CUSUM statistic and alarms", x, axisOf(statistics, DATA.threshold, "CUSUM"), { ...wide, height: 250, bottom: 84 });
+  const cusum = chart("CUSUM statistic and alarms", x, cusumAxis, { ...wide, height: 250, bottom: 84 });
   cusum.drawing.append(onset(cusum, false),
     shape("line", { class: "threshold", x1: cusum.left, x2: cusum.right, y1: cusum.sy(DATA.threshold), y2: cusum.sy(DATA.threshold) }),
     line(cusum, rows(example.twin_cusum), example.twin_cusum, TWIN),
     line(cusum, rows(example.cusum), example.cusum, ANOMALOUS),
     alarmStrip(cusum, example.alarms, ANOMALOUS, 26), alarmStrip(cusum, example.twin_alarms, TWIN, 40));
 
+  const bending = Boolean(scoreAxis.bend || cusumAxis.bend);
   const first = (alarms) => {
     const found = alarms.find((t) => t >= example.onset);
     return found === undefined ? "none in this window" : `${found - example.onset} steps after the onset`;
@@ -180,14 +192,14 @@ function trajectoryFigure(example) {
   return figure([scores.drawing, cusum.drawing],
     [[ANOMALOUS, "anomalous trajectory"], [TWIN, "its nominal twin"], ["threshold", `alarm threshold ${DATA.threshold}`]],
     `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
-    "Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift 0.0018, before the reset that an alarm brings; marks below it are alarms. " +
-    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}. Axes with very large values are logarithmic beyond one unit.`);
+    `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms. ` +
+    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.${bending ? " Where values are very large the upright scale is logarithmic." : ""}`);
 }
 
 /** Marks below a chart, one for each alarm. */
 function alarmStrip(plot, alarms, kind, below) {
   const y = plot.bottom + below;
   return shape("g", { class: `alarms ${kind}` },
-    shape("text", { x: plot.left - 7, y: y + 8, "text-anchor": "end" }, kind === TWIN ? "twin" : "alarms"),
+    shape("text", { x: plot.left - 7, y: y + 8, "text-anchor": "end" }, kind === TWIN ? "twin\u2019s" : "alarms"),
     alarms.map((t) => shape("line", { x1: plot.sx(t), x2: plot.sx(t), y1: y, y2: y + 9 })));
 }

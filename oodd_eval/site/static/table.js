@@ -2,7 +2,7 @@
 
 const state = {
   board: DATA.boards[0]?.id, ...EVERYTHING, horizon: "all", inputs: "all", trivial: true,
-  view: "ranking", sort: "", ascending: false,
+  view: "ranking", sort: "auc_matched", ascending: false,
 };
 
 /** Rows that the filters leave. */
@@ -13,21 +13,18 @@ function rowsOf(board) {
     (state.trivial || !row.trivial));
 }
 
-/** Sort by a column, what has no value last; without one, by rank (of a selection, by mean). */
+/** Sort by a column, by matched AUC when the view has no such column; what has no value last. */
 function sorted(board, rows, columns) {
-  const column = [RANK, ...columns].find((c) => c.key === state.sort);
-  const value = (row, of) => of(row, state).value;
-  const matched = (row) => mean(board, row, "auc_matched", state).value ?? -1;
   const label = (a, b) => a.label.localeCompare(b.label);
-  const standard = (a, b) =>
-    (a.rank ?? Infinity) - (b.rank ?? Infinity) || matched(b) - matched(a) || label(a, b);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
-  const byMean = (a, b) => matched(b) - matched(a) || label(a, b);
-  if (!column) return [...rows].sort(selectsLess(state) ? byMean : standard);
+  const matched = (row) => mean(board, row, "auc_matched", state).value;
+  const column = [RANK, ...columns].find((c) => c.key === state.sort);
+  const value = column ? (row) => column.of(row, state).value : matched;
+  const sign = column && state.ascending ? 1 : -1;
   return [...rows].sort((a, b) => {
-    const [x, y] = [value(a, column.of), value(b, column.of)];
-    if (!isNumber(x) || !isNumber(y)) return isNumber(y) - isNumber(x) || standard(a, b);
-    return (state.ascending ? x - y : y - x) || standard(a, b);
+    const [x, y] = [value(a), value(b)];
+    const defined = isNumber(y) - isNumber(x);
+    return defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
   });
 }
 
@@ -47,7 +44,7 @@ function drawTable() {
     element("caption", {}, captionOf(board, rows)),
     element("thead", {}, element("tr", {}, [
       header(RANK),
-      header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", left: true }),
+      header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", left: true, better: "lower" }),
       ...columns.map(header),
     ])),
     element("tbody", {}, rows.map((row) => tableRow(board, row, columns, rows))),
@@ -64,7 +61,7 @@ function header(column) {
   return element("th", { scope: "col", "aria-sort": order, class: column.left && "left" },
     element("button", {
       type: "button", "data-sort": column.key, title: column.hint,
-      onclick: () => sortBy(column.key, column.left || column.key === "rank" ? "lower" : column.better),
+      onclick: () => sortBy(column.key, column.better),
     }, column.title, element("span", { class: "arrow", "aria-hidden": "true" },
       active ? (state.ascending ? "\u25b2" : "\u25bc") : "\u2195")),
     column.unit && element("span", { class: "unit" }, column.unit));
@@ -86,7 +83,7 @@ function tableRow(board, row, columns, rows) {
       const text = column.plain
         ? (isNumber(found.value) ? (column.fixed ? found.value.toFixed(column.digits) : brief(found.value)) : UNDEFINED)
         : meanText(found, column.kind);
-      const strong = isNumber(found.value) && !row.trivial && !column.paper && found.value === best(column);
+      const strong = isNumber(found.value) && !row.trivial && column.marked && found.value === best(column);
       return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.state ? reasonOf(row) : null },
         element(strong ? "strong" : "span", { class: "value" }, text),
         column.whisker && whisker(board, found),
@@ -112,7 +109,7 @@ const TRUST = {
 function badges(row) {
   return [
     row.trivial && element("span", { class: "badge", title: "Knows nothing of the dynamics: what a detector has to beat" }, "trivial"),
-    element("span", { class: `badge ${row.trust}`, title: TRUST[row.trust] ?? "" }, row.trust),
+    " ", element("span", { class: `badge ${row.trust}`, title: TRUST[row.trust] ?? "" }, row.trust),
   ];
 }
 
@@ -123,12 +120,15 @@ function whisker(board, found) {
   if (!isNumber(found.value)) return null;
   const lows = board.rows.map((r) => mean(board, r, "auc_matched", state)).map((m) => m.low ?? m.value);
   const left = Math.min(0.4, Math.floor(10 * Math.min(...lows.filter(isNumber))) / 10);
-  const x = (value) => (4 + 112 * (value - left) / (1 - left)).toFixed(1);
-  return shape("svg", { class: "whisker", viewBox: "0 0 120 16", width: 120, height: 16, "aria-hidden": "true" },
+  const x = (value) => (4 + 172 * (value - left) / (1 - left)).toFixed(1);
+  const upright = (name, value, y) => shape("line", { class: name, x1: x(value), x2: x(value), y1: y, y2: 16 - y });
+  const bar = isNumber(found.low) && [
+    shape("line", { class: "bar", x1: x(found.low), x2: x(found.high), y1: 8, y2: 8 }),
+    upright("bar", found.low, 4.5), upright("bar", found.high, 4.5),
+  ];
+  return shape("svg", { class: "whisker", viewBox: "0 0 180 16", width: 180, height: 16, "aria-hidden": "true" },
     shape("line", { class: "axis", x1: x(left), x2: x(1), y1: 8, y2: 8 }),
-    shape("line", { class: "half", x1: x(0.5), x2: x(0.5), y1: 1, y2: 15 }),
-    isNumber(found.low) && shape("line", { class: "bar", x1: x(found.low), x2: x(found.high), y1: 8, y2: 8 }),
-    shape("circle", { cx: x(found.value), cy: 8, r: 3.4 }));
+    upright("half", 0.5, 1), bar, shape("circle", { cx: x(found.value), cy: 8, r: 2.8 }));
 }
 
 /** What the table is over, in words. */
@@ -150,16 +150,17 @@ function notesOf(board, rows) {
     `Split ${board.split}, digest ${board.digest.slice(0, 12)}, protocol ${board.protocol}, ` +
     `${board.tests.join(", ")} test seeds per environment${limit}. Tables never mix splits or protocols.`,
   ];
-  if (cellsOf(board, state) && !hasIntervals(board, state)) {
-    lines.push("No interval was computed for this selection of cells; there are intervals for one or all environments with one or all groups, for one anomaly over all environments, and for single cells.");
-  }
   if (selectsLess(state)) {
     lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
   }
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
+  const captions = new Map();
   for (const row of rows) {
-    for (const { caption } of row.entries) if (caption) lines.push(`${row.label}: ${caption}`);
+    for (const { caption } of row.entries) {
+      if (caption) captions.set(caption, [...(captions.get(caption) ?? []), row.label]);
+    }
   }
+  for (const [caption, labels] of captions) lines.push(`${labels.join(", ")}: ${caption}`);
   if (rows.some((row) => mean(board, row, "auc_matched", state).partial)) {
     lines.push("* A mean over fewer cells than other rows have.");
   }

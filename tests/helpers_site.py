@@ -1,0 +1,148 @@
+"""Entries of a leaderboard made by hand: small ones for the site, and one as large as it gets."""
+
+from dataclasses import replace
+
+import numpy as np
+from helpers_records import make_record
+
+from oodd_eval.alarms import CALIBRATED
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.curves import Sweep, cell_curves, thresholds, write_curves
+from oodd_eval.cusum import Standardization
+from oodd_eval.intervals import bootstrap_weights, interval
+from oodd_eval.metrics import METRICS, AlarmRule, Contribution
+from oodd_eval.records import Metric
+from oodd_eval.submission.format import Entry, read_entries
+
+DIGEST = "ab" * 32
+
+
+def write_entry(root, identity, records, *, curves=(), **fields):
+    """Write one entry; `curves` names the detectors whose cells get some."""
+    directory = root / identity
+    directory.mkdir(parents=True)
+    lines = [record.to_json() + "\n" for record in records]
+    (directory / "records.jsonl").write_text("".join(lines), encoding="utf-8")
+    units = [make_curves(r, i) for i, r in enumerate(records) if r.ok and r.detector in curves]
+    if units:
+        write_curves({"units": units}, directory / "curves.json")
+    first = records[0]
+    given = {
+        "title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
+        "url": "https://example.org/page", "trust": "reported", "created": "2026-11-21",
+        "command": "oodd-eval run --detector all", "caption": "",
+    } | fields  # fmt: skip
+    entry = Entry(
+        id=identity, detectors=sorted({r.detector for r in records}), split=first.split,
+        split_digest=first.split_digest, protocol=first.protocol, plugins=[], environment={},
+        **given,
+    )  # fmt: skip
+    (directory / "entry.json").write_text(entry.to_json(), encoding="utf-8")
+
+
+def make_curves(record, seed):
+    """Curves of one cell, of random scores that are shifted from the onset on."""
+    rng = np.random.default_rng(seed)
+    twins = [rng.normal(size=120) for _ in range(3)]
+    anomalous = [rng.normal(size=110) for _ in range(3)]
+    onsets = [35, 50, 62]
+    for scores, onset in zip(anomalous, onsets, strict=True):
+        scores[onset:] += 1.5
+    rule = AlarmRule(Standardization(mean=0.0, std=1.0))
+    sweep = Sweep.over(twins, rule, thresholds(twins, rule))
+    return {
+        "cell": record.cell, "detector": record.detector, "horizon": record.horizon,
+        "seed": record.seed, "overrides": record.provenance["overrides"],
+        "environment": record.environment, "anomaly": record.anomaly,
+        **cell_curves(sweep, rule, anomalous, onsets),
+    }  # fmt: skip
+
+
+def describe(record, *, inputs="observations", **fields):
+    """A record with cost and inputs, intervals, and alarms at a calibrated threshold."""
+    calibrated = {f"{name}_at_1pct": record.per_trajectory.get(name) for name in CALIBRATED}
+    columns = {k: v for k, v in (record.per_trajectory | calibrated).items() if v}
+    metrics = {}
+    for name, pair in columns.items():
+        c = Contribution(*map(np.array, pair))
+        weights = bootstrap_weights(len(c.numerator), key=record.environment)
+        metrics[name] = Metric(c.value, *interval(c, weights), n=c.n)
+    fields = {"metrics": metrics, "per_trajectory": columns} | fields
+    provenance = {**record.provenance, "inputs": inputs, "steps_scored": 1000}
+    cost = {"seconds_fit": 2.5, "seconds_score": 0.05, "peak_rss_mb": 150.0}
+    return replace(record, **cost, **fields, provenance=provenance)
+
+
+def values(rng, level, n=4):
+    """Numerators per metric over n trajectories; AUCs about a level."""
+    found = {name: list(np.round(rng.uniform(0, 0.2, n), 3)) for name in METRICS}
+    for name in ("auc", "auc_matched"):
+        found[name] = [float(v) for v in np.clip(rng.normal(level, 0.05, n), 0, 1)]
+    for name in ("delay", "delay_null", "delay_censored"):
+        found[name] = [float(v) for v in rng.integers(0, 30, n)]
+    return found
+
+
+LEVELS = {"riqn": 0.9, "rf": 0.7, "persistence": 0.55, "clock": 0.5}
+
+
+def example(root):
+    """Three entries on two boards: two environments, four anomalies, horizons, a failure, seeds."""
+    rng = np.random.default_rng(0)
+    cells = [(e, a) for e in ("cartpole", "hopper") for a in ("iid", "drift", "gravity",
+                                                              "components")]  # fmt: skip
+
+    def records(detector, *, level=None, inputs="observations", broken=(), **settings):
+        found = []
+        for environment, anomaly in cells:
+            failed = (environment, anomaly) in broken
+            record = make_record(
+                detector, environment, anomaly, digest=settings.get("digest", DIGEST),
+                values=values(rng, level or LEVELS[detector]),
+                status="timeout" if failed else "ok", reason="not done after 5 s" if failed else "",
+                **{k: v for k, v in settings.items() if k != "digest"},
+            )  # fmt: skip
+            found.append(describe(record, inputs=inputs))
+        return found
+
+    write_entry(
+        root, "forecasters",
+        [
+            *records("riqn", inputs="observations+actions"),
+            *records("riqn", level=0.8, horizon=10, inputs="observations+actions"),
+            *records("rf", seed=0), *records("rf", seed=1),
+        ],
+        curves=("riqn",), trust="re-run", caption="Three members instead of five.",
+    )  # fmt: skip
+    write_entry(root, "trivial", [*records("persistence"), *records("clock")], trust="re-scored")
+    broken = {("hopper", "iid"), ("hopper", "drift")}
+    write_entry(
+        root, "third-party",
+        records("mine", level=0.6, broken=broken, overrides={"window": 3}),
+        title="<b>bold</b>", url="javascript:alert(1)",
+    )  # fmt: skip
+    write_entry(root, "other-digest", records("rf", digest="cd" * 32))
+    return read_entries(root)
+
+
+def full(root, rows=12, n=10):
+    """One entry of all 56 cells for each of many detectors, with curves, as on the real board."""
+    rng = np.random.default_rng(0)
+    sample = None
+    for i in range(rows):
+        name = f"detector-{i}"
+        records = [
+            describe(make_record(name, e, a, values=values(rng, 0.5 + i / 25, n)))
+            for e in ENVIRONMENTS
+            for a in ANOMALIES
+        ]
+        write_entry(root, name, records)
+        # Curves cost time, and it is their size that counts here.
+        sample = sample or make_curves(records[0], 0)
+        units = [
+            {**sample, "cell": r.cell, "detector": name, "environment": r.environment,
+             "anomaly": r.anomaly}
+            for r in records
+        ]  # fmt: skip
+        write_curves({"units": units}, root / name / "curves.json")
+    return read_entries(root)

@@ -1,0 +1,200 @@
+"""Fitted detectors are kept by content key: scoring again never fits again."""
+
+import json
+import threading
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval.fitted import FittedStore
+from oodd_eval.isolation import Limits
+from oodd_eval.plan import make_plan
+from oodd_eval.plugins import discover
+from oodd_eval.results import ResultsDirectory, fit_key
+from oodd_eval.runner import Settings, run
+from oodd_eval.splits import load_split
+
+PLUGIN = """
+import json, os
+from pathlib import Path
+import numpy as np
+from oodd_eval import DetectorSpec, hookimpl
+
+LOG = Path({log!r})
+
+class Mean:
+    def __init__(self, seed=0, horizon=1, scale=1.0, factor=1.0):
+        self.horizon, self.factor = horizon, factor
+
+    def fit(self, nominal):
+        with LOG.open("a") as log:
+            log.write("fit\\n")
+        self.mean = float(np.mean([x.observations.mean() for x in nominal]))
+
+    def score(self, x):
+        return self.factor * np.abs(x.observations.astype(np.float64).mean(axis=1) - self.mean)
+
+    def save(self, directory):
+        (directory / "mean.json").write_text(json.dumps(self.mean))
+
+    def load(self, directory):
+        with LOG.open("a") as log:
+            log.write("load\\n")
+        self.mean = json.loads((directory / "mean.json").read_text())
+
+class Cannot(Mean):
+    def save(self, directory):
+        (directory / "half").write_text("half")
+        raise RuntimeError("disk is not to my taste")
+
+class Forgets(Mean):
+    def load(self, directory):
+        raise RuntimeError("forgot how")
+
+@hookimpl
+def oodd_detectors():
+    known = {{"scale": 1.0, "factor": 1.0}}
+    common = dict(parameters=known, fit_ignores=("horizon", "factor"))
+    return [
+        DetectorSpec("mean", Mean, "mean", **common),
+        DetectorSpec("mean-too", Mean, "same fit", fit_name="mean", **common),
+        DetectorSpec("cannot", Cannot, "cannot save", **common),
+        DetectorSpec("forgets", Forgets, "cannot load", **common),
+    ]
+"""
+
+
+@pytest.fixture
+def log(monkeypatch, tmp_path):
+    path = tmp_path / "log"
+    install(monkeypatch, tmp_path / "plugin", "means", PLUGIN.format(log=str(path)), header="")
+
+    def events():
+        lines = path.read_text().split() if path.exists() else []
+        path.unlink(missing_ok=True)
+        return lines
+
+    return events
+
+
+def go(directory, out, detectors=("mean",), *, fresh=False, jobs=1, **settings):
+    split = load_split(directory)
+    plan = make_plan(
+        discover(), split=split.name, split_digest=split.digest, detectors=detectors,
+        environments=split.environments[:1], **settings,
+    )  # fmt: skip
+    made = Settings(jobs=jobs, limits=Limits(60, None), fresh=fresh)
+    return plan, run(plan, split, discover(), made, ResultsDirectory(out))
+
+
+def test_scores_of_another_anomaly_need_no_second_fit(tiny_split, log, tmp_path):
+    go(tiny_split, tmp_path / "out", anomalies=("iid",))
+    assert log() == ["fit"]
+    _, done = go(tiny_split, tmp_path / "out", anomalies=("iid", "drift"))
+    assert log() == ["load"]
+    assert [r.status for r in done.records] == ["ok", "ok"]
+
+
+def test_what_the_fit_ignores_shares_it(tiny_split, log, tmp_path):
+    _, done = go(tiny_split, tmp_path / "out", ("mean", "mean-too"), horizons=(1, 2), jobs=2)
+    assert sorted(log()) == ["fit", "load", "load", "load"]
+    assert {r.seconds_fit for r in done.records} == {done.records[0].seconds_fit}
+    go(tiny_split, tmp_path / "out", parameters={"factor": 2.0})
+    assert log() == ["load"]
+
+
+@pytest.mark.parametrize(
+    "settings", [{"parameters": {"scale": 2.0}}, {"seeds": (1,)}, {"limit": 2}]
+)
+def test_what_decides_the_fit_has_a_key_of_its_own(tiny_split, log, tmp_path, settings):
+    go(tiny_split, tmp_path / "out")
+    log()
+    go(tiny_split, tmp_path / "out", **settings)
+    assert log() == ["fit"]
+
+
+def test_a_loaded_fit_gives_the_same_records(tiny_split, log, tmp_path):
+    go(tiny_split, tmp_path / "one", anomalies=("iid",))
+    _, loaded = go(tiny_split, tmp_path / "one")
+    _, fitted = go(tiny_split, tmp_path / "two")
+    assert log() == ["fit", "load", "fit"]
+    assert [r.metrics for r in loaded.records] == [r.metrics for r in fitted.records]
+
+
+def test_fresh_fits_again_and_keeps_that(tiny_split, log, tmp_path):
+    go(tiny_split, tmp_path / "out")
+    go(tiny_split, tmp_path / "out", fresh=True)
+    assert log() == ["fit", "fit"]
+    go(tiny_split, tmp_path / "out", horizons=(3,))
+    assert log() == ["load"]
+
+
+@pytest.mark.parametrize("damage", ["bytes", "index", "gone"])
+def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path, damage):
+    plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
+    key = fit_key(plan, plan.units[0], discover().offer("mean"))
+    place = tmp_path / "out" / "fitted" / key
+    match damage:
+        case "bytes":
+            (place / "mean.json").write_text("123.0")
+        case "index":
+            (place / "fitted.json").write_text("{}")
+        case "gone":
+            (place / "mean.json").unlink()
+    log()
+    _, done = go(tiny_split, tmp_path / "out", anomalies=("drift",))
+    assert log() == ["fit"]
+    assert done.records[0].ok
+
+
+def test_a_detector_that_cannot_save_itself_is_scored_all_the_same(tiny_split, log, tmp_path):
+    _, done = go(tiny_split, tmp_path / "out", ("cannot",))
+    assert all(r.ok for r in done.records)
+    assert [p.name for p in (tmp_path / "out" / "fitted").iterdir()] == []
+
+
+def test_a_detector_that_cannot_load_itself_is_fitted(tiny_split, log, tmp_path):
+    go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",))
+    _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("drift",))
+    assert log() == ["fit", "fit"]
+    assert done.records[0].ok
+
+
+def test_the_key_tells_nothing_of_the_environment(tiny_split, log, tmp_path):
+    plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
+    key = fit_key(plan, plan.units[0], discover().offer("mean"))
+    assert not any(c not in "0123456789abcdef" for c in key)
+
+
+def test_a_store_keeps_whole_directories_only(tmp_path):
+    store = FittedStore(tmp_path / "fitted")
+    assert store.find("k") is None
+    with store.room() as room:
+        (room / "a").write_text("1")
+        store.keep("k", room, 2.5)
+    found = store.find("k")
+    assert found is not None
+    assert found.seconds_fit == 2.5
+    assert json.loads((found.path / "fitted.json").read_text())["files"].keys() == {"a"}
+    with store.room() as room:
+        store.keep("empty", room, 1.0)
+    assert store.find("empty") is None
+    assert [p.name for p in store.path.iterdir()] == ["k"]
+
+
+def test_one_thread_at_a_time_fits_for_a_key(tmp_path):
+    store, inside, most = FittedStore(tmp_path), [0], [0]
+
+    def work():
+        with store.alone("k"):
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            threading.Event().wait(0.01)
+            inside[0] -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]

@@ -1,0 +1,259 @@
+"""Hostile plug-ins, each a module of its own, through the real command line in three runs.
+
+Each ends in a named state, the cells of the others are finished, and nothing is left running.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers_plugins import install
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks into /proc")
+
+HEADER = """
+import builtins, ctypes, os, signal, subprocess, sys, threading, time
+from pathlib import Path
+import numpy as np
+from oodd_eval import DetectorSpec, hookimpl
+
+class Base:
+    def __init__(self, *, seed=0, horizon=1): pass
+    def fit(self, nominal): pass
+    def score(self, x): return np.abs(x.observations).sum(axis=1).astype(np.float64)
+
+@hookimpl
+def oodd_detectors():
+    return [DetectorSpec(Hostile.__module__.removeprefix("oodd_"), Hostile, "")]
+"""
+
+# name: (body of the class, status, reason)
+QUICK = {
+    "segfault": ("def score(self, x): ctypes.string_at(0)",
+                 "error", "the worker was killed by SIGSEGV while scoring"),
+    "abort": ("def fit(self, nominal): os.abort()",
+              "error", "the worker was killed by SIGABRT while fitting"),
+    "sysexit": ("def score(self, x): sys.exit(0)", "error", r"called sys.exit\(0\)"),
+    "hardexit": ("def score(self, x): os._exit(0)",
+                 "error", "the worker ended with exit code 0 while scoring"),
+    "interrupt": ("def fit(self, nominal): raise KeyboardInterrupt",
+                  "error", r"KeyboardInterrupt \(oodd_interrupt.py:\d+\)"),
+    "oddraise": ("""
+        class Odd(BaseException): pass
+        def score(self, x): raise self.Odd("neither fish nor flesh")""",
+                 "error", "Odd: neither fish nor flesh"),
+    "recursion": ("def score(self, x): return self.score(x)", "error", "RecursionError"),
+    "wrongshape": ("def score(self, x): return super().score(x)[:, None]",
+                   "invalid", r"returned an array of shape \(\d+, 1\)"),
+    "latenan": ("""
+        def score(self, x):
+            s = super().score(x); s[-1] = np.nan; return s""",
+                "invalid", r"returned nan at t = \d+ of cartpole/"),
+    "objects": ("def score(self, x): return super().score(x).astype(object)",
+                "invalid", "score returned ndarray of object"),
+    "lazy": ("""
+        def score_many(self, xs):
+            return (self.score(x) if i < 3 else 1 / 0 for i, x in enumerate(xs))""",
+             "error", "ZeroDivisionError"),
+    "mapped": ("""
+        def score(self, x):
+            path = Path(f"/tmp/{os.getpid()}.scores")
+            found = np.memmap(path, np.float64, "w+", shape=(len(x),))
+            os.truncate(path, 0); path.unlink()
+            return found""",
+               "error", "the worker was killed by SIGBUS while scoring"),
+    "pipe": ("""
+        def score(self, x):
+            for descriptor in range(3, 64):
+                try: os.write(descriptor, b"garbage " * 10)
+                except OSError: pass
+            return super().score(x)""",
+             "error", "the detector wrote into the pipe between worker and harness"),
+    "closer": ("def fit(self, nominal): os.closerange(0, 64)",
+               "error", "the worker ended with exit code 1 while fitting"),
+    "forks": ("def fit(self, nominal): os.fork()",
+              "error", "the detector wrote into the pipe between worker and harness"),
+    "orphan": ("""
+        def fit(self, nominal):
+            if os.fork() == 0:
+                os.setsid()
+                if os.fork() == 0: time.sleep(600)
+                os._exit(0)
+            os._exit(3)""",
+               "error", "the worker ended with exit code 3 while fitting"),
+    "daemons": ("""
+        def fit(self, nominal):
+            for _ in range(5): subprocess.Popen(["sleep", "600"], start_new_session=True)
+            raise OSError("and they sleep on")""",
+                "error", "OSError: and they sleep on"),
+    "sabotage": ("def fit(self, nominal): builtins.isinstance = builtins.len = None",
+                 "error", "the worker ended with exit code 1 while |TypeError"),
+    "modules": ("""
+        def fit(self, nominal):
+            for name in list(sys.modules): del sys.modules[name]
+            raise ImportError("nothing is left")""",
+                "error", "ImportError: nothing is left"),
+    "noise": ("""
+        def score(self, x):
+            for descriptor in (1, 2): os.write(descriptor, bytes(range(256)) * 400)
+            print("\\x1b[2J garbage " * 1000, flush=True)
+            return super().score(x)[1:]""",
+              "invalid", r"returned \d+ scores for cartpole/"),
+    "settings": ("""
+        def fit(self, nominal):
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)
+            os.chdir("/"); os.umask(0o777); os.environ.clear(); np.seterr(all="raise")
+            sys.stdout = sys.stderr = None
+            raise ValueError("all is upside down")""",
+                 "error", "ValueError: all is upside down"),
+    "grows": ("""
+        def score(self, x):
+            self.rows = np.ones(6 * 10**7); time.sleep(600)""",
+              "oom", r"resident memory \d+ MB is over the limit of 300 MB \(--memory\)"),
+    "leaves": ("""
+        def fit(self, nominal):
+            subprocess.Popen(["sleep", "600"], start_new_session=True)
+            for _ in range(50): threading.Thread(target=time.sleep, args=(600,)).start()""",
+               "ok", ""),
+}  # fmt: skip
+
+HANGING = {
+    "hangs": "def fit(self, nominal): time.sleep(600)",
+    "spins": """
+        def score(self, x):
+            while True: pass""",
+    "deaf": """
+        def fit(self, nominal):
+            for number in set(signal.Signals) - {signal.SIGKILL, signal.SIGSTOP}:
+                signal.signal(number, signal.SIG_IGN)
+            time.sleep(600)""",
+    "stops": "def score(self, x): os.kill(os.getpid(), signal.SIGSTOP)",
+    "bomb": """
+        def fit(self, nominal):
+            threads = [threading.Thread(target=time.sleep, args=(600,)) for _ in range(200)]
+            for thread in threads: thread.start()
+            for thread in threads: thread.join()""",
+    "floods": """
+        def score(self, x):
+            while True: os.write(1, b"garbage " * 1000)""",
+}
+
+BROKEN = {
+    "leavesatimport": "import sys; sys.exit(0)",
+    "brokenatimport": "import no_such_module",
+}
+
+MARKER = f"OODD_TEST_HOSTILE=run-{os.getpid()}"
+LIMIT = "6"
+
+
+def left_running():
+    """Processes whose environment holds this test's marker, but for this one."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if MARKER.encode() in (place / "environ").read_bytes():
+                found.append((place.name, (place / "cmdline").read_bytes()))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.fixture(scope="module")
+def hostile(tiny_split, tmp_path_factory):
+    """All runs: exit codes, outputs, records by detector, and processes left running."""
+    plugins = tmp_path_factory.mktemp("plugins")
+    bodies = {name: body for name, (body, *_) in QUICK.items()} | HANGING
+    with pytest.MonkeyPatch.context() as patch:
+        for name, body in bodies.items():
+            code = f"class Hostile(Base):\n{indented(body)}\n"
+            install(patch, plugins, name, code, header=HEADER)
+        for name, code in BROKEN.items():
+            install(patch, plugins, name, code, header="")
+
+    def run(names, *options):
+        output = tmp_path_factory.mktemp("output")
+        name, value = MARKER.split("=")
+        done = subprocess.run(
+            [sys.executable, "-m", "oodd_eval", "run", "--detector", ",".join(names), "--env",
+             "cartpole", "--anomaly", "iid,gravity", "--split", tiny_split, "--output",
+             output, *options],
+            env={**os.environ, name: value, "PYTHONPATH": str(plugins),
+                 "OODD_EVAL_PLUGINS": ",".join([*bodies, *BROKEN])},
+            capture_output=True, text=True, check=False, timeout=300,
+        )  # fmt: skip
+        lines = (output / "records.jsonl").read_text().splitlines()
+        return done, [json.loads(line) for line in lines]
+
+    quick = run([*QUICK, "clock"], "--memory", "300MB", "--timeout", "120", "--jobs", "3")
+    # On their own: a short limit would also end whoever starts slowly on a busy machine.
+    hanging = run(HANGING, "--timeout", LIMIT, "--jobs", "12")
+    time.sleep(0.2)
+    return quick, hanging, left_running()
+
+
+def indented(body):
+    lines = body.strip("\n").splitlines()
+    margin = len(lines[0]) - len(lines[0].lstrip())
+    return "\n".join("    " + line[margin:] for line in lines)
+
+
+def cells(records, name):
+    return [record for record in records if record["detector"] == name]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_hostile_plugin_ends_in_its_state(hostile, name):
+    _, status, reason = QUICK[name]
+    found = cells(hostile[0][1], name)
+    assert [record["status"] for record in found] == [status] * 2, found[0]["reason"]
+    assert all(re.search(reason, r["reason"]) for r in found)
+
+
+@pytest.mark.parametrize("name", HANGING)
+def test_a_hanging_plugin_is_ended_by_the_time_limit(hostile, name):
+    found = cells(hostile[1][1], name)
+    assert [(record["status"], record["reason"]) for record in found] == [
+        ("timeout", f"not done after {LIMIT} s (--timeout)")
+    ] * 2
+
+
+def test_there_are_enough_of_them():
+    assert len([n for n, (_, status, _) in QUICK.items() if status != "ok"]) + len(HANGING) >= 15
+
+
+def test_the_exit_code_is_1_and_every_other_cell_is_finished(hostile):
+    (quick, records), (hanging, hung), _ = hostile
+    assert quick.returncode == hanging.returncode == 1, quick.stderr
+    assert len(records) == 2 * (len(QUICK) + 1)
+    assert len(hung) == 2 * len(HANGING)
+    assert [record["status"] for record in cells(records, "clock")] == ["ok"] * 2
+
+
+def test_the_summary_counts_the_states(hostile):
+    states = [status for _, status, _ in QUICK.values()]
+    out = hostile[0][0].stdout
+    assert f"{2 * (states.count('ok') + 1)} ok, {2 * states.count('error')} error" in out
+    assert f"{2 * len(HANGING)} timeout in" in hostile[1][0].stdout
+
+
+def test_nothing_that_a_plugin_printed_reaches_the_output(hostile):
+    for done, _ in hostile[:2]:
+        assert "garbage" not in done.stdout + done.stderr
+        assert "\x1b" not in done.stdout
+
+
+def test_plugins_that_fail_at_import_are_named(hostile):
+    err = hostile[0][0].stderr
+    assert "plug-in 'leavesatimport' of oodd-leavesatimport is broken: SystemExit: 0" in err
+    assert "plug-in 'brokenatimport' of oodd-brokenatimport is broken: ModuleNotFoundError" in err
+
+
+def test_no_process_is_left_behind(hostile):
+    assert hostile[2] == []

@@ -1,0 +1,251 @@
+"""``oodd-eval reproduce`` as a whole: a small split, quick detectors in the paper's names."""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_reproduce import install_quick
+
+from oodd_eval.cli import main
+from oodd_eval.reproduce.plots import Dots, Figure, Panel, draw
+from oodd_eval.results import ResultsDirectory
+
+ONLY = "delays"
+"""Five units in each environment, riqn at three horizons."""
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    install_quick(monkeypatch, tmp_path / "plugins")
+
+
+def reproduce(split, output, *options, only=ONLY):
+    return main(
+        ["reproduce", "--tier", "mini", "--split", str(split), "--output", str(output),
+         "--only", only, *options]
+    )  # fmt: skip
+
+
+def contents(directory):
+    """Everything a reader sees, by name: not the scores and logs."""
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(Path(directory).rglob("*"))
+        if path.is_file() and path.parts[len(Path(directory).parts)] not in ("scores", "logs")
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_split, tmp_path_factory):
+    """A directory in which the delays are finished; tests must not write to it."""
+    with pytest.MonkeyPatch.context() as patch:
+        install_quick(patch, tmp_path_factory.mktemp("plugins"))
+        output = tmp_path_factory.mktemp("finished") / "reproduction"
+        assert reproduce(tiny_split, output) == 0
+    return output
+
+
+def test_files_of_a_reproduction(finished):
+    names = set(contents(finished))
+    assert {
+        "README.md",
+        "claims.csv",
+        "records.jsonl",
+        "reproduction.json",
+        "returns.json",
+    } <= names
+    for name in ("table-2", "figure-horizon", "delays"):
+        assert {f"tables/{name}.md", f"tables/{name}.csv"} <= names
+        assert {f"figures/{name}.png", f"figures/{name}.svg"} <= names
+    page = (finished / "README.md").read_text()
+    assert "10 of 72 fits and scorings have been run." in page
+    # Ensembles share no setup but RIQN's with the delays; N-RIQN was not run at all.
+    assert "not run" in (finished / "tables" / "table-3.md").read_text()
+    assert "(2 of 7)" in page
+
+
+def test_numbers_are_those_of_the_records(finished):
+    records = [r for r in ResultsDirectory(finished).records()
+               if (r.environment, r.horizon) == ("hopper", 10)]  # fmt: skip
+    sensor = [r.value("delay_censored") for r in records if r.group == "sensor"]
+    lines = (finished / "tables" / "delays.csv").read_text().splitlines()
+    header = lines[0].split(",")
+    rows = [dict(zip(header, line.split(","), strict=True)) for line in lines[1:]]
+    [row] = [
+        r for r in rows
+        if (r["environment"], r["horizon"], r["anomalies"], r["metric"])
+        == ("hopper", "10", "sensor", "delay_censored")
+    ]  # fmt: skip
+    assert float(row["value"]) == pytest.approx(np.mean(sensor))
+
+
+def test_a_second_run_does_nothing_and_changes_no_byte(finished, tiny_split, quick, capsys):
+    before = contents(finished)
+    times = {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()}
+    assert reproduce(tiny_split, finished) == 0
+    assert "[1/" not in capsys.readouterr().out
+    assert contents(finished) == before
+    assert times == {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()}
+
+
+def test_tables_and_figures_are_made_again_from_the_records_alone(finished, tmp_path, monkeypatch):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "nowhere"))
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for name in ("records.jsonl", "reproduction.json", "returns.json"):
+        shutil.copy(finished / name, kept / name)
+    assert main(["reproduce", "--render-only", "--output", str(kept), "-q"]) == 0
+    assert contents(kept) == contents(finished)
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_tables(
+    finished, tiny_split, quick, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("QUICK_SECONDS", "0.1")
+    output = tmp_path / "killed"
+    command = [
+        sys.executable, "-m", "oodd_eval", "reproduce", "--tier", "mini", "--split",
+        str(tiny_split), "--output", str(output), "--only", ONLY, "--jobs", "2",
+    ]  # fmt: skip
+    rng = random.Random(4)
+    scores = set()
+    for _ in range(3):
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        seen = len(scores)
+        deadline = time.monotonic() + 60
+        # Killed at a random moment after something new was finished, or after the end.
+        while process.poll() is None and time.monotonic() < deadline:
+            scores = {p.name for p in (output / "scores").glob("*.h5")}
+            if len(scores) > seen:
+                break
+            time.sleep(0.02)
+        time.sleep(rng.uniform(0, 0.5))
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        assert scores <= {p.name for p in (output / "scores").glob("*.h5")}
+        scores = {p.name for p in (output / "scores").glob("*.h5")}
+        for path in (*output.rglob("*.json"), *output.rglob("*.jsonl")):
+            if not path.name.startswith("."):
+                [json.loads(line) for line in path.read_text().splitlines()[:1] if line != "{"]
+    assert scores, "nothing was finished before the last kill"
+    assert reproduce(tiny_split, output, "-q") == 0
+    mine, theirs = contents(output), contents(finished)
+    for name in theirs:
+        if name != "records.jsonl":
+            assert mine[name] == theirs[name], name
+    assert {r.cell for r in ResultsDirectory(output).records()} == {
+        r.cell for r in ResultsDirectory(finished).records()
+    }
+
+
+def test_a_budget_that_is_used_up_leaves_units_and_says_so(tiny_split, quick, tmp_path, capsys):
+    assert reproduce(tiny_split, tmp_path / "out", "--budget", "0.001s", "--no-figures") == 2
+    said = capsys.readouterr().out
+    # A unit that was begun may end before the budget is looked at.
+    assert re.search(r"the budget is used up: (9|10) units left", said)
+    page = (tmp_path / "out" / "README.md").read_text()
+    assert re.search(r"\b[0-8] of 72 fits and scorings have been run\.", page)
+    assert "Not run." in page
+
+
+def test_the_plan_says_what_remains_and_does_nothing(finished, tiny_split, quick, tmp_path, capsys):
+    assert reproduce(tiny_split, tmp_path / "out", "--plan") == 0
+    said = capsys.readouterr().out
+    assert "What remains" in said
+    [line] = [line for line in said.splitlines() if line.startswith("all ")]
+    assert line.split()[1:4] == ["10", "0", "10"]
+    assert not (tmp_path / "out").exists()
+    assert reproduce(tiny_split, finished, "--plan") == 0
+    [line] = [x for x in capsys.readouterr().out.splitlines() if x.startswith("all ")]
+    assert line.split()[1:4] == ["10", "10", "0"]
+
+
+def test_one_directory_holds_one_reproduction(finished, quick, capsys):
+    assert main(["reproduce", "--tier", "mini", "--output", str(finished)]) == 4
+    message = capsys.readouterr().err
+    assert "split tiny" in message
+    assert "--output" in message
+
+
+def test_a_split_that_is_not_here_comes_with_the_command_that_builds_it(
+    quick, monkeypatch, tmp_path, capsys
+):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path))
+    assert main(["reproduce", "--output", str(tmp_path / "out")]) == 4
+    message = capsys.readouterr().err
+    assert "oodd-eval data build standard" in message
+    assert "--build" in message
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["--tier", "mimi"], "did you mean 'mini'"),
+        (["--tier", "mini", "--only", "table-6"], "unknown table or figure 'table-6'"),
+        (["--tier", "mini", "--budget", "soon"], "a time such as"),
+        (["--tier", "mini", "--jobs", "0"], "--jobs is 0"),
+        (["--render-only"], "no reproduction in"),
+    ],
+)
+def test_wrong_requests_are_refused_before_any_work(quick, tmp_path, capsys, options, part):
+    output = tmp_path / "out"
+    assert main(["reproduce", "--output", str(output), *options]) == 4
+    assert part in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_failing_units_are_states_and_the_exit_code_is_one(
+    tiny_split, quick, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setenv("QUICK_SECONDS", "30")
+    output = tmp_path / "out"
+    code = reproduce(
+        tiny_split, output, "--timeout", "1s", "--no-figures", "--jobs", "5", only="delays"
+    )
+    assert code == 1
+    assert "timeout" in (output / "tables" / "delays.md").read_text()
+    assert "## Failures" in (output / "README.md").read_text()
+    assert "timeout" in capsys.readouterr().out
+
+
+def test_a_damaged_header_is_refused_by_name(finished, tmp_path, capsys):
+    shutil.copytree(finished, tmp_path / "copy")
+    header = tmp_path / "copy" / "reproduction.json"
+    header.write_text(header.read_text()[:-20])
+    assert main(["reproduce", "--render-only", "--output", str(tmp_path / "copy")]) == 4
+    assert "reproduction.json" in capsys.readouterr().err
+
+
+def a_figure(**changes):
+    dots = Dots(
+        "RIQN", (50.0, float("nan")), (40.0, float("nan")), (60.0, float("nan")), (55.0,) * 2
+    )
+    return Figure("A figure", (Panel("One", "AUC (%)", ("a", "b"), (dots,), 50.0),), 1, **changes)
+
+
+def test_figures_are_the_same_bytes_again_without_date_or_version():
+    first, second = draw(a_figure()), draw(a_figure())
+    assert first == second
+    assert first["png"].startswith(b"\x89PNG")
+    assert b"<dc:date>" not in first["svg"]
+    assert b"Software" not in first["png"]
+    assert draw(a_figure(height=3.0)) != first
+
+
+def test_a_figure_names_its_parts():
+    text = draw(a_figure())["svg"].decode()
+    for word in ("A figure", "One", "RIQN", "AUC (%)", "hollow"):
+        assert word in text

@@ -1,0 +1,495 @@
+"""The site in a real browser, opened from disk: sorting, filters, keyboard, a detector's page."""
+
+import itertools
+import math
+
+import helpers_browser
+import helpers_site
+import pytest
+
+from oodd_eval import site
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.report.leaderboard import sections
+from oodd_eval.report.tables import show_value
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        helpers_browser.programs() is None,
+        reason="no chromium with chromedriver on this machine (Debian: chromium-driver)",
+    ),
+]
+
+LABELS = "#ranking tbody th a"
+
+
+@pytest.fixture(scope="module")
+def entries(tmp_path_factory):
+    return helpers_site.example(tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="module")
+def url(entries, tmp_path_factory):
+    return site.render(entries, tmp_path_factory.mktemp("site")).as_uri()
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory):
+    with helpers_browser.launch(tmp_path_factory.mktemp("browser")) as window:
+        yield window
+
+
+@pytest.fixture
+def browser(window, url):
+    """A freshly opened page, which afterwards has to have been silent."""
+    window.open("about:blank")
+    window.console()
+    window.requests()
+    window.open(url)
+    yield window
+    assert window.console() == []
+    # The page itself, and its empty icon.
+    assert {request.partition("#")[0] for request in window.requests()} <= {url, "data:,"}
+
+
+def column(browser, title):
+    """Texts of the values of one column, by row."""
+    titles = [t.removesuffix("↕").removesuffix("▲").removesuffix("▼").replace("\n", " ").strip()
+              for t in browser.texts("#ranking thead button")]  # fmt: skip
+    index = titles.index(title) + 1
+    cells = browser.texts(f"#ranking tbody tr > :nth-child({index})")
+    return dict(zip(browser.texts(LABELS), cells, strict=True))
+
+
+def open_row(browser, label):
+    browser.run(
+        "[...document.querySelectorAll(arguments[0])].find((a) => a.textContent === arguments[1])"
+        ".click()",
+        LABELS,
+        label,
+    )
+    browser.wait_for("document.querySelector('#detector h1') !== null")
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+def test_the_first_view_is_the_ranking_of_the_first_board(browser):
+    assert browser.texts(LABELS) == [
+        "riqn", "riqn[h=10]", "rf", "persistence", "clock", "mine[window=3]",
+    ]  # fmt: skip
+    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text("caption")
+    assert "digest abababababab, protocol 1, 2 test seeds" in browser.texts("#notes li")[0]
+    assert browser.run("return document.querySelector('[aria-sort=descending]').textContent")
+
+
+def test_trivial_rows_are_marked_and_can_be_left_out(browser):
+    assert browser.texts("tr.trivial th a") == ["persistence", "clock"]
+    assert "trivial" in browser.texts("tr.trivial .badge")
+    browser.click("#filters [name=trivial]")
+    assert browser.texts(LABELS) == ["riqn", "riqn[h=10]", "rf", "mine[window=3]"]
+    assert "4 of 6 rows" in browser.text("caption")
+
+
+def test_a_click_sorts_and_a_second_one_turns_round(browser):
+    def order():
+        return browser.run(
+            "const h = document.querySelector('[data-sort=auc_placebo]').closest('th');"
+            "return h.getAttribute('aria-sort')"
+        )
+
+    assert order() == "none"
+    browser.click("[data-sort=auc_placebo]")
+    assert order() == "ascending"
+    values = [float(v) for v in column(browser, "Placebo").values() if v != "timeout"]
+    assert values == sorted(values)
+    browser.click("[data-sort=auc_placebo]")
+    assert order() == "descending"
+    turned = list(column(browser, "Placebo").values())
+    # What has no value stays last.
+    assert turned == [*map(str, sorted(values, reverse=True)), "timeout"]
+
+
+def test_every_column_of_every_view_sorts(browser):
+    for view in browser.run(
+        "return [...document.querySelectorAll('[name=view]')].map(e => e.value)"
+    ):
+        browser.click(f"#filters [value={view}]")
+        keys = browser.run(
+            "return [...document.querySelectorAll('[data-sort]')].map(e => e.dataset.sort)"
+        )
+        assert len(keys) > 3
+        for key in keys:
+            browser.click(f'[data-sort="{key}"]')
+            assert len(browser.texts(LABELS)) == 6
+            assert browser.run(
+                "return document.querySelector(`[data-sort='${arguments[0]}']`).closest('th')"
+                ".getAttribute('aria-sort')", key,
+            ) != "none"  # fmt: skip
+
+
+def test_the_keyboard_sorts_and_keeps_its_place(browser):
+    browser.run("document.querySelector('[data-sort=label]').focus()")
+    browser.press("enter")
+    assert browser.texts(LABELS) == sorted(browser.texts(LABELS))
+    assert browser.run("return document.activeElement.dataset.sort") == "label"
+    browser.press("space")
+    assert browser.texts(LABELS) == sorted(browser.texts(LABELS), reverse=True)
+
+
+def test_the_keyboard_reaches_every_control_and_opens_a_detector(browser):
+    seen = []
+    for _ in range(40):
+        browser.press("tab")
+        seen.append(
+            browser.run(
+                "const e = document.activeElement; return e.name || e.dataset.sort || e.textContent"
+            )
+        )
+        if seen[-1] == "riqn":
+            break
+    for control in ("board", "environment", "group", "anomaly", "horizon", "inputs", "view",
+                    "trivial", "rank", "label", "auc_matched"):  # fmt: skip
+        assert control in seen
+    browser.press("enter")
+    browser.wait_for("document.querySelector('#detector h1') !== null")
+    assert browser.text("#detector h1").startswith("riqn")
+    # The heading is announced, and the way back leads to the link that was followed.
+    assert browser.run("return document.activeElement.tagName") == "H1"
+    browser.press("shift+tab", "enter")
+    browser.wait_for("document.querySelector('#detector').hidden")
+    assert browser.run("return document.activeElement.textContent") == "riqn"
+
+
+def test_means_and_intervals_are_the_boards_for_every_selection(browser, entries):
+    section = sections(entries)[0]
+    board = section.ranks.board
+    environments = {
+        "All environments": board.environments, "Bullet": ["hopper"], "CartPole": ["cartpole"],
+    }  # fmt: skip
+    groups = {"Both groups": board.anomalies, "Sensor": board.in_group("sensor"),
+              "Dynamics": board.in_group("dynamics")}  # fmt: skip
+    compared = 0
+    for (place, some), (group, members) in itertools.product(environments.items(), groups.items()):
+        browser.choose("environment", place)
+        browser.choose("group", group)
+        for name, chosen in {
+            "All anomalies": members,
+            ANOMALIES[members[0]].title: members[:1],
+        }.items():
+            browser.choose("anomaly", name)
+            found = column(browser, "Matched AUC")
+            for standing in section.ranks.standings:
+                value = board.mean(standing.entry, some, chosen, "auc_matched", intervals=True)
+                expected = show_value(value, "auc_matched").split(maxsplit=1)
+                text = found[standing.entry.label].replace("\n", " ").split(maxsplit=1)
+                assert text == expected
+                compared += 1
+    assert compared == 3 * 3 * 2 * 6
+
+
+def test_filters_of_rows(browser):
+    browser.choose("horizon", "Δ = 10")
+    assert browser.texts(LABELS) == ["riqn[h=10]"]
+    browser.choose("horizon", "All horizons")
+    browser.choose("inputs", "observations + actions")
+    assert browser.texts(LABELS) == ["riqn", "riqn[h=10]"]
+
+
+def test_the_anomalies_to_choose_are_those_of_the_group(browser):
+    browser.choose("group", "Sensor")
+    assert browser.texts("[name=anomaly] option") == ["All anomalies", "IID", "Sensor Drift"]
+    browser.choose("anomaly", "IID")
+    browser.choose("group", "Dynamics")
+    assert browser.run("return document.querySelector('[name=anomaly]').value") == "all"
+
+
+def test_ranks_are_said_to_be_those_of_all_cells(browser):
+    assert not any("Ranks" in line for line in browser.texts("#notes li"))
+    browser.choose("environment", "Hopper")
+    assert any("Ranks, tie groups and wins" in line for line in browser.texts("#notes li"))
+
+
+def test_boards_are_never_mixed(browser):
+    browser.choose("board", "mini (cdcdcdcd), protocol 1")
+    assert browser.texts(LABELS) == ["rf"]
+    assert "digest cdcdcdcdcdcd" in browser.texts("#notes li")[0]
+
+
+def test_failures_are_states_with_a_reason(browser):
+    assert column(browser, "Matched AUC")["mine[window=3]"] == "timeout"
+    assert any(
+        "Not ranked: mine[window=3], timeout in 2 of 8" in t for t in browser.texts("#notes li")
+    )
+    assert browser.run("return document.querySelector('td.state').title") == "not done after 5 s"
+    browser.choose("group", "Dynamics")
+    assert column(browser, "Matched AUC")["mine[window=3]"] != "timeout"
+
+
+def test_the_papers_digits_stand_in_a_column_of_their_own(browser):
+    browser.choose("environment", "CartPole")
+    browser.choose("group", "Sensor")
+    browser.click("#filters [value=aucs]")
+    found = column(browser, "Paper’s AUC")  # noqa: RUF001
+    paper = site.data.site_data([])[0]["paper"]["cartpole"]["auc"]["sensor"]
+    assert found["riqn"] == f"{paper['riqn']:.1f}"
+    assert found["rf"] == f"{paper['rf']:.1f}"
+    # They are at horizon 1 and with the paper's settings.
+    assert found["riqn[h=10]"] == found["clock"] == "–"  # noqa: RUF001
+
+
+def test_costs_are_shown(browser):
+    browser.click("#filters [value=cost]")
+    assert column(browser, "Fit")["riqn"] == "2.5"
+    assert column(browser, "Score")["riqn"] == "50"
+    assert column(browser, "Peak memory")["riqn"] == "150"
+
+
+# -- the page of a detector -----------------------------------------------------------------------
+
+
+def test_a_detectors_page_has_its_cells_and_curves(browser):
+    open_row(browser, "riqn")
+    assert browser.texts(".heat thead [scope=col]")[1:] == [
+        "IID", "Sensor\nDrift", "Gravity", "Agent's\nComponents", "Mean",
+    ] or len(browser.texts(".heat thead [scope=col]")) == 6  # fmt: skip
+    assert len(browser.texts(".heat td a")) == 8
+    assert browser.text("#cell h2") == "CartPole, IID"
+    assert len(browser.texts("#cell figure")) == 3
+    titles = browser.run(
+        "const drawn = [...document.querySelectorAll('#cell svg[role=img]')];"
+        "return drawn.map(e => e.getAttribute('aria-label'))"
+    )
+    assert titles == [
+        "ROC curve",
+        "Delay against false-alarm rate",
+        "Missed trajectories against false-alarm rate",
+        "Scores",
+        "CUSUM statistic and alarms",
+    ]
+    assert "against" in browser.text("#cell > p")
+    assert "from false alarms alone" in browser.text("#cell > p")
+
+
+def test_curves_are_drawn_from_the_entrys_numbers(browser, entries):
+    from oodd_eval.curves import read_curves
+
+    units = read_curves(entries[0].curves)["units"]
+    (unit,) = [u for u in units if u["cell"].startswith("mini/hopper/gravity::riqn[h=1,")]
+    open_row(browser, "riqn")
+    browser.run("location.hash += '/hopper/gravity'")
+    browser.wait_for("document.querySelector('#cell h2').textContent === 'Hopper, Gravity'")
+    example = unit["example"]
+    assert len(browser.texts(".alarms.anomalous line")) == len(example["alarms"])
+    assert len(browser.texts(".alarms.twin line")) == len(example["twin_alarms"])
+    assert f"onset τ = {example['onset']}" in browser.texts(".onset text")
+    assert f"Test trajectory {example['index']}," in browser.texts("figcaption")[2]
+    first = next(t for t in example["alarms"] if t >= example["onset"]) - example["onset"]
+    assert f"anomalous {first} steps after the onset" in browser.texts("figcaption")[2]
+    # Every point of the ROC curve, and its corner, is on the line.
+    path = browser.run("return document.querySelector('#cell .line.anomalous').getAttribute('d')")
+    assert path.count("L") == len(unit["roc"]["fpr"])
+    browser.run("document.querySelectorAll('#cell details')[1].open = true")
+    table = browser.texts("#cell details[open] tbody tr")
+    assert len(table) == len(unit["delay_far"]["far"])
+
+
+def test_choosing_a_cell_shows_it(browser):
+    open_row(browser, "riqn")
+    browser.run("document.querySelectorAll('.heat td a')[7].focus()")
+    browser.press("enter")
+    browser.wait_for("document.querySelector('#cell h2').textContent.startsWith('Hopper')")
+    assert browser.text("#cell h2") == "Hopper, Agent's Components"
+    assert browser.run("return document.querySelectorAll('.heat [aria-current]').length") == 1
+    # The keyboard stays where it was.
+    assert browser.run("return document.activeElement.getAttribute('aria-current')") == "true"
+
+
+def test_heat_shows_every_cell_of_a_row(browser, entries):
+    section = sections(entries)[0]
+    board = section.ranks.board
+    open_row(browser, "rf")
+    (rf,) = [s.entry for s in section.ranks.standings if s.entry.label == "rf"]
+    shown = iter(browser.texts(".heat tbody td"))
+    everything = [*([e] for e in board.environments), board.environments]
+    for some in everything:
+        for anomalies in [*([a] for a in board.anomalies), board.anomalies]:
+            value = board.mean(rf, some, anomalies, "auc_matched")
+            assert next(shown) == show_value(value, "auc_matched")
+
+
+def test_a_failed_cell_says_why(browser):
+    open_row(browser, "mine[window=3]")
+    browser.run("location.hash += '/hopper/iid'")
+    browser.wait_for("document.querySelector('.failure') !== null")
+    assert browser.text(".failure") == "timeout: not done after 5 s"
+
+
+def test_a_row_without_curves_says_so(browser):
+    open_row(browser, "clock")
+    assert any("no curves for this cell" in t for t in browser.texts("#cell .note"))
+
+
+def test_comparisons_name_every_other_ranked_row(browser, entries):
+    ranking = sections(entries)[0].ranks.ranking
+    open_row(browser, "rf")
+    rows = browser.texts("#comparisons tbody tr")
+    expected = [c for c in ranking.comparisons if c.first == "rf"]
+    assert len(rows) == len(expected) == 4
+    for c in expected:
+        (text,) = [r for r in rows if r.split("\t")[0] == c.second]
+        back = next(b for b in ranking.comparisons if (b.first, b.second) == (c.second, "rf"))
+        verdict = "better" if c.better else "worse" if back.better else "not told apart"
+        assert text.split("\t")[3] == verdict
+        printed = text.split("\t")[1].replace("−", "-")  # noqa: RUF001
+        assert float(printed) == pytest.approx(100 * c.difference, abs=0.051)
+
+
+def test_the_papers_table_stands_beside_ours_where_it_has_digits(browser):
+    open_row(browser, "rf")
+    assert "Table 5" in browser.text("#paper caption")
+    assert len(browser.texts("#paper tbody tr")) == 3
+    browser.run("history.back()")
+    browser.wait_for("document.querySelector('#detector').hidden")
+    open_row(browser, "riqn[h=10]")
+    assert browser.texts("#paper") == []
+
+
+def test_names_and_notes_are_text(browser):
+    open_row(browser, "mine[window=3]")
+    assert "<b>bold</b>" in browser.texts("#source h3")
+    assert browser.run("return document.querySelectorAll('#source b').length") == 0
+    # An address of a script is shown, not linked.
+    assert "javascript:alert(1)" in browser.texts("#source dd")
+    assert browser.run("return document.querySelector('#source a')") is None
+
+
+def test_links_lead_out_only_when_followed(browser):
+    open_row(browser, "riqn")
+    link = browser.run(
+        "const a = document.querySelector('#source a'); return [a.href, a.rel]"
+    )  # fmt: skip
+    assert link == ["https://example.org/page", "noopener noreferrer external"]
+
+
+@pytest.mark.parametrize("address", ["#/detector/nobody", "#/detector/%E0%A4%A", "#/x", "#<b>"])
+def test_an_unknown_address_is_the_table(browser, url, address):
+    browser.open("about:blank")
+    browser.open(url + address)
+    assert browser.texts(LABELS)[0] == "riqn"
+    assert browser.run("return document.querySelector('#detector').hidden")
+
+
+def test_an_address_opens_a_cell_directly(browser, url):
+    open_row(browser, "riqn")
+    address = browser.run("return location.hash")
+    browser.open("about:blank")
+    browser.open(f"{url}{address}/hopper/drift")
+    assert browser.text("#cell h2") == "Hopper, Sensor Drift"
+    assert browser.run("return document.title").startswith("riqn")
+
+
+# -- all of it ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [400, 900])
+def test_nothing_but_tables_scrolls_sideways_in_a_narrow_window(browser, width):
+    browser.resize(width, 900)
+    try:
+        for label in (None, "riqn"):
+            if label:
+                open_row(browser, label)
+            wide = browser.run(
+                "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            )
+            assert wide <= 0
+    finally:
+        browser.resize(1280, 1000)
+
+
+def test_every_drawing_and_control_has_a_name(browser):
+    open_row(browser, "riqn")
+    nameless = browser.run(
+        """
+        const named = (e) => e.getAttribute("aria-label") || e.textContent.trim() || e.title
+          || e.closest("label")?.textContent.trim();
+        const all = document.querySelectorAll("a, button, select, input, svg:not([aria-hidden])");
+        return [...all].filter((e) => !named(e)).map((e) => e.outerHTML);
+        """
+    )
+    assert nameless == []
+
+
+def test_texts_have_enough_contrast(browser):
+    """At least 4.5 to 1 (WCAG AA) for every text of both views, coloured cells included."""
+    for label in (None, "riqn"):
+        if label:
+            open_row(browser, label)
+        found = browser.run(CONTRAST)
+        assert found["checked"] > 50
+        assert found["low"] == []
+
+
+CONTRAST = """
+    const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+    const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+      .map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+      .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+    const back = (e) => {
+      for (; e; e = e.parentElement) {
+        const c = rgb(getComputedStyle(e).backgroundColor);
+        if (c.length < 4 || c[3] > 0) return c;
+      }
+      return [255, 255, 255];
+    };
+    const low = []; let checked = 0;
+    for (const e of document.querySelectorAll("body *:not(script):not(style):not(option)")) {
+      const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
+      if (!own || !e.checkVisibility() || e.closest("svg") || e.closest("[aria-hidden]")) continue;
+      const [a, b] = [light(rgb(getComputedStyle(e).color)), light(back(e))];
+      const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+      checked += 1;
+      if (ratio < 4.5) low.push(`${e.textContent.trim().slice(0, 30)}: ${ratio.toFixed(2)}`);
+    }
+    return { checked, low };
+"""
+
+
+def test_the_policy_stops_requests(window, url):
+    window.open(url)
+    window.requests()
+    outcome = window.run(
+        """
+        const image = new Image();
+        const result = new Promise((done) => {
+          image.onload = image.onerror = (e) => done(e.type);
+        });
+        image.src = "https://example.org/x.png";
+        const fetched = fetch("https://example.org/").then(() => "ok", () => "stopped");
+        return Promise.all([result, fetched]);
+        """
+    )
+    assert outcome == ["error", "stopped"]
+    assert any("Content Security Policy" in message for message in window.console())
+
+
+def test_a_page_without_entries_says_so(window, tmp_path):
+    window.open(site.render([], tmp_path).as_uri())
+    assert "There are no entries yet." in window.texts("#overview .note")
+    assert window.console() == []
+
+
+def test_all_cells_of_a_large_site_open(window, tmp_path):
+    entries = helpers_site.full(tmp_path / "results", rows=2)
+    window.open(site.render(entries, tmp_path / "site").as_uri())
+    window.console()
+    cells = list(itertools.product(ENVIRONMENTS, ANOMALIES))
+    open_row(window, "detector-1")
+    start = window.run("return location.hash")
+    for environment, anomaly in cells:
+        window.run("location.hash = arguments[0]", f"{start}/{environment}/{anomaly}")
+        expected = f"{ENVIRONMENTS[environment].title}, {ANOMALIES[anomaly].title}"
+        window.wait_for(f"document.querySelector('#cell h2').textContent === {expected!r}")
+        assert len(window.texts("#cell figure")) == 3
+    assert window.console() == []
+    assert math.prod([len(ENVIRONMENTS), len(ANOMALIES)]) == len(window.texts(".heat td a"))
