@@ -136,6 +136,8 @@ SPLITS: Final = MappingProxyType(
         for s in (
             SplitDefinition("mini", 40, 20, 10, 300, 1),
             SplitDefinition("standard", 500, 100, 50, None, 2),
+            # The first trajectories of standard: its seed base, the same episodes.
+            SplitDefinition("reduced", 500, 50, 20, None, 2),
             SplitDefinition("paper", 10_000, 1_000, 1_000, None, 3),
         )
     }

@@ -267,7 +267,7 @@ TIERS: Final = {
     tier.name: tier
     for tier in (
         Tier("full", "standard", 3, 3),
-        Tier("reduced", "standard", 3, 1, 20),
+        Tier("reduced", "reduced", 3, 1),
         Tier("mini", "mini", 3, 1),
     )
 }
