@@ -148,6 +148,26 @@ def test_parameters_reach_the_cell_id(run, failing):
     assert out.startswith("tiny/cartpole/iid::fails[h=1,seed=0,size=7]\n")
 
 
+def test_the_device_is_a_parameter_of_detectors_that_have_one(run):
+    selected = ("run", "--env", "cartpole", "--split", "tiny", "--anomaly", "iid", "--collect-only")
+    _, out, _ = run(*selected, "--detector", "npn,clock", "--device", "auto")
+    assert out.splitlines()[:2] == [
+        "tiny/cartpole/iid::npn[h=1,seed=0,device=auto]",
+        "tiny/cartpole/iid::clock[h=1,seed=0]",
+    ]
+    # The default is no override, so that the row is that of a run without the option.
+    assert "npn[h=1,seed=0]" in run(*selected, "--detector", "npn", "--device", "cpu")[1]
+
+
+def test_a_device_that_cannot_be_is_refused(run):
+    code, _, err = run(*CLOCK, "--device", "cpu")
+    assert code == 4
+    assert "--device cpu: none of the detectors has a device (clock)" in err
+    code, _, err = run(*CLOCK, "--device", "tpu")
+    assert code == 4
+    assert "--device is 'tpu', expected one of auto, cpu, cuda" in err
+
+
 def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path):
     (tmp_path / "run.toml").write_text(
         'detector = ["clock", "random"]\nenv = "all"\nsplit = "tiny"\nhorizon = [1, 2]\n'

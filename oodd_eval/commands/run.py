@@ -6,13 +6,14 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, Final
 
 from oodd_eval.benchmark import ANOMALIES
 from oodd_eval.commands.discovery import discovered, report_broken
 from oodd_eval.errors import UsageError
 from oodd_eval.isolation import Limits
-from oodd_eval.plan import Plan, make_plan
+from oodd_eval.plan import Plan, Unit, make_plan
 from oodd_eval.plugins import Plugins
 from oodd_eval.report import markdown
 from oodd_eval.report.terminal import TerminalReporter, make_console
@@ -21,6 +22,8 @@ from oodd_eval.runner import Run, Settings
 from oodd_eval.runner import run as carry_out
 from oodd_eval.selection import expression, memory_bytes, seconds, select, whole_numbers
 from oodd_eval.splits import Split, load_split
+
+DEVICES: Final = ("auto", "cpu", "cuda")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -86,7 +89,31 @@ def _plan(options: argparse.Namespace, plugins: Plugins, split: Split) -> Plan:
         parameters=_parameters(options.param),
         limit=options.limit,
     )
+    if options.device is not None:
+        plan = _on_device(plan, options.device, plugins)
     return plan.matching(expression(options.expression)) if options.expression else plan
+
+
+def _on_device(plan: Plan, device: str, plugins: Plugins) -> Plan:
+    """Set the parameter ``device`` of those detectors that have it."""
+    if device not in DEVICES:
+        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
+    units = [_placed(unit, device, plugins) for unit in plan.units]
+    if units and not any("device" in unit.parameters for unit in units):
+        names = ", ".join(dict.fromkeys(unit.detector for unit in units))
+        raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
+    return replace(plan, units=tuple(units))
+
+
+def _placed(unit: Unit, device: str, plugins: Plugins) -> Unit:
+    defaults = plugins.offer(unit.detector).spec.parameters
+    if "device" not in defaults:
+        return unit
+    others = {name: value for name, value in unit.overrides.items() if name != "device"}
+    changed = {} if device == defaults["device"] else {"device": device}
+    return replace(
+        unit, parameters={**unit.parameters, "device": device}, overrides={**others, **changed}
+    )
 
 
 def _parameters(given: Sequence[str]) -> dict[str, Any]:

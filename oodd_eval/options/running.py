@@ -25,6 +25,8 @@ def _add_run(commands: Commands[Parser]) -> None:
     add("--seed", default="0", metavar="N,...", help="seeds of the detectors (default: 0)")
     add("--param", action="append", default=[], metavar="K=V",
         help="a parameter of the selected detectors, V in JSON or plain text")  # fmt: skip
+    add("--device", metavar="auto|cpu|cuda",
+        help="where networks compute: the parameter device of detectors that have it")  # fmt: skip
     add("-k", dest="expression", metavar="EXPR",
         help="only cells whose id matches, such as 'hopper and not (iid or drift)'")  # fmt: skip
     add("--collect-only", action="store_true", help="print the selected cells and do nothing")
