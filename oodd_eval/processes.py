@@ -26,6 +26,9 @@ MARK: Final = "OODD_EVAL_PROCESS"
 POLL_SECONDS: Final = 0.005
 LOG_BYTES: Final = 64_000
 
+LONGEST_REASON: Final = 600
+"""Characters of a reason, at most; of a longer one, the start and the end are kept."""
+
 _PATIENCE: Final = 5.0
 """Seconds for which processes that left the group are hunted, should they multiply."""
 
@@ -137,10 +140,31 @@ class _Tail:
         return self._kept.decode(errors="replace")
 
 
+def printable(reason: str) -> str:
+    r"""Return a line of a foreign process as one that every terminal, file and table takes.
+
+    Examples
+    --------
+    >>> printable("ValueError: \x1b[2J")
+    'ValueError: \ufffd[2J'
+    >>> len(printable("x" * 10**6)) <= LONGEST_REASON
+    True
+    """
+    if len(reason) > LONGEST_REASON:
+        half = LONGEST_REASON // 2 - 3
+        reason = f"{reason[:half]} ... {reason[-half:]}"
+    # Halves of surrogate pairs, which no file takes, are not printable either.
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in reason)
+
+
 def _environment() -> dict[str, str]:
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
-    # What steers the harness is none of a detector's business.
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("OODD_EVAL_")}
+    # What steers the harness is none of a detector's business; pytest tells the cell under test.
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("OODD_EVAL_") and name != "PYTEST_CURRENT_TEST"
+    }
     return {**kept, **_SINGLE_THREAD, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
 
 

@@ -16,6 +16,7 @@ from oodd_eval.fitted import FittedStore
 from oodd_eval.isolation import Limits, Outcome, Request, Stop, run_isolated
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.plugins import Offer
+from oodd_eval.processes import printable
 from oodd_eval.results import ResultsDirectory, ScoreFile, fit_key, unit_key
 from oodd_eval.splits import EnvironmentData, TrajectorySet
 from oodd_eval.splits_format import TWINS
@@ -33,6 +34,7 @@ class Scored:
     """Checked scores of one unit by part, or the way in which it failed.
 
     `log` is the end of what a failing detector printed; `resumed` tells scores of an earlier run.
+    The reason may have come from the detector: it is made fit to print.
     """
 
     status: str = "ok"
@@ -40,6 +42,9 @@ class Scored:
     file: ScoreFile = field(default_factory=lambda: ScoreFile({}, {}))
     log: str = ""
     resumed: bool = False
+
+    def __post_init__(self) -> None:
+        self.reason = printable(self.reason)
 
 
 @dataclass(frozen=True, slots=True)

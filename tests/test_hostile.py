@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 from helpers_plugins import install
 
+from oodd_eval.processes import LONGEST_REASON
+
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks into /proc")
 
 HEADER = """
-import builtins, ctypes, os, signal, subprocess, sys, threading, time
+import builtins, ctypes, os, shutil, signal, subprocess, sys, threading, time
 from pathlib import Path
 import numpy as np
 from oodd_eval import DetectorSpec, hookimpl
@@ -116,6 +118,36 @@ QUICK = {
         def score(self, x):
             self.rows = np.ones(6 * 10**7); time.sleep(600)""",
               "oom", r"resident memory \d+ MB is over the limit of 300 MB \(--memory\)"),
+    "huge": ("def score(self, x): return np.broadcast_to(1.0, 10**12)",
+             "oom", r"resident memory \d+ MB is over the limit of 300 MB \(--memory\)"),
+    "importcrash": ("if 'OODD_EVAL_PROCESS' in os.environ: ctypes.string_at(0)",
+                    "error", "the worker was killed by SIGSEGV while fitting"),
+    "group": ("def fit(self, nominal): os.killpg(0, signal.SIGTERM)",
+              "error", "the worker was killed by SIGTERM while fitting"),
+    "speechless": ("""
+        class Odd(Exception):
+            def __str__(self): raise ValueError("no words")
+        def score(self, x): raise self.Odd""",
+                   "error", "the worker ended with exit code 1 while scoring"),
+    "ugly": ("def score(self, x): raise ValueError('\\udcff \\x1b[2J [/red] [bold]')",
+             "error", r"ValueError: \ufffd \ufffd\[2J \[/red\] \[bold\] \(oodd_ugly.py:\d+\)"),
+    "wordy": ("def score(self, x): raise ValueError('no ' * 10**6)",
+              "error", r"ValueError: (no )+.{3,9}(no )+no \(oodd_wordy.py:\d+\)"),
+    "inputs": ("def score(self, x): x.observations[0] = 0",
+               "error", "ValueError: assignment destination is read-only"),
+    "scribbles": ("""
+        def fit(self, nominal):
+            for x in nominal: x.observations.flags.writeable = True; x.observations[:] = np.nan
+        def score(self, x):
+            scores = super().score(x)
+            x.observations.flags.writeable = True; x.observations[:] = np.nan
+            return scores""",
+                  "ok", ""),
+    "unsaves": ("""
+        def save(self, directory):
+            (directory / "fit").write_text("1"); shutil.rmtree(directory.parent)
+        def load(self, directory): raise RuntimeError("there is nothing")""",
+                "ok", ""),
     "leaves": ("""
         def fit(self, nominal):
             subprocess.Popen(["sleep", "600"], start_new_session=True)
@@ -142,11 +174,18 @@ HANGING = {
     "floods": """
         def score(self, x):
             while True: os.write(1, b"garbage " * 1000)""",
+    "importhangs": "if 'OODD_EVAL_PROCESS' in os.environ: time.sleep(600)",
 }
 
 BROKEN = {
     "leavesatimport": "import sys; sys.exit(0)",
     "brokenatimport": "import no_such_module",
+}
+
+# Plug-ins are imported by the harness itself: these have to be left out.
+LEFT_OUT = {
+    "killsatimport": "import os; os._exit(9)",
+    "hangsatimport": "import time; time.sleep(600)",
 }
 
 MARKER = f"OODD_TEST_HOSTILE=run-{os.getpid()}"
@@ -174,7 +213,7 @@ def hostile(tiny_split, tmp_path_factory):
         for name, body in bodies.items():
             code = f"class Hostile(Base):\n{indented(body)}\n"
             install(patch, plugins, name, code, header=HEADER)
-        for name, code in BROKEN.items():
+        for name, code in (BROKEN | LEFT_OUT).items():
             install(patch, plugins, name, code, header="")
 
     def run(names, *options):
@@ -183,9 +222,9 @@ def hostile(tiny_split, tmp_path_factory):
         done = subprocess.run(
             [sys.executable, "-m", "oodd_eval", "run", "--detector", ",".join(names), "--env",
              "cartpole", "--anomaly", "iid,gravity", "--split", tiny_split, "--output",
-             output, *options],
+             output, *(part for name in LEFT_OUT for part in ("-p", f"no:{name}")), *options],
             env={**os.environ, name: value, "PYTHONPATH": str(plugins),
-                 "OODD_EVAL_PLUGINS": ",".join([*bodies, *BROKEN])},
+                 "OODD_EVAL_PLUGINS": ",".join([*bodies, *BROKEN, *LEFT_OUT])},
             capture_output=True, text=True, check=False, timeout=300,
         )  # fmt: skip
         lines = (output / "records.jsonl").read_text().splitlines()
@@ -247,6 +286,24 @@ def test_nothing_that_a_plugin_printed_reaches_the_output(hostile):
     for done, _ in hostile[:2]:
         assert "garbage" not in done.stdout + done.stderr
         assert "\x1b" not in done.stdout
+
+
+def test_a_reason_is_one_line_of_bounded_length(hostile):
+    (reason,) = {record["reason"] for record in cells(hostile[0][1], "wordy")}
+    assert len(reason) <= LONGEST_REASON
+    assert len(hostile[0][0].stdout) < 20_000
+
+
+def test_what_a_detector_does_to_its_trajectories_stays_with_it(hostile):
+    """Trajectories of the worker are copies: the scores of the others are as they would be."""
+    found = {name: cells(hostile[0][1], name) for name in ("scribbles", "leaves")}
+    assert found["scribbles"][0]["metrics"] == found["leaves"][0]["metrics"]
+
+
+def test_plugins_that_kill_at_import_can_be_left_out(hostile):
+    for done, _ in hostile[:2]:
+        assert "atimport" in done.stderr
+        assert not any(name in done.stderr for name in LEFT_OUT)
 
 
 def test_plugins_that_fail_at_import_are_named(hostile):

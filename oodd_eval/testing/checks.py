@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from typing import Final
 
+from oodd_eval.processes import printable
 from oodd_eval.testing import (
     checks_causality,
     checks_contract,
@@ -44,9 +45,10 @@ def carry_out(bench: Bench, checks: Iterable[Check]) -> Iterator[Result]:
         try:
             check.carry_out(bench)
         except CheckFailedError as error:
-            status, message = "failed", str(error)
+            status, message = "failed", printable(str(error))
             if error.__cause__:
-                detail = "".join(traceback.format_exception(error.__cause__))
+                lines = "".join(traceback.format_exception(error.__cause__)).splitlines()
+                detail = "\n".join(printable(line) for line in lines)
         except CheckSkipped as skip:
             status, message = "skipped", str(skip)
         yield Result(check.name, status, message, time.perf_counter() - start, detail)
