@@ -1,7 +1,7 @@
 """Open a frozen split, verify it, and iterate over its trajectories.
 
 Names, onsets and parameters stay on this side; a detector is handed `Trajectory` objects only.
-Trajectories are read from the file one at a time, so that a split may be larger than memory.
+Trajectories are read from the file a few at a time, so that a split may be larger than memory.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Final, overload
 
 import h5py
 import numpy as np
@@ -32,6 +32,9 @@ from oodd_eval.trajectory import Trajectory
 
 SHIPPED = Path(__file__).with_name("data")
 """Splits that come with the package: ``mini``."""
+
+_ROWS: Final = 1 << 14
+"""Transitions that are read at once from a file, unless a single trajectory has more."""
 
 
 def data_home() -> Path:
@@ -110,13 +113,25 @@ class TrajectorySet(Sequence[Trajectory]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         i = range(len(self))[index]
-        start, stop = int(self._offsets[i]), int(self._offsets[i + 1])
-        return Trajectory(
-            self._data["observations"][start + i : stop + i + 1], self._data["actions"][start:stop]
-        )
+        return next(self._read(i, i + 1))
 
     def __iter__(self) -> Iterator[Trajectory]:
-        return (self[i] for i in range(len(self)))
+        # Several at a time: the file is unpacked in chunks that hold rows of many trajectories.
+        start = 0
+        while start < len(self):
+            most = self._offsets[start] + max(self.lengths[start], _ROWS)
+            stop = int(np.searchsorted(self._offsets, most, side="right")) - 1
+            yield from self._read(start, stop)
+            start = stop
+
+    def _read(self, start: int, stop: int) -> Iterator[Trajectory]:
+        """Yield the trajectories of a range, which are read at once."""
+        first, last = int(self._offsets[start]), int(self._offsets[stop])
+        rows = self._data["observations"][first + start : last + stop]
+        actions = self._data["actions"][first:last]
+        for i in range(start, stop):
+            a, b = self._offsets[i : i + 2] - first
+            yield Trajectory(rows[a + i - start : b + i - start + 1], actions[a:b])
 
     def rewards(self, index: int) -> NDArray[np.float32]:
         """Rewards of one trajectory, of shape (T,)."""

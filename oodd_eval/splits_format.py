@@ -41,7 +41,7 @@ NOMINAL_DTYPES: Final = {
 ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {"onsets": "<i8", "redraws": "<i8", "parameters": "|S"}
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
-_BLOCK: Final = 1 << 22
+_BLOCK: Final = 1 << 21
 """Bytes that are held at once while content is digested or written."""
 
 
@@ -144,13 +144,16 @@ def content_digest(group: Mapping[str, Any]) -> str:
         little = data.dtype.newbyteorder("<")
         sha.update(f"{name}|{little.str}|{data.shape}|".encode())
         for block in _blocks(data):
-            sha.update(np.ascontiguousarray(block.astype(little, copy=False)).tobytes())
+            plain = np.ascontiguousarray(block.astype(little, copy=False))
+            sha.update(plain.reshape(-1).view(np.uint8).data)
     return sha.hexdigest()
 
 
 def _blocks(data: Any) -> Iterator[NDArray[Any]]:
+    """Yield all rows in blocks of whole chunks, so that each chunk is unpacked once."""
     row = max(1, int(np.prod(data.shape[1:], dtype=np.int64)) * data.dtype.itemsize)
-    step = max(1, _BLOCK // row)
+    chunk = (getattr(data, "chunks", None) or (1,))[0]
+    step = chunk * max(1, _BLOCK // (row * chunk))
     for start in range(0, len(data), step):
         yield np.asarray(data[start : start + step])
 

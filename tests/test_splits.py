@@ -78,7 +78,8 @@ def test_a_trajectory_set_is_a_sequence(tiny_split):
         train[6]
 
 
-def test_iteration_holds_one_trajectory_in_memory(tmp_path):
+def test_iteration_holds_one_block_of_trajectories_in_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(splits, "_ROWS", 800)
     groups = {"train": make_group("ant", range(60), 400)}
     write_environment(tmp_path / "ant.h5", groups)
     whole = groups["train"]["observations"].astype("f4").nbytes
