@@ -1,0 +1,256 @@
+"""Draw the figures of docs/protocol.md from the split that comes with the package.
+
+``python docs/figures/make.py [DIRECTORY]`` writes the SVG files, here unless told otherwise. One
+episode of Hopper goes through all of them; nothing in them is made up.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from oodd_eval import load_split
+from oodd_eval.alarms import calibrate
+from oodd_eval.curves import Sweep, delay_far, thresholds
+from oodd_eval.cusum import UNIT, Standardization, cusum
+from oodd_eval.detector import Detector, Scores
+from oodd_eval.metrics import AlarmRule, auc_onset, auc_same_times, first_delay
+from oodd_eval.plugins import discover
+from oodd_eval.splits import AnomalousSet, EnvironmentData
+
+ENVIRONMENT = "hopper"
+DYNAMICS, SENSOR = "components", "shutdown"
+EPISODE = 1
+"""Which test seed: one in which the anomaly is found neither at once nor with difficulty."""
+
+NOMINAL, ANOMALOUS, ONSET, ALARM = "#555555", "#D55E00", "#000000", "#0072B2"
+
+STYLE = {
+    "svg.hashsalt": "oodd-eval",
+    "svg.fonttype": "path",
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "path.simplify": False,
+}
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One detector's scores of an environment, and what turns them into alarms."""
+
+    calibration: list[Scores]
+    twins: list[Scores]
+    anomalous: list[Scores]
+    rule: AlarmRule
+
+    def calibrated(self) -> AlarmRule:
+        """Return the rule whose false-alarm rate is 1 % on the calibration part."""
+        return replace(self.rule, threshold=calibrate(self.calibration, self.rule, 0.01))
+
+
+def scored(name: str, data: EnvironmentData) -> Scored:
+    """Fit an installed detector on the train part and score the others."""
+    detector: Detector = discover().offer(name).spec.factory(seed=0, horizon=1)
+    detector.fit(list(data.train))
+    calibration = [detector.score(x) for x in data.calibration]
+    return Scored(
+        calibration,
+        [detector.score(x) for x in data.twins],
+        [detector.score(x) for x in data.anomalous(DYNAMICS)],
+        AlarmRule(Standardization.fit(calibration)),
+    )
+
+
+def mark_onset(axes: Axes, onset: int) -> None:
+    """Draw the line that separates nominal from anomalous."""
+    axes.axvline(onset, color=ONSET, linewidth=1, linestyle="--")
+    axes.annotate(
+        "onset", (onset, 1), xycoords=("data", "axes fraction"), xytext=(4, 1),
+        textcoords="offset points", fontsize=8,
+    )  # fmt: skip
+
+
+def widest_gap(found: AnomalousSet, data: EnvironmentData) -> int:
+    """Return the (corrupted) sensor that differs most from the twin's, in standard deviations."""
+    anomalous, twin = found[EPISODE].observations, data.twins[EPISODE].observations
+    both = min(len(anomalous), len(twin))
+    spread = np.maximum(twin.std(axis=0), 0.1)
+    gap = np.abs(anomalous[:both] - twin[:both]).mean(axis=0) / spread
+    among = found.parameters[EPISODE].get("sensors", range(len(gap)))
+    return int(max(among, key=gap.__getitem__))
+
+
+def draw_twins(data: EnvironmentData) -> Figure:
+    """One sensor of an anomalous trajectory and of its nominal twin, for both groups."""
+    figure = Figure(figsize=(7.6, 4.6), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True)
+    titles = {
+        SENSOR: "Sensor anomaly: sensor {sensor} is switched off and reads 0",
+        DYNAMICS: "Dynamics anomaly: motor power {power:.2f} instead of 0.75; sensor {sensor}",
+    }
+    for axes, (anomaly, title) in zip(panels, titles.items(), strict=True):
+        found = data.anomalous(anomaly)
+        drawn = {k: v for k, v in found.parameters[EPISODE].items() if k != "sensors"}
+        sensor, onset = widest_gap(found, data), int(found.onsets[EPISODE])
+        for trajectory, colour, width, label in (
+            (found[EPISODE], ANOMALOUS, 1.2, "anomalous trajectory"),
+            (data.twins[EPISODE], NOMINAL, 1.2, "its nominal twin"),
+        ):
+            axes.plot(trajectory.observations[:, sensor], color=colour, lw=width, label=label)
+        if (end := len(found[EPISODE])) < len(data.twins[EPISODE]):
+            last = found[EPISODE].observations[-1, sensor]
+            axes.annotate("episode ends", (end, last), xytext=(4, -3), textcoords="offset points")
+        axes.set_title(title.format(sensor=sensor, **drawn), pad=14)
+        axes.set_ylabel("observation")
+        mark_onset(axes, onset)
+    panels[0].legend(loc="lower right")
+    panels[1].set_xlabel("time t (steps)")
+    return figure
+
+
+def draw_alarms(data: EnvironmentData, mewma: Scored) -> Figure:
+    """From scores over the CUSUM statistic to alarms, with the paper's threshold."""
+    figure = Figure(figsize=(7.6, 5.2), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    onset = int(data.anomalous(DYNAMICS).onsets[EPISODE])
+    rule = mewma.rule
+    shown = slice(onset - 60, onset + 60)
+    times = np.arange(shown.start, shown.stop)
+    for scores, colour, label in (
+        (mewma.twins[EPISODE], NOMINAL, "nominal twin"),
+        (mewma.anomalous[EPISODE], ANOMALOUS, "anomalous trajectory"),
+    ):
+        x = rule.standardization(scores)
+        statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
+        above.plot(times, x[shown] / UNIT, color=colour, lw=1.2, label=label)
+        below.plot(times, statistic[shown] / UNIT, color=colour, lw=1.2)
+        raised = times[alarms[shown]]
+        if colour == ANOMALOUS:
+            early, late = raised[raised < onset], raised[raised >= onset]
+            for at, style, name in ((early, "none", "false alarm"), (late, ALARM, "alarm")):
+                below.scatter(
+                    at, np.full(len(at), -0.8), marker="^", s=26, edgecolors=ALARM,
+                    facecolors=style, linewidths=0.9, label=name,
+                )  # fmt: skip
+            delay = int(first_delay(alarms, onset))
+    above.axhline(rule.drift / UNIT, color="#888888", lw=0.8, ls=":")
+    below.axhline(rule.threshold / UNIT, color="#888888", lw=0.8, ls=":")
+    for axes, name, height in ((above, "drift", rule.drift), (below, "threshold", rule.threshold)):
+        axes.annotate(
+            name, (0, height / UNIT), xycoords=("axes fraction", "data"), fontsize=8,
+            xytext=(3, 2), textcoords="offset points", color="#555555",
+        )  # fmt: skip
+        mark_onset(axes, onset)
+    above.set_title("Standardized score of the detector mewma", pad=14)
+    above.set_ylabel("standard deviations")
+    above.legend(loc="upper left", bbox_to_anchor=(0, 1.02))
+    below.set_title(f"CUSUM statistic: the first alarm comes {delay} steps after the onset", pad=14)
+    below.set_ylabel("standard deviations")
+    below.set_xlabel("time t (steps)")
+    below.set_yticks([0, 1, 2])
+    below.legend(loc="upper left", ncols=2)
+    return figure
+
+
+def draw_clock(data: EnvironmentData, mewma: Scored) -> Figure:
+    """Compare what the paper's AUC and what matched AUC compare, for two detectors."""
+    figure = Figure(figsize=(8.4, 5.4), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True, sharey="row")
+    onset = int(data.anomalous(DYNAMICS).onsets[EPISODE])
+    scores = {
+        "clock": tuple(
+            np.arange(len(x[EPISODE]), dtype=np.float64) for x in (mewma.anomalous, mewma.twins)
+        ),
+        "mewma": (mewma.anomalous[EPISODE], mewma.twins[EPISODE]),
+    }
+    for (left, right), (name, (anomalous, twin)) in zip(grid, scores.items(), strict=True):
+        stop = min(len(anomalous), len(twin))
+        before, after = np.arange(onset), np.arange(onset, stop)
+        own = 100 * auc_onset(anomalous, onset)
+        matched = 100 * auc_same_times(anomalous, twin, onset, stop)
+        left.plot(before, anomalous[:onset], color=ALARM, lw=1.6, label="before the onset")
+        left.plot(after, anomalous[onset:stop], color=ANOMALOUS, lw=1.6, label="from the onset on")
+        left.set_title(f"{name}: paper's AUC {own:.0f} %", pad=14)
+        right.plot(after, twin[onset:stop], color=NOMINAL, lw=3.2 if name == "clock" else 1.6,
+                   label="nominal twin")  # fmt: skip
+        right.plot(after, anomalous[onset:stop], color=ANOMALOUS, lw=1.6, label="anomalous")
+        right.set_title(f"{name}: matched AUC {matched:.0f} %", pad=14)
+        left.set_ylabel("score")
+        mark_onset(left, onset)
+        mark_onset(right, onset)
+    for axes in grid[0]:
+        axes.legend(loc="upper left")
+    for axes in grid[1]:
+        axes.set_xlabel("time t (steps)")
+    return figure
+
+
+def draw_calibrated(data: EnvironmentData, mewma: Scored) -> Figure:
+    """Delay against the false-alarm rate over all thresholds."""
+    figure = Figure(figsize=(7.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    onsets = data.anomalous(DYNAMICS).onsets.tolist()
+    rows = {
+        "random": (scored("random", data), "#999999"),
+        "persistence": (scored("persistence", data), "#009E73"),
+        "mewma": (mewma, ANOMALOUS),
+    }
+    for name, (scores, colour) in rows.items():
+        at = thresholds(scores.twins, scores.rule)
+        marks = [rule.threshold for rule in (scores.rule, scores.calibrated())]
+        at = np.unique([*at, *(at[1:] + at[:-1]) / 2, *marks])
+        sweep = Sweep.over(scores.twins, scores.rule, at)
+        curve = delay_far(sweep, scores.anomalous, onsets)
+        heard = np.array(curve["far"]) > 0
+        delays = np.array(curve["delay_censored"])
+        axes.plot(np.array(curve["far"])[heard], delays[heard], color=colour, lw=1.6, label=name)
+        for mark, marker in zip(marks, "os", strict=True):
+            i = at.tolist().index(mark)
+            axes.plot(
+                curve["far"][i], curve["delay_censored"][i], marker, color=colour, ms=7, mec="white"
+            )
+    axes.plot([], [], "o", color="#333333", label="paper's threshold")
+    axes.plot([], [], "s", color="#333333", label="calibrated to 1 %")
+    axes.axvline(0.01, color="#888888", lw=0.8, ls=":")
+    axes.set_xscale("log")
+    axes.set_xticks([0.001, 0.01, 0.1, 1], ["0.1 %", "1 %", "10 %", "100 %"])
+    axes.set_xlim(left=0.001)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("false-alarm rate on nominal twins, per step")
+    axes.set_ylabel("delay (steps), a miss counts\nas the rest of the episode")
+    axes.legend(ncols=2)
+    return figure
+
+
+def draw_all(directory: Path) -> None:
+    """Write all figures; the same versions write the same bytes."""
+    data = load_split("mini").environment(ENVIRONMENT)
+    mewma = scored("mewma", data)
+    figures: dict[str, Callable[[], Figure]] = {
+        "twins": lambda: draw_twins(data),
+        "alarms": lambda: draw_alarms(data, mewma),
+        "clock": lambda: draw_clock(data, mewma),
+        "calibrated": lambda: draw_calibrated(data, mewma),
+    }
+    with mpl.rc_context(STYLE):
+        for name, draw in figures.items():
+            draw().savefig(directory / f"{name}.svg", metadata={"Date": None, "Creator": None})
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("directory", type=Path, nargs="?", default=Path(__file__).parent)
+    draw_all(parser.parse_args().directory)

@@ -1,0 +1,117 @@
+"""What the site shows beyond the files of docs/, and links that work on both sides of it.
+
+MkDocs calls these functions while it builds (``hooks`` in mkdocs.yml). Pages that live beside what
+they describe, such as the detectors' READMEs, become pages of the site. A link to a file that has
+no page becomes its path in the repository: the site belongs to no one host.
+"""
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+from oodd_eval.cli import build_parser
+from oodd_eval.options import choices
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = "docs/"
+
+ELSEWHERE = ("CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
+             "leaderboard/README.md", "leaderboard/site/index.html")  # fmt: skip
+"""Files outside docs/ that are part of the site, under the same paths."""
+
+RESULTS = ("leaderboard/README.md", "leaderboard/site/index.html")
+"""What `leaderboard build` makes of entries: not there before the first entry is."""
+
+FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+MATHS = re.compile(r"^\$\$(.+?)\$\$$", re.MULTILINE | re.DOTALL)
+COMMANDS = "<!-- help of every command -->"
+
+
+def elsewhere() -> list[str]:
+    """Repository paths of the site's files outside docs/."""
+    found = (path for pattern in ELSEWHERE for path in sorted(ROOT.glob(pattern)))
+    return [path.relative_to(ROOT).as_posix() for path in found]
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Leave results out of the navigation while there are none."""
+    missing = {path for path in RESULTS if not (ROOT / path).exists()}
+    config.nav = _without(config.nav or [], missing)
+    return config
+
+
+def _without(entries: list, missing: set[str]) -> list:
+    """Entries of a navigation whose files are there: paths, and titles with a path or a section."""
+    kept = []
+    for entry in entries:
+        if isinstance(entry, dict):
+            ((title, target),) = entry.items()
+            if isinstance(target, list):
+                kept.append({title: _without(target, missing)})
+            elif target not in missing:
+                kept.append(entry)
+        elif entry not in missing:
+            kept.append(entry)
+    return kept
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that live elsewhere."""
+    for path in elsewhere():
+        files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn links, formulas and the mark for commands into what the site shows."""
+    del config
+    source = page.file.src_uri
+    source = source if source in elsewhere() else DOCS + source
+    shown = [file.src_uri for file in files if file.inclusion.is_included()]
+    pages = {uri: uri if uri in elsewhere() else DOCS + uri for uri in shown}
+    pages = {repository: uri for uri, repository in pages.items()}
+
+    def outside_of_code(text: str) -> str:
+        text = LINK.sub(lambda found: _link(found, source, page.file.src_uri, pages), text)
+        return MATHS.sub(lambda found: convert(found[1].strip(), display="block"), text)
+
+    parts = FENCE.split(markdown)
+    parts[::2] = map(outside_of_code, parts[::2])
+    return "".join(parts).replace(COMMANDS, _commands() if COMMANDS in markdown else "")
+
+
+def _link(found: re.Match[str], source: str, uri: str, pages: dict[str, str]) -> str:
+    """Return a link of a page as the site has it; what leads nowhere stays, and MkDocs says so."""
+    text, target, anchor = found[1], found[2], found[3] or ""
+    path = os.path.normpath(PurePosixPath(source).parent / target)
+    if path == "README.md":
+        path = DOCS + "index.md"
+    for page in (path, f"{path}/README.md"):
+        if page in pages:
+            return f"[{text}]({os.path.relpath(pages[page], PurePosixPath(uri).parent)}{anchor})"
+    if (ROOT / path).exists():
+        return text if path in text else f"{text} (`{path}`)"
+    return found[0]
+
+
+def _commands() -> str:
+    """Help texts of all commands, a section each."""
+    # Wide enough for the longest option, narrow enough for a page, whatever the terminal is.
+    os.environ["COLUMNS"] = "80"
+    sections: list[str] = []
+
+    def add(name: str, parser: object, help_text: Callable[[], str], level: int) -> None:
+        sections.append(f"{'#' * level} {name}\n\n```text\n{help_text().rstrip()}\n```")
+        for action, inner in choices(parser).items():
+            add(f"{name} {action}", inner, inner.format_help, level)
+
+    parser = build_parser()
+    add("oodd-eval", parser, parser.format_help, 2)
+    return "\n\n".join(sections)
