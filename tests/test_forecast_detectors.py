@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from helpers_forecast import Walker, slow_errors
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms
 from oodd_torch.forecast import Forecaster, rollouts
@@ -140,68 +141,6 @@ def test_mean_sampling_collapses_towards_the_mean(learned):
     assert mean.std() < 0.85 * free.std()
 
 
-def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):
-    """The obvious way: one trajectory, one time, one member, one sample after the other."""
-    a = made.architecture
-    errors = []
-    for t in range(horizon, len(rows)):
-        levels = quantile_levels(seed, range(t, t + 1), horizon, made.members, samples, a.features)
-        total = 0.0
-        for e in range(made.members):
-            streams = [list(rows[: t - horizon + 1]) for _ in range(samples)]
-            for k in range(horizon):
-                following = []
-                for m in range(samples):
-                    index = levels[0, k, e, m] if a.quantiles else None
-                    following.append(one_step(made, e, streams[m], index))
-                if mean_sampling and k < horizon - 1:
-                    following = [np.mean(following, axis=0)] * samples
-                for stream, row in zip(streams, following, strict=True):
-                    stream.append(row)
-            total += np.mean([np.abs(rows[t] - s[-1]) for s in streams])
-        errors.append(total / made.members)
-    return np.array(errors)
-
-
-def one_step(made, e, stream, index):
-    d = made.architecture.features
-    if made.architecture.per_feature:  # one network after the other, each for its own sensor
-        change = [change_of(made, e * d + i, stream, index, [i])[0] for i in range(d)]
-    else:
-        change = change_of(made, e, stream, index, range(d))
-    return stream[-1] + made.unit.numpy() * np.array(change, np.float32)
-
-
-def change_of(made, network, stream, index, sensors):
-    a, h = made.architecture, made.architecture.units
-    p = {n: p[network] for n, p in made.named_parameters()}
-
-    def dense(x, name):
-        return x @ p[name] + p[f"{name}_bias"][0]
-
-    memory = torch.zeros(h)
-    for t in range(len(stream)):
-        past = [stream[max(t - w, 0)] for w in range(a.window)]
-        f = torch.relu(dense(torch.tensor(np.concatenate(past)), "first"))
-        if not a.recurrent:
-            memory = f
-            continue
-        gates, recurrent = dense(f, "gru_in"), dense(memory, "gru")
-        reset = torch.sigmoid(gates[:h] + recurrent[:h])
-        update = torch.sigmoid(gates[h : 2 * h] + recurrent[h : 2 * h])
-        candidate = torch.tanh(gates[2 * h :] + reset * recurrent[2 * h :])
-        memory = (1 - update) * candidate + update * memory
-    z = torch.relu(dense(memory, "second")) + f
-    out = []
-    for column, d in enumerate(sensors):
-        phi = torch.ones(h)
-        if index is not None:
-            tau = (index[d] + 0.5) / GRID
-            phi = torch.relu(dense(torch.cos(torch.pi * torch.arange(a.cosines) * tau), "cosine"))
-        out.append(float((z * phi) @ p["out"][:, column] + p["out_bias"][0, column]))
-    return out
-
-
 @pytest.mark.parametrize("horizon", [1, 3])
 @pytest.mark.parametrize(
     ("architecture", "mean_sampling"),
@@ -224,6 +163,16 @@ def test_rollouts_equal_a_slow_loop_sample_for_sample(architecture, mean_samplin
     fast = Forecaster.of(made, **options).errors(rows)
     for found, episode in zip(fast, rows, strict=True):
         assert np.allclose(found, slow_errors(made, episode, **options), atol=1e-5)
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_the_loop_of_the_benchmark_computes_the_same(horizon):
+    made = network(2, features=2, random_head=True, units=8, cosines=5)
+    rows = waves(1, 12, 2)[0].observations
+    options = {"horizon": horizon, "samples": 3, "mean_sampling": False, "seed": 7}
+    expected = slow_errors(made, rows, **options)
+    found = Walker(made, **options).errors(rows, len(rows) - horizon)
+    assert np.allclose(found, expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module", params=[(n, h) for n in FACTORIES for h in (1, 3)], ids=str)
