@@ -29,9 +29,10 @@ def quick(monkeypatch, tmp_path):
 
 
 def reproduce(split, output, *options, only=ONLY):
+    """Without figures, which take longer than all the rest."""
     return main(
         ["reproduce", "--tier", "mini", "--split", str(split), "--output", str(output),
-         "--only", only, *options]
+         "--only", only, "--no-figures", *options]
     )  # fmt: skip
 
 
@@ -44,9 +45,15 @@ def contents(directory):
     }
 
 
+def render(directory, *options):
+    return main(
+        ["reproduce", "--render-only", "--output", str(directory), "--no-figures", "-q", *options]
+    )
+
+
 @pytest.fixture(scope="module")
 def finished(tiny_split, tmp_path_factory):
-    """A directory in which the delays are finished; tests must not write to it."""
+    """A directory in which the delays are finished; tests must not change it."""
     with pytest.MonkeyPatch.context() as patch:
         install_quick(patch, tmp_path_factory.mktemp("plugins"))
         output = tmp_path_factory.mktemp("finished") / "reproduction"
@@ -65,7 +72,6 @@ def test_files_of_a_reproduction(finished):
     } <= names
     for name in ("table-2", "figure-horizon", "delays"):
         assert {f"tables/{name}.md", f"tables/{name}.csv"} <= names
-        assert {f"figures/{name}.png", f"figures/{name}.svg"} <= names
     page = (finished / "README.md").read_text()
     assert "10 of 72 fits and scorings have been run." in page
     # Ensembles share no setup but RIQN's with the delays; N-RIQN was not run at all.
@@ -103,8 +109,67 @@ def test_tables_and_figures_are_made_again_from_the_records_alone(finished, tmp_
     kept.mkdir()
     for name in ("records.jsonl", "reproduction.json", "returns.json"):
         shutil.copy(finished / name, kept / name)
-    assert main(["reproduce", "--render-only", "--output", str(kept), "-q"]) == 0
+    assert render(kept) == 0
     assert contents(kept) == contents(finished)
+
+
+def test_tables_are_made_from_records_that_lie_elsewhere_in_any_order(finished, tmp_path, capsys):
+    """Entries of the leaderboard hold the records, and other things beside them."""
+    kept, entries = tmp_path / "kept", tmp_path / "entries"
+    kept.mkdir()
+    for name in ("reproduction.json", "returns.json"):
+        shutil.copy(finished / name, kept / name)
+    lines = (finished / "records.jsonl").read_text().splitlines(keepends=True)
+    random.Random(0).shuffle(lines)
+    others = [line.replace('"split_digest": "', '"split_digest": "0') for line in lines]
+    for name, part in (("a", lines[:30]), ("b/c", lines[30:]), ("d", others), ("e", others)):
+        (entries / name).mkdir(parents=True)
+        (entries / name / "records.jsonl").write_text("".join(part))
+    assert render(kept, "--records", str(entries)) == 0
+    mine, theirs = contents(kept), contents(finished)
+    assert mine | {"records.jsonl": theirs["records.jsonl"]} == theirs
+
+    (entries / "f").mkdir()
+    (entries / "f" / "records.jsonl").write_text(lines[0])
+    assert render(kept, "--records", str(entries)) == 4
+    message = capsys.readouterr().err
+    assert str(entries / "a") in message
+    assert str(entries / "f") in message
+    assert render(kept, "--records", str(entries / "a"), str(entries / "b")) == 0
+    assert render(kept, "--records", str(kept)) == 4
+    assert "no results in" in capsys.readouterr().err
+
+
+def test_a_header_with_fields_of_an_earlier_version_is_read(finished, tmp_path):
+    for name in ("records.jsonl", "returns.json"):
+        shutil.copy(finished / name, tmp_path / name)
+    plain = json.loads((finished / "reproduction.json").read_text())
+    plain["tier"]["limit"] = None
+    (tmp_path / "reproduction.json").write_text(json.dumps(plain))
+    assert render(tmp_path) == 0
+    assert (tmp_path / "README.md").read_bytes() == (finished / "README.md").read_bytes()
+
+
+def test_figures_are_drawn_once_and_again_when_numbers_change(finished, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    assert main(["reproduce", "--render-only", "--output", str(copy), "-q"]) == 0
+    pictures = {p: p.stat().st_mtime_ns for p in (copy / "figures").iterdir()}
+    names = {"table-2", "table-3", "table-4", "table-5", "controls", "delays", "figure-models",
+             "figure-horizon", "figure-horizon-matched", "figure-samples",
+             "figure-samples-matched"}  # fmt: skip
+    assert {p.name for p in pictures} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
+    page = (copy / "README.md").read_text()
+    assert all(f"](figures/{name}.png)" in page for name in names)
+
+    records = copy / "records.jsonl"
+    lines = records.read_text().splitlines(keepends=True)
+    records.write_text("".join(line for line in lines if '"horizon": 20' not in line))
+    (copy / "figures" / "table-2.png").unlink()
+    assert main(["reproduce", "--render-only", "--output", str(copy), "-q"]) == 0
+    changed = {p.stem for p, t in pictures.items() if p.stat().st_mtime_ns != t}
+    assert {"table-2", "delays", "figure-horizon"} <= changed
+    assert not {"table-4", "table-5", "controls", "figure-samples"} & changed
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_tables(
@@ -114,7 +179,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_tables(
     output = tmp_path / "killed"
     command = [
         sys.executable, "-m", "oodd_eval", "reproduce", "--tier", "mini", "--split",
-        str(tiny_split), "--output", str(output), "--only", ONLY, "--jobs", "2",
+        str(tiny_split), "--output", str(output), "--only", ONLY, "--jobs", "2", "--no-figures",
     ]  # fmt: skip
     rng = random.Random(4)
     scores = set()
@@ -151,7 +216,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_tables(
 
 
 def test_a_budget_that_is_used_up_leaves_units_and_says_so(tiny_split, quick, tmp_path, capsys):
-    assert reproduce(tiny_split, tmp_path / "out", "--budget", "0.001s", "--no-figures") == 2
+    assert reproduce(tiny_split, tmp_path / "out", "--budget", "0.001s") == 2
     said = capsys.readouterr().out
     # A unit that was begun may end before the budget is looked at.
     assert re.search(r"the budget is used up: (9|10) units left", said)
@@ -197,6 +262,8 @@ def test_a_split_that_is_not_here_comes_with_the_command_that_builds_it(
         (["--tier", "mini", "--only", "table-6"], "unknown table or figure 'table-6'"),
         (["--tier", "mini", "--budget", "soon"], "a time such as"),
         (["--tier", "mini", "--jobs", "0"], "--jobs is 0"),
+        (["--tier", "mini", "--device", "tpu"], "--device is 'tpu'"),
+        (["--tier", "mini", "--records", "x"], "--records is what --render-only reads"),
         (["--render-only"], "no reproduction in"),
     ],
 )
@@ -212,9 +279,7 @@ def test_failing_units_are_states_and_the_exit_code_is_one(
 ):
     monkeypatch.setenv("QUICK_SECONDS", "30")
     output = tmp_path / "out"
-    code = reproduce(
-        tiny_split, output, "--timeout", "1s", "--no-figures", "--jobs", "5", only="delays"
-    )
+    code = reproduce(tiny_split, output, "--timeout", "1s", "--jobs", "5", only="delays")
     assert code == 1
     assert "timeout" in (output / "tables" / "delays.md").read_text()
     assert "## Failures" in (output / "README.md").read_text()

@@ -10,6 +10,7 @@ from rich.console import Console
 from oodd_eval.benchmark import PROTOCOL, SPLITS
 from oodd_eval.commands import data
 from oodd_eval.commands.discovery import discovered, report_broken
+from oodd_eval.commands.run import DEVICES
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UnknownNameError, UsageError
 from oodd_eval.isolation import Limits
 from oodd_eval.plugins import Plugins
@@ -20,7 +21,8 @@ from oodd_eval.reproduce import header as headers
 from oodd_eval.reproduce import returns
 from oodd_eval.reproduce.carry import Outcome, Watch, carry_out
 from oodd_eval.reproduce.costs import duration, scored_rows
-from oodd_eval.reproduce.experiments import EXPERIMENTS, IDS, TIERS, Tier
+from oodd_eval.reproduce.experiments import EXPERIMENTS, IDS, TIERS, Tier, setups_of
+from oodd_eval.reproduce.gathering import gather
 from oodd_eval.reproduce.header import Header
 from oodd_eval.reproduce.publish import publish, put
 from oodd_eval.reproduce.schedule import (
@@ -48,16 +50,21 @@ def run(options: argparse.Namespace) -> int:
     """
     tier, directory = _tier(options), Path(options.output)
     console = make_console()
-    results = ResultsDirectory(directory)
     if options.render_only:
-        return _render(options, directory, headers.load(directory), results, console)
+        header = headers.load(directory)
+        places = [Path(place) for place in options.records or [directory]]
+        return _render(options, directory, header, gather(header, places), console)
+    if options.records:
+        raise UsageError("--records is what --render-only reads; a run reads its own directory")
+    results = ResultsDirectory(directory)
     jobs, limits = _jobs(options), Limits(seconds(options.timeout), memory_bytes(options.memory))
     budget = None if options.budget is None else seconds(options.budget)
     chosen = select("table or figure", options.only, IDS)
     plugins = discovered(options.plugins)
     report_broken(plugins)
     split = _split(options, tier)
-    wanted = lay_out([e for e in EXPERIMENTS if e.id in chosen], tier, split, plugins)
+    device = _device(options)
+    wanted = lay_out([e for e in EXPERIMENTS if e.id in chosen], tier, split, plugins, device)
     header = _header(tier, split, plugins)
     headers.check_same_data(directory, header)
     finished = {} if options.fresh else finished_keys(_records(results))
@@ -69,13 +76,13 @@ def run(options: argparse.Namespace) -> int:
         return 0
     results.prepare()
     put(directory / headers.FILE, header.dump())
-    _keep_returns(directory, split, tier)
-    rows = {e: scored_rows(split, e, tier.limit) for e in split.environments}
+    _keep_returns(directory, split)
+    rows = {e: scored_rows(split, e) for e in split.environments}
     tell = console.print if options.verbosity >= 0 else None
     watch = Watch(left, rows, jobs, tell, fitted)
     settings = Settings(jobs=jobs, limits=limits, fresh=options.fresh)
     outcome = carry_out(watch, split, plugins, settings, results, budget=budget)
-    code = _render(options, directory, header, results, console)
+    code = _render(options, directory, header, _records(results), console)
     return _say_end(console, outcome, watch) or code
 
 
@@ -89,6 +96,13 @@ def _jobs(options: argparse.Namespace) -> int:
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs is {options.jobs}, expected at least 1")
     return options.jobs or available_cores()
+
+
+def _device(options: argparse.Namespace) -> str | None:
+    device: str | None = options.device
+    if device not in (None, *DEVICES):
+        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
+    return device
 
 
 def _split(options: argparse.Namespace, tier: Tier) -> Split:
@@ -112,11 +126,7 @@ def _split(options: argparse.Namespace, tier: Tier) -> Split:
 
 def _header(tier: Tier, split: Split, plugins: Plugins) -> Header:
     definition = split.manifest["definition"]
-    limit = tier.limit
-    sizes = {
-        part: int(definition[part]) if limit is None else min(limit, int(definition[part]))
-        for part in ("train", "calibration", "test")
-    }
+    sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
     units = len(lay_out(EXPERIMENTS, tier, split, plugins))
     return Header(tier, split.name, split.digest, PROTOCOL, **sizes, units=units)
 
@@ -131,24 +141,22 @@ def _fitted(results: ResultsDirectory) -> set[str]:
     return {path.name for path in place.iterdir()} if place.is_dir() else set()
 
 
-def _keep_returns(directory: Path, split: Split, tier: Tier) -> None:
+def _keep_returns(directory: Path, split: Split) -> None:
     """Read the returns for Table 2 once; they are in the split and not in records."""
     path = directory / returns.FILE
-    if returns.load(path, split.digest, tier.limit) is None:
-        found = returns.collect(split, tier.limit)
-        put(path, returns.dump(found, split.digest, tier.limit))
+    if returns.load(path, split.digest) is None:
+        put(path, returns.dump(returns.collect(split), split.digest))
 
 
 def _render(
     options: argparse.Namespace,
     directory: Path,
     header: Header,
-    results: ResultsDirectory,
+    records: list[Record],
     console: Console,
 ) -> int:
     """Write tables and figures; 1 when units failed, as far as there are records."""
-    records = _records(results)
-    found = returns.load(directory / returns.FILE, header.split_digest, header.tier.limit)
+    found = returns.load(directory / returns.FILE, header.split_digest)
     try:
         publish(directory, header, records, found, pictures=options.figures)
     except MissingExtraError as error:
@@ -156,8 +164,7 @@ def _render(
         publish(directory, header, records, found, pictures=False)
     if options.verbosity >= 0:
         console.print(f"tables, figures and claims in {directory / 'README.md'}")
-    setups = [setup for e in EXPERIMENTS for setup in e.setups]
-    own = own_records(records, header.split_digest, header.tier.limit, header.tier, setups)
+    own = own_records(records, header.split_digest, header.tier, setups_of(EXPERIMENTS))
     return int(not all(r.ok for r in own))
 
 
@@ -170,10 +177,9 @@ def _say_plan(
     jobs: int,
 ) -> None:
     """Print what remains, stage by stage, and how long it takes."""
-    limited = f", first {header.tier.limit} trajectories of each part" if header.tier.limit else ""
     console.print(
         f"reproduction, tier {header.tier.name}: split {header.split}, digest "
-        f"{header.split_digest[:12]}{limited}"
+        f"{header.split_digest[:12]}"
     )
     rows = []
     seen = set(fitted)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from oodd_eval.benchmark import SPLITS
 from oodd_eval.records import Record
-from oodd_eval.report.board import entry_of
 from oodd_eval.report.markdown import table as markdown_table
 from oodd_eval.report.tables import UNDEFINED, Table
-from oodd_eval.reproduce.experiments import Experiment
+from oodd_eval.reproduce.experiments import Experiment, row_of
 from oodd_eval.reproduce.header import Header
 from oodd_eval.reproduce.numbers import Numbers, seeds_used
 
@@ -18,20 +17,31 @@ TABLE_2_HEADING = "Table 2: returns of the policies, nominal and under each anom
 
 def opening(header: Header, records: Sequence[Record]) -> list[str]:
     """Return the head of the page: what it is, how much was run, and by what."""
-    done = {(entry_of(r), r.environment, r.seed) for r in records}
-    failed = {(entry_of(r), r.environment, r.seed) for r in records if not r.ok}
+    done = {(row_of(r), r.environment, r.seed) for r in records}
+    failed = {(row_of(r), r.environment, r.seed) for r in records if not r.ok}
     tier = header.tier
     state = f"{len(done)} of {header.units} fits and scorings have been run"
     state += f", {len(failed)} of which failed (see the end)." if failed else "."
+    if len(done) < header.units:
+        state += " **Unfinished**: numbers and verdicts may change."
     made = sorted({_origin(r) for r in records})
-    seeds = (
-        f"Detector seeds: {tier.seeds_near} at Δ = 1, {tier.seeds_far} at Δ > 1 and for other "
-        "sampling sizes than M = 8. With one seed an interval holds the spread of test "
-        "trajectories alone, not that of training."
-    )
+    seeds = f"Detector seeds: {tier.seeds_near} of each setup"
+    if tier.seeds_far != tier.seeds_near:
+        seeds += (
+            f" at Δ = 1, and {tier.seeds_far} at Δ > 1 and for other sampling sizes than M = 8. "
+            "With one seed an interval holds the spread of test trajectories alone, not that of "
+            "training"
+        )
+    seeds += "; 1 of the rows without training (controls)."
+    command = f"oodd-eval reproduce --tier {tier.name}"
+    command += f" --split {header.split}" if header.split != tier.split else ""
+    places = {str(r.parameters["device"]) for r in records if "device" in r.parameters}
+    made += [f"networks on {place}" for place in sorted(places)]
     reading = (
         "Values are ours with a 95 % bootstrap interval over test seeds and detector seeds, the "
-        "paper's digits below; **not run** is missing, a failure is named by its state, "
+        "paper's digits below. These were computed on the authors' own data, policies and "
+        "networks: they are there to compare, not to meet. **Not run** is missing, a failure is "
+        "named by its state, "
         f"{UNDEFINED} is undefined (no alarm, say), *(n of m)* is a mean over fewer environments."
     )
     aucs = (
@@ -39,12 +49,12 @@ def opening(header: Header, records: Sequence[Record]) -> list[str]:
         "AUC compares with the nominal twin at the same times, so that the phase of an episode "
         "does not count."
     )
-    run = (f"Tier **{tier.name}**: {_data(header)}.", seeds, state)
+    run = (f"Tier **{tier.name}**. {_data(header)}.", seeds, state, f"Run by `{command}`.")
     lines = (*run, *(f"Made with {text}." for text in made), reading, aucs)
     source = (
         "*Out-of-Distribution Dynamics Detection: RL-Relevant Benchmarks and Results.* Every "
-        "number is computed from `records.jsonl` (Table 2 from `returns.json`); "
-        "`oodd-eval reproduce --render-only` makes this page again."
+        "number is computed from stored records of cells (Table 2 from `returns.json`); "
+        "`oodd-eval reproduce --render-only` makes this page again from them."
     )
     title = "# Reproduction of Danesh & Fern (2021)"
     return [title, "", source, "", *(f"- {line}" for line in lines), ""]
@@ -58,13 +68,7 @@ def heading(experiment: Experiment) -> str:
 
 def caption(header: Header, experiment: Experiment, numbers: Numbers) -> str:
     """Return what has to stand above an experiment's tables and figures."""
-    used = seeds_used(numbers)
-    counts = sorted({tuple(seeds) for seeds in used.values()})
-    if len(counts) == 1:
-        seeds = f"Detector seeds: {_span(counts[0])}."
-    else:
-        each = "; ".join(f"{label}: {_span(seeds)}" for label, seeds in used.items())
-        seeds = f"Detector seeds: {each}."
+    seeds = _seeds(seeds_used(numbers))
     parts = [f"In the paper: {experiment.place}.", f"{_data(header)}.", seeds, experiment.note]
     return " ".join(part[0].upper() + part[1:] for part in parts if part)
 
@@ -78,15 +82,15 @@ def of_returns(header: Header) -> str:
     ) else ""  # fmt: skip
     return (
         f"In the paper: Table 2. {_data(header)}. Mean over test seeds with a 95 % bootstrap "
-        f"interval.{short} In the figure, shares of the nominal return (magnitude)."
+        f"interval.{short} Policies are this benchmark's own, of the paper's algorithms."
     )
 
 
 def failures(records: Sequence[Record]) -> list[str]:
     """Return the section on units that failed; nothing where none did."""
     failed = {
-        (entry_of(r).label, r.environment, r.seed): [
-            entry_of(r).label, r.environment, str(r.seed), r.status, r.reason
+        (row_of(r).label, r.environment, r.seed): [
+            row_of(r).label, r.environment, str(r.seed), r.status, r.reason
         ]
         for r in records
         if not r.ok
@@ -99,15 +103,25 @@ def failures(records: Sequence[Record]) -> list[str]:
 
 
 def _data(header: Header) -> str:
-    used = f"split {header.split}, digest {header.split_digest[:12]}, protocol {header.protocol}, "
+    used = f"Split {header.split}, digest {header.split_digest[:12]}, protocol {header.protocol}, "
     used += f"{header.train} training, {header.calibration} calibration trajectories and "
     used += f"{header.test} test seeds per environment"
-    if header.tier.limit is not None:
-        used += (
-            f" — **a reduced tier**: the first {header.tier.limit} trajectories of each part of "
-            "the split"
-        )
-    return used
+    return used + _reduction(header)
+
+
+def _reduction(header: Header) -> str:
+    """Say what a split lacks whose trajectories are the first ones of another published split."""
+    own = SPLITS.get(header.split)
+    for whole in SPLITS.values():
+        if own and whole.seed_base == own.seed_base and whole.test > own.test:
+            sizes = {
+                "training trajectories": (own.train, whole.train),
+                "calibration trajectories": (own.calibration, whole.calibration),
+                "test seeds": (own.test, whole.test),
+            }
+            less = [f"{few} of {all_} {what}" for what, (few, all_) in sizes.items() if few < all_]
+            return f" (**reduced**: the first {' and '.join(less)} of split {whole.name})"
+    return ""
 
 
 def _origin(record: Record) -> str:
@@ -116,5 +130,18 @@ def _origin(record: Record) -> str:
     return ", ".join(versions) or "unknown versions"
 
 
-def _span(seeds: Sequence[int]) -> str:
-    return str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+def _seeds(used: Mapping[str, Sequence[int]]) -> str:
+    """Say on how many detector seeds each series rests; briefly where those of a horizon agree."""
+    settings: dict[str, set[str]] = {}
+    for label, seeds in used.items():
+        span = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+        settings.setdefault(label.rpartition(": ")[0], set()).add(span)
+    if any(len(spans) > 1 for spans in settings.values()):
+        return _seeds({f"{label}: ": seeds for label, seeds in used.items()})
+    by_span: dict[str, list[str]] = {}
+    for setting, (span,) in settings.items():
+        by_span.setdefault(span, []).append(setting)
+    if len(by_span) == 1:
+        return f"Detector seeds: {next(iter(by_span))}."
+    each = "; ".join(f"{span} for {', '.join(names)}" for span, names in by_span.items())
+    return f"Detector seeds: {each}."

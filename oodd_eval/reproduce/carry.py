@@ -160,9 +160,7 @@ def carry_out(
         done = {w.fit for w in watch.works if w not in left}
         seconds = room * watch.jobs / watch.factor()
         batch = next_batch(left, seconds, {*watch.fitted, *done})
-        plan = Plan(
-            split.name, split.digest, tuple(w.unit for w in batch), batch[0].plan.limit
-        )  # fmt: skip
+        plan = Plan(split.name, split.digest, tuple(w.unit for w in batch))
         interrupted = run(plan, split, plugins, settings, results).interrupted
         # A batch of which nothing came would come again for ever.
         if interrupted or len(watch.open()) == len(left):

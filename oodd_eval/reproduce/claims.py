@@ -157,8 +157,13 @@ def judge(claim: Claim, metric: str, evidence: Evidence) -> Judged:
             for environment in claim.environments
         ]
         return everywhere(claim, metric, found)
-    estimate = _shifted(evidence.combine(terms, claim.environments), claim.offset)
-    return Judged(metric, estimate, claim.rule(estimate))
+    return ruled(claim, metric, _shifted(evidence.combine(terms, claim.environments), claim.offset))
+
+
+def ruled(claim: Claim, metric: str, estimate: Estimate) -> Judged:
+    """Return the verdict on a claim about a mean; open where environments are missing from it."""
+    verdict = "undecided" if estimate.partial else claim.rule(estimate)
+    return Judged(metric, estimate, verdict)
 
 
 def everywhere(claim: Claim, metric: str, found: Sequence[tuple[str, Estimate]]) -> Judged:

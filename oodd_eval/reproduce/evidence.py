@@ -8,6 +8,7 @@ seeds (the same ones for all terms), independently by environment. So difference
 from __future__ import annotations
 
 import functools
+import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,8 +18,8 @@ from numpy.typing import NDArray
 
 from oodd_eval.intervals import RESAMPLES, bootstrap_weights, percentiles, resampled
 from oodd_eval.records import NAN, Record
-from oodd_eval.report.board import Entry, contribution, entry_of
-from oodd_eval.reproduce.experiments import Setup
+from oodd_eval.report.board import Entry, contribution
+from oodd_eval.reproduce.experiments import Setup, row_of
 
 _weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
 
@@ -45,7 +46,8 @@ class Estimate:
     value, low, high
         NaN where undefined or not run.
     environments, expected
-        How many environments it is a mean over, and how many were asked for.
+        How many environments it is a mean over, and how many were asked for. Where it is undefined
+        in all that were run, these are counted.
     seeds
         Fewest detector seeds in any of these environments.
     state
@@ -67,7 +69,7 @@ class Estimate:
 
 
 class Evidence:
-    """Records of one split digest, protocol and limit, by setup, environment and anomaly.
+    """Records of one split digest and protocol, by setup, environment and anomaly.
 
     Parameters
     ----------
@@ -76,21 +78,22 @@ class Evidence:
     """
 
     def __init__(self, records: Iterable[Record]) -> None:
-        self._records: dict[tuple[Entry, str, str], dict[int, Record]] = {}
+        self._cells: dict[tuple[Entry, str], dict[str, dict[int, Record]]] = {}
         for record in records:
-            key = entry_of(record), record.environment, record.anomaly
-            self._records.setdefault(key, {})[record.seed] = record
+            row = self._cells.setdefault((row_of(record), record.environment), {})
+            row.setdefault(record.anomaly, {})[record.seed] = record
+        # A number is asked for by several tables and claims.
         self._mean = functools.lru_cache(maxsize=8192)(self._mean_over_anomalies)
 
     def has(self, setups: Iterable[Setup]) -> bool:
         """Whether there is a record of any of these setups."""
         wanted = {setup.entry for setup in setups}
-        return any(entry in wanted for entry, _, _ in self._records)
+        return any(entry in wanted for entry, _ in self._cells)
 
     def seeds(self, setup: Setup, environment: str, anomalies: tuple[str, ...]) -> set[int]:
         """Return the detector seeds for which all of these cells are there."""
-        cells = (self._records.get((setup.entry, environment, a), {}) for a in anomalies)
-        return set[int].intersection(*(set(cell) for cell in cells))
+        cells = self._cells.get((setup.entry, environment), {})
+        return set[int].intersection(*(set(cells.get(a, ())) for a in anomalies))
 
     def combine(
         self,
@@ -127,16 +130,16 @@ class Evidence:
         if not found:
             return Estimate(expected=len(environments))
         value, series = _average(found)
-        return Estimate(
-            value, *percentiles(series), len(found), len(environments), fewest
-        )  # fmt: skip
+        defined = sum(not math.isnan(v) for v, _ in found) or len(found)
+        return Estimate(value, *percentiles(series), defined, len(environments), fewest)
 
     def _held(self, term: Term, environment: str) -> dict[int, Record]:
         """Return a record of every seed that has all of a term's cells, a failed one if any."""
         seeds = self.seeds(term.setup, environment, term.anomalies)
-        cells = [self._records[term.setup.entry, environment, a] for a in term.anomalies if seeds]
+        cells = self._cells.get((term.setup.entry, environment), {})
         return {
-            seed: min((cell[seed] for cell in cells), key=lambda r: r.ok) for seed in sorted(seeds)
+            seed: min((cells[a][seed] for a in term.anomalies), key=lambda r: r.ok)
+            for seed in sorted(seeds)
         }
 
     def _over_seeds(self, term: Term, environment: str, seeds: tuple[int, ...]) -> Sample:
@@ -151,8 +154,8 @@ class Evidence:
     def _mean_over_anomalies(
         self, setup: Setup, environment: str, anomalies: tuple[str, ...], metric: str, seed: int
     ) -> Sample:
-        records = [self._records[setup.entry, environment, a][seed] for a in anomalies]
-        return _average([_cell(r, metric) for r in records])
+        cells = self._cells[setup.entry, environment]
+        return _average([_cell(cells[a][seed], metric) for a in anomalies])
 
 
 def _cell(record: Record, metric: str) -> Sample:
@@ -170,6 +173,9 @@ def _average(samples: Sequence[Sample]) -> Sample:
 
 def _nan_mean(stacked: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean over the first axis of what is not NaN, without a warning where nothing is."""
+    whole: NDArray[np.float64] = stacked.sum(axis=0)
+    if not np.isnan(whole).any():
+        return np.divide(whole, len(stacked))
     defined = ~np.isnan(stacked)
     count = defined.sum(axis=0)
     total = np.where(defined, stacked, 0.0).sum(axis=0)

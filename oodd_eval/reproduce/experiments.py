@@ -6,13 +6,15 @@ setups out beside one another; experiments share setups, and each is run once.
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, GROUPS
-from oodd_eval.report.board import Entry
+from oodd_eval.records import Record
+from oodd_eval.report.board import Entry, entry_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +28,21 @@ class Setup:
     @property
     def entry(self) -> Entry:
         """The row of a board that its records belong to."""
-        return Entry(self.detector, self.horizon, json.dumps(dict(self.parameters), sort_keys=True))
+        return _entry(self.detector, self.horizon, self.parameters)
+
+
+@functools.cache
+def _entry(detector: str, horizon: int, parameters: tuple[tuple[str, Any], ...]) -> Entry:
+    return Entry(detector, horizon, json.dumps(dict(parameters), sort_keys=True))
+
+
+def row_of(record: Record) -> Entry:
+    """Return the row that a record belongs to: where its networks computed makes no other one."""
+    overrides = dict(record.provenance.get("overrides", {}))
+    overrides.pop("device", None)
+    if overrides == record.provenance.get("overrides", {}):
+        return entry_of(record)
+    return Entry(record.detector, record.horizon, json.dumps(overrides, sort_keys=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,15 +261,12 @@ class Tier:
     seeds_near, seeds_far
         Numbers of detector seeds at Δ = 1, and where scoring is dear: at Δ > 1 and in the sweep
         of sampling sizes.
-    limit
-        Trajectories of each part that are used; None means all.
     """
 
     name: str
     split: str
     seeds_near: int
     seeds_far: int
-    limit: int | None = None
 
     def seeds(self, setup: Setup) -> range:
         """Return the detector seeds of a setup; controls have no training to vary, and one."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
@@ -105,7 +104,7 @@ def _means(experiment: Experiment, numbers: Numbers) -> Figure:
 
 
 def returns_figure(returns: Returns, paper: Sequence[Sequence[float]]) -> Figure:
-    """Return Table 2 as shares of the nominal return, ours and the paper's.
+    """Return Table 2 as changes in percent of the nominal return, ours and the paper's.
 
     Parameters
     ----------
@@ -122,15 +121,14 @@ def returns_figure(returns: Returns, paper: Sequence[Sequence[float]]) -> Figure
         found = [mean_return(returns, environment, kind) for kind in kinds]
         scale = 100 / abs(nominal)
         ours = Dots(
-            "return, % of nominal (intervals: of the anomalous mean)",
-            tuple(scale * e.value for e in found),
-            tuple(scale * e.low for e in found),
-            tuple(scale * e.high for e in found),
-            tuple(100 * x / abs(theirs[0]) for x in theirs[1:]),
+            "ours, with intervals of the mean under the anomaly",
+            tuple(scale * (e.value - nominal) for e in found),
+            tuple(scale * (e.low - nominal) for e in found),
+            tuple(scale * (e.high - nominal) for e in found),
+            tuple(100 * (x - theirs[0]) / abs(theirs[0]) for x in theirs[1:]),
         )
-        sign = math.copysign(100.0, nominal)
-        panels.append(Panel(_row(environment), "% of nominal", categories, (ours,), sign))
-    title = "Return of the policies under each anomaly (dashed: nominal)"
+        panels.append(Panel(_row(environment), "change in %", categories, (ours,), 0.0))
+    title = "Change of the policies' return under each anomaly, % of the nominal return"
     return Figure(title, tuple(panels), columns=2, width=4.6, height=2.0, share="none")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Final
 
@@ -40,9 +40,9 @@ class Header:
     units: int
 
     @property
-    def data(self) -> tuple[str, int, int | None]:
+    def data(self) -> tuple[str, int]:
         """What records must agree in to stand in one table."""
-        return self.split_digest, self.protocol, self.tier.limit
+        return self.split_digest, self.protocol
 
     def dump(self) -> str:
         """Return the content of the file."""
@@ -62,7 +62,8 @@ def load(directory: Path) -> Header:
         plain = json.loads(path.read_text(encoding="utf-8"))
         if plain.pop("schema") != SCHEMA:
             raise ResultsError(f"{str(path)!r} was written by another version of oodd-eval")
-        return Header(**plain | {"tier": Tier(**plain["tier"])})
+        tier = {f.name: plain["tier"][f.name] for f in fields(Tier)}
+        return Header(**plain | {"tier": Tier(**tier)})
     except FileNotFoundError:
         raise ResultsError(
             f"no reproduction in {str(directory)!r}: expected a file {FILE}, written by "
@@ -80,7 +81,7 @@ def check_same_data(directory: Path, header: Header) -> None:
     Raises
     ------
     UsageError
-        When the directory holds one on other data, under other rules or with another limit.
+        When the directory holds one on other data or under other rules.
     """
     if not (directory / FILE).exists():
         return

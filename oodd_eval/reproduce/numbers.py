@@ -10,6 +10,7 @@ from typing import Final
 
 from oodd_eval.benchmark import ENVIRONMENTS
 from oodd_eval.records import NAN
+from oodd_eval.report.csv_tables import number as digits
 from oodd_eval.report.tables import PERCENT, TITLES, Table
 from oodd_eval.report.tables import number as plain
 from oodd_eval.reproduce import paper
@@ -133,8 +134,8 @@ def csv_lines(numbers: Numbers) -> list[list[str]]:
         parameters = json.dumps(dict(first.parameters)) if first.parameters else ""
         lines.append([
             n.environment, n.series.label, detectors, str(first.horizon), parameters, n.scope.id,
-            n.metric, *(_exact(x) for x in (e.value, e.low, e.high)), str(e.environments),
-            str(e.seeds), e.state or ("" if e.environments else NOT_RUN), _exact(n.paper),
+            n.metric, *(digits(x) for x in (e.value, e.low, e.high)), str(e.environments),
+            str(e.seeds), e.state or ("" if e.environments else NOT_RUN), digits(n.paper),
         ])  # fmt: skip
     return lines
 
@@ -163,8 +164,3 @@ def _rows(experiment: Experiment) -> list[str]:
 
 def _row_title(row: str) -> str:
     return "Mean" if row == MEAN else ENVIRONMENTS[row].title
-
-
-def _exact(value: float) -> str:
-    """Return the shortest text that reads back as the same float; empty for NaN."""
-    return "" if math.isnan(value) else repr(value)

@@ -60,10 +60,9 @@ def digit(
 
 
 def mean_digit(experiment: Experiment, series: Series, scope: Scope, metric: str) -> float:
-    """Return the mean of the paper's digits over the environments for which it prints one."""
+    """Return the mean of the paper's digits; NaN unless it prints one for every environment."""
     found = [digit(experiment, series, e, scope, metric) for e in experiment.environments]
-    defined = [value for value in found if not np.isnan(value)]
-    return float(np.mean(defined)) if defined else NAN
+    return float(np.mean(found))
 
 
 def returns(environment: str) -> Mapping[str, Any]:

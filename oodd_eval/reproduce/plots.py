@@ -5,9 +5,12 @@ Files are the same bytes for the same numbers: no date, no random ids, no machin
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
 import io
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from oodd_eval.errors import MissingExtraError
@@ -111,6 +114,30 @@ class Figure:
     share: Literal["all", "row", "none"] = "all"
 
 
+def drawing_key(figure: Figure) -> str:
+    """Return what decides how a figure looks, as a digest: it is written into the SVG file.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+    """
+    try:
+        version = importlib.metadata.version("matplotlib")
+    except importlib.metadata.PackageNotFoundError:
+        raise _missing() from None
+    content = hashlib.sha256(Path(__file__).read_bytes())
+    content.update(f"{version}\0{figure!r}".encode())
+    return content.hexdigest()
+
+
+def _missing() -> MissingExtraError:
+    return MissingExtraError(
+        'figures need matplotlib: pip install "oodd-eval[plots]", or leave them out with '
+        "--no-figures"
+    )
+
+
 def draw(figure: Figure) -> dict[str, bytes]:
     """Return the figure as PNG and SVG, by suffix.
 
@@ -119,14 +146,12 @@ def draw(figure: Figure) -> dict[str, bytes]:
     MissingExtraError
         Without matplotlib.
     """
+    key = drawing_key(figure)
     try:
         import matplotlib as mpl  # noqa: PLC0415  an extra, and slow to import
         from matplotlib.figure import Figure as Canvas  # noqa: PLC0415
     except ImportError:
-        raise MissingExtraError(
-            'figures need matplotlib: pip install "oodd-eval[plots]", or leave them out with '
-            "--no-figures"
-        ) from None
+        raise _missing() from None
     rows = math.ceil(len(figure.panels) / figure.columns)
     with mpl.rc_context(STYLE):  # type: ignore[arg-type]  # its keys are a closed list of literals
         size = figure.columns * figure.width, rows * figure.height + 0.75
@@ -146,7 +171,7 @@ def draw(figure: Figure) -> dict[str, bytes]:
         wide = 0.075 * max(map(len, labels)) + 0.55  # inches of a legend's column, roughly
         columns = max(1, min(len(labels), int(size[0] / wide)))
         canvas.legend(handles, labels, loc="outside lower center", ncols=columns)
-        return {suffix: _saved(canvas, suffix) for suffix in ("png", "svg")}
+        return {suffix: _saved(canvas, suffix, key) for suffix in ("png", "svg")}
 
 
 def _panel(axes: Axes, panel: Panel) -> None:
@@ -202,9 +227,11 @@ def _marker(index: int) -> str:
     return MARKERS[index % len(MARKERS)]
 
 
-def _saved(canvas: Any, suffix: str) -> bytes:
+def _saved(canvas: Any, suffix: str, key: str) -> bytes:
     # Dates and versions would make files differ that show the same.
-    metadata: dict[str, str | None] = {"Date": None} if suffix == "svg" else {"Software": None}
+    metadata: dict[str, str | None] = {"Software": None}
+    if suffix == "svg":
+        metadata = {"Date": None, "Identifier": key}
     buffer = io.BytesIO()
     canvas.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
     return buffer.getvalue()

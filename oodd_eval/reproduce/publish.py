@@ -29,7 +29,7 @@ from oodd_eval.reproduce.experiments import EXPERIMENTS, TABLE_2, Experiment, se
 from oodd_eval.reproduce.figures import figures, returns_figure
 from oodd_eval.reproduce.header import Header
 from oodd_eval.reproduce.numbers import Numbers, compute, csv_lines, layout, without_intervals
-from oodd_eval.reproduce.plots import Figure, draw
+from oodd_eval.reproduce.plots import Figure, draw, drawing_key
 from oodd_eval.reproduce.schedule import own_records
 
 
@@ -63,9 +63,7 @@ def publish(
     MissingExtraError
         When figures are wanted and matplotlib is not installed.
     """
-    own = own_records(
-        records, header.split_digest, header.tier.limit, header.tier, setups_of(EXPERIMENTS)
-    )
+    own = own_records(records, header.split_digest, header.tier, setups_of(EXPERIMENTS))
     evidence = Evidence(own)
     page = [*captions.opening(header, own)]
     made = verdicts.rulings(evidence, found)
@@ -140,12 +138,22 @@ def _returns(
 def _picture(directory: Path, name: str, figure: Figure, *, pictures: bool) -> list[str]:
     """Draw a figure, or leave the one that is there; return its place in the page."""
     place = directory / "figures"
-    if pictures:
+    if pictures and not _is_drawn(place, name, figure):
         for suffix, content in draw(figure).items():
             put(place / f"{name}.{suffix}", content)
     if not (place / f"{name}.png").exists():
         return []
     return [f"![{figure.title}](figures/{name}.png)", "", f"[as SVG](figures/{name}.svg)", ""]
+
+
+def _is_drawn(place: Path, name: str, figure: Figure) -> bool:
+    """Whether the files there show these numbers already: drawing takes seconds a figure."""
+    svg, png = place / f"{name}.svg", place / f"{name}.png"
+    return (
+        svg.is_file()
+        and png.is_file()
+        and drawing_key(figure) in svg.read_text(encoding="utf-8", errors="replace")[:4000]
+    )
 
 
 def markdown_table(table: Table) -> str:

@@ -14,9 +14,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, GROUPS
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import ResultsError
 from oodd_eval.intervals import bootstrap_weights, percentiles
+from oodd_eval.report.csv_tables import number
 from oodd_eval.report.tables import Table
 from oodd_eval.reproduce import paper
 from oodd_eval.reproduce.evidence import Estimate
@@ -29,26 +30,26 @@ Returns = Mapping[str, Mapping[str, Sequence[float]]]
 """Return of every test trajectory by environment and kind, ``nominal`` or an anomaly's id."""
 
 
-def collect(split: Split, limit: int | None) -> dict[str, dict[str, list[float]]]:
-    """Read the returns of the first `limit` test seeds; verifies the data on the way."""
+def collect(split: Split) -> dict[str, dict[str, list[float]]]:
+    """Read the returns of the test part; verifies the data on the way."""
     found: dict[str, dict[str, list[float]]] = {}
     for name in split.environments:
         data = split.environment(name)
         try:
             sets = {"nominal": data.twins} | {a: data.anomalous(a) for a in data.anomalies}
-            found[name] = {kind: s.returns[:limit].tolist() for kind, s in sets.items()}
+            found[name] = {kind: s.returns.tolist() for kind, s in sets.items()}
         finally:
             data.close()
     return found
 
 
-def dump(returns: Returns, digest: str, limit: int | None) -> str:
+def dump(returns: Returns, digest: str) -> str:
     """Return the content of ``returns.json``."""
-    whole = {"schema": 1, "split_digest": digest, "limit": limit, "returns": returns}
+    whole = {"schema": 1, "split_digest": digest, "returns": returns}
     return json.dumps(whole, sort_keys=True) + "\n"
 
 
-def load(path: Path, digest: str, limit: int | None) -> Returns | None:
+def load(path: Path, digest: str) -> Returns | None:
     """Read ``returns.json``; None where it is absent or of other data.
 
     Raises
@@ -59,7 +60,7 @@ def load(path: Path, digest: str, limit: int | None) -> Returns | None:
     try:
         whole: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         found: Returns = whole["returns"]
-        same = whole["split_digest"] == digest and whole["limit"] == limit
+        same = whole["split_digest"] == digest
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -84,7 +85,7 @@ def mean_return(returns: Returns, environment: str, kind: str) -> Estimate:
 
 
 def loss(returns: Returns, over: Sequence[str], weights: Mapping[str, float]) -> Estimate:
-    """Return the weighted sum over groups of the share of the nominal return that is lost.
+    """Return the weighted sum, over groups of anomalies, of the share of the return that is lost.
 
     In each environment a group's loss is (nominal - mean over its anomalies) / |nominal|, paired
     over test seeds.
@@ -112,15 +113,19 @@ def loss(returns: Returns, over: Sequence[str], weights: Mapping[str, float]) ->
 
 
 def table(returns: Returns) -> Table:
-    """Return the paper's Table 2, ours with intervals and the paper's below it."""
+    """Return the paper's Table 2, ours with intervals and the paper's below it.
+
+    The policies are of the paper's kinds; ours and the authors' are not the same networks.
+    """
     rows = []
     for environment in environments(returns):
         ours = [mean_return(returns, environment, kind) for kind in KINDS]
         theirs = [f"{paper.returns(environment)[kind]:.1f}" for kind in KINDS]
         title = ENVIRONMENTS[environment].title
-        rows += [[title, "ours", *map(_show, ours)], ["", "paper", *theirs]]
-    header = ["Environment", "", "Nominal", *(a.title for a in ANOMALIES.values())]
-    return Table("Mean return", header, rows, labels=2)
+        policy = ENVIRONMENTS[environment].policy
+        rows += [[title, policy, "ours", *map(_show, ours)], ["", "", "paper", *theirs]]
+    header = ["Environment", "Policy", "", "Nominal", *(a.title for a in ANOMALIES.values())]
+    return Table("Mean return", header, rows, labels=3)
 
 
 def numbers(returns: Returns) -> list[list[str]]:
@@ -131,15 +136,10 @@ def numbers(returns: Returns) -> list[list[str]]:
         for kind in KINDS:
             e = mean_return(returns, environment, kind)
             n = len(returns[environment].get(kind, []))
-            lines.append([environment, kind, groups[kind], *map(repr, (e.value, e.low, e.high)),
-                          str(n), repr(float(paper.returns(environment)[kind]))])  # fmt: skip
+            digits = map(number, (e.value, e.low, e.high))
+            theirs = number(float(paper.returns(environment)[kind]))
+            lines.append([environment, kind, groups[kind], *digits, str(n), theirs])
     return lines
-
-
-def difference_of_groups(returns: Returns, over: Sequence[str]) -> Estimate:
-    """Return how much more of the nominal return dynamics anomalies cost than sensor anomalies."""
-    sensor, dynamics = GROUPS
-    return loss(returns, over, {dynamics: 1.0, sensor: -1.0})
 
 
 def _resampled_mean(environment: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,9 +10,16 @@ from oodd_eval.benchmark import PROTOCOL
 from oodd_eval.plan import Plan, Unit, make_plan
 from oodd_eval.plugins import Plugins
 from oodd_eval.records import Record
-from oodd_eval.report.board import Entry, entry_of
+from oodd_eval.report.board import Entry
 from oodd_eval.reproduce.costs import Cost, estimate, scored_rows
-from oodd_eval.reproduce.experiments import CONTROLS, Experiment, Setup, Tier, setups_of
+from oodd_eval.reproduce.experiments import (
+    CONTROLS,
+    Experiment,
+    Setup,
+    Tier,
+    row_of,
+    setups_of,
+)
 from oodd_eval.results import fit_key, unit_key
 from oodd_eval.splits import Split
 
@@ -58,18 +65,29 @@ class Work:
 
 
 def lay_out(
-    experiments: Sequence[Experiment], tier: Tier, split: Split, plugins: Plugins
+    experiments: Sequence[Experiment],
+    tier: Tier,
+    split: Split,
+    plugins: Plugins,
+    device: str | None = None,
 ) -> list[Work]:
     """Return every unit that some experiments need, in the order in which they are to be run.
+
+    Parameters
+    ----------
+    experiments, tier, split, plugins
+        What is to be run, on what, by what.
+    device
+        Where networks compute; None leaves it to the detectors.
 
     Raises
     ------
     UnknownNameError
         When one of the paper's detectors is not installed.
     """
-    rows = {e: scored_rows(split, e, tier.limit) for e in split.environments}
+    rows = {e: scored_rows(split, e) for e in split.environments}
     found = [
-        _work(unit, setup, split, tier, plugins, rows[unit.environment])
+        _work(unit, setup, split, plugins, rows[unit.environment])
         for setup in setups_of(experiments)
         for unit in make_plan(
             plugins,
@@ -79,18 +97,15 @@ def lay_out(
             environments=split.environments,
             horizons=[setup.horizon],
             seeds=tier.seeds(setup),
-            parameters=dict(setup.parameters),
-            limit=tier.limit,
+            parameters={**dict(setup.parameters), **_placed(setup, plugins, device)},
         ).units
     ]
     place = {environment: i for i, environment in enumerate(split.environments)}
     return sorted(found, key=lambda w: (w.stage, place[w.unit.environment]))
 
 
-def _work(
-    unit: Unit, setup: Setup, split: Split, tier: Tier, plugins: Plugins, rows: int
-) -> Work:  # fmt: skip
-    plan = Plan(split.name, split.digest, (unit,), tier.limit)
+def _work(unit: Unit, setup: Setup, split: Split, plugins: Plugins, rows: int) -> Work:
+    plan = Plan(split.name, split.digest, (unit,))
     offer = plugins.offer(unit.detector)
     return Work(
         plan=plan,
@@ -99,6 +114,12 @@ def _work(
         fit=fit_key(plan, unit, offer),
         cost=estimate(unit, rows),
     )
+
+
+def _placed(setup: Setup, plugins: Plugins, device: str | None) -> dict[str, str]:
+    """Return the parameter ``device`` for a detector that has one and where it is not default."""
+    default = plugins.offer(setup.detector).spec.parameters.get("device", device)
+    return {} if device is None or device == default else {"device": device}
 
 
 def _stage(setup: Setup, seed: int) -> int:
@@ -114,15 +135,15 @@ def _stage(setup: Setup, seed: int) -> int:
 
 
 def own_records(
-    records: Iterable[Record], digest: str, limit: int | None, tier: Tier, setups: Sequence[Setup]
+    records: Iterable[Record], digest: str, tier: Tier, setups: Sequence[Setup]
 ) -> list[Record]:
-    """Return the records that belong to a reproduction: its data, its setups, its seeds."""
+    """Return the records that belong to a reproduction: its whole data, its setups, its seeds."""
     seeds: dict[Entry, range] = {setup.entry: tier.seeds(setup) for setup in setups}
     return [
         r
         for r in records
-        if (r.split_digest, r.protocol, r.provenance.get("limit")) == (digest, PROTOCOL, limit)
-        and r.seed in seeds.get(entry_of(r), ())
+        if (r.split_digest, r.protocol, r.provenance.get("limit")) == (digest, PROTOCOL, None)
+        and r.seed in seeds.get(row_of(r), ())
     ]
 
 
