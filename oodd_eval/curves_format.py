@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval import packed
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import OutputError, ResultsError
 
@@ -72,7 +73,7 @@ def read_curves(path: Path | str) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
+        plain = json.loads(packed.read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
     return check_curves(plain, path.name)

@@ -27,6 +27,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from oodd_eval import packed
 from oodd_eval.benchmark import PROTOCOL
 from oodd_eval.detector import Scores
 from oodd_eval.errors import OutputError, ResultsError
@@ -156,16 +157,16 @@ class ResultsDirectory:
             self.records()
 
     def records(self) -> list[Record]:
-        """Read all records.
+        """Read all records; those of a large entry of the leaderboard are packed, in ``.gz``.
 
         Raises
         ------
         ResultsError
             When there are none, or one cannot be read.
         """
-        file = self.path / RECORDS
+        file = packed.find(self.path / RECORDS) or self.path / RECORDS
         try:
-            lines = file.read_text(encoding="utf-8").splitlines()
+            lines = packed.read_text(file).splitlines()
         except FileNotFoundError:
             raise ResultsError(
                 f"no results in {str(self.path)!r}: expected a file {RECORDS}, written by "

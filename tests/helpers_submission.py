@@ -11,6 +11,7 @@ from helpers_split import make_split
 from oodd_eval.api import evaluate
 from oodd_eval.intervals import bootstrap_weights, interval
 from oodd_eval.metrics import Contribution
+from oodd_eval.packed import pack
 from oodd_eval.submission.submit import Statement, submit
 from oodd_eval.submission.verify import verify_entry
 
@@ -33,11 +34,11 @@ def make_submissions(home):
     for detector in ("persistence", "random"):
         evaluate(detector, split, output=results)
     statement = Statement(submitter="A. Tester", citation="Tester, Trivial rows, 2026")
-    plain, _ = submit(results, home / "plain", statement)
-    full, _ = submit(
+    plain = submit(results, home / "plain", statement)
+    full = submit(
         results, home / "full", statement, detectors="persistence", scores=True, split=split
     )
-    return Submissions(split, results, plain, full)
+    return Submissions(split, results, plain.place, full.place)
 
 
 class Draft:
@@ -79,6 +80,16 @@ class Draft:
                     facts["sha256"] = hashlib.sha256(content).hexdigest()
                     facts["bytes"] = len(content)
         self.file("entry.json").write_text(json.dumps(self.entry))
+
+    def packed(self, name, content=None):
+        """Replace a file by its packed form, or by other bytes under that name."""
+        file = self.file(name)
+        content = pack(file.read_bytes()) if content is None else content
+        file.unlink()
+        file.with_name(f"{name}.gz").write_bytes(content)
+        del self.entry["files"][name]
+        self.entry["files"][f"{name}.gz"] = {}
+        self.seal()
 
     def consistent(self, index, name):
         """Make value, n and interval of a metric what its changed terms give."""

@@ -13,7 +13,7 @@ from helpers_submission import Draft
 
 from oodd_eval import cli
 from oodd_eval.submission.format import read_entries
-from oodd_eval.submission.submit import run_command
+from oodd_eval.submission.selecting import run_command
 
 
 def submit(submissions, root, *options):
@@ -66,7 +66,7 @@ def test_the_command_names_parameters_and_splits_unlike_runs(submissions):
     assert first.endswith(
         "--detector persistence --env cartpole --split small --horizon 1 --seed 0"
     )
-    assert second.endswith("--param width=3 --param 'kind=a b'")
+    assert second.endswith("--param 'kind=a b' --param width=3")
 
 
 def test_an_existing_entry_is_never_overwritten(submissions, tmp_path, capsys):
@@ -104,18 +104,19 @@ def test_an_id_is_a_plain_name(submissions, tmp_path, name, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_trust_levels_that_can_be_claimed(submissions, tmp_path, capsys):
+def test_re_scored_is_claimed_with_scores_alone(submissions, tmp_path, capsys):
     claim = ("--detector", "random", "--trust")
     assert submit(submissions, tmp_path, *claim, "re-scored") == 1
     assert "trust: is 're-scored', but scores are not there" in capsys.readouterr().out
     assert submit(submissions, tmp_path, *claim, "re-scored", "--scores", "--id", "a") == 0
-    shutil.rmtree(tmp_path / "a")
-    assert submit(submissions, tmp_path, *claim, "re-run", "--id", "b") == 1
-    assert "rerun: is null" in capsys.readouterr().out
-    by = ("--rerun-by", "the maintainers", "--rerun-how", "seed base 17")
-    assert submit(submissions, tmp_path, *claim, "re-run", "--id", "b", *by) == 0
     (entry,) = read_entries(tmp_path)
-    assert entry.meta.rerun == {"by": "the maintainers", "how": "seed base 17"}
+    assert entry.meta.trust == "re-scored"
+    assert "trust level established here: re-scored" in capsys.readouterr().out
+
+
+def test_nobody_grants_their_own_submission_a_run_again(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--trust", "re-run") == 4
+    assert "invalid choice: 're-run'" in capsys.readouterr().err
 
 
 def test_limited_results_are_no_entry(submissions, tmp_path, capsys):

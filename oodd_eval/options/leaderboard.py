@@ -38,6 +38,10 @@ def _add_verify(actions: Commands[Parser]) -> None:
     add = verify.add_argument
     add("paths", nargs="+", metavar="PATH", help="an entry, or a directory of entries")
     add("--split", metavar="PATH", help="where the split is, if not at its usual place")
+    add("--rerun", metavar="DIR",
+        help="results of a run of your own, to compare the entry with (for one entry)")  # fmt: skip
+    add("--grant", default="", metavar="NAME",
+        help="write the trust level that was reached into the entry, in this name")  # fmt: skip
 
 
 def _add_submit(actions: Commands[Parser]) -> None:
@@ -45,10 +49,15 @@ def _add_submit(actions: Commands[Parser]) -> None:
         actions, "submit", "leaderboard:submit", "write an entry from a results directory"
     )
     add = submit.add_argument
-    add("directory", metavar="DIR", help="results directory, written by oodd-eval run")
+    add("directory", metavar="DIR",
+        help="results directory, written by oodd-eval run or reproduce")  # fmt: skip
     add("--results", default=RESULTS, metavar="RESULTS_DIR",
         help=f"directory of the entries (default: {RESULTS})")  # fmt: skip
     add("--detector", default="all", metavar="NAMES", help=f"{NAMES} (default: all)")
+    add("-k", dest="expression", default="", metavar="EXPR",
+        help="only cells whose id contains this; and, or, not")  # fmt: skip
+    add("--complete", action="store_true",
+        help="leave out those seeds of a row that lack cells which others have")  # fmt: skip
     add("--id", metavar="ID", help="name of the entry's directory (default: detectors and split)")
     add("--title", default="", metavar="TEXT", help="one line, shown on the board")
     add("--submitter", default="", metavar="TEXT", help="who stands behind the results")
@@ -59,8 +68,8 @@ def _add_submit(actions: Commands[Parser]) -> None:
     add("--scores", action="store_true",
         help="include every score, so that others can recompute the metrics")  # fmt: skip
     add("--split", metavar="PATH", help="where the split is, if not at its usual place")
-    add("--trust", default="reported", choices=("reported", "re-scored", "re-run"),
-        help="trust level to claim (default: reported)")  # fmt: skip
-    add("--rerun-by", default="", metavar="TEXT", help="for re-run: who ran it again")
-    add("--rerun-how", default="", metavar="TEXT",
-        help="for re-run: on what, such as split and digest of fresh seeds")  # fmt: skip
+    add("--trust", default="reported", choices=("reported", "re-scored"),
+        help="trust level to claim; re-scored needs --scores (default: reported)")  # fmt: skip
+    add("--curves", default="rows", choices=("rows", "detectors", "none"),
+        help="curves and examples for the site: of every row, of each detector's plainest row, "
+        "or none (default: rows)")  # fmt: skip

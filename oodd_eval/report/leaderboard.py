@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-from oodd_eval.benchmark import SPLITS
 from oodd_eval.errors import ResultsError
 from oodd_eval.records import Record
 from oodd_eval.report.board import Entry, boards, entry_of
 from oodd_eval.report.standings import RankedBoard, ranked
+from oodd_eval.submission.cells import PLACE
 from oodd_eval.submission.format import TRUST, SubmittedEntry
 
-_SPLITS_FIRST: Final = ("standard", *(name for name in SPLITS if name != "standard"))
-"""Order of the boards: the standard split is the leaderboard's."""
+_SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
+"""Order of the boards: the leaderboard's own split, then from the most data to the least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     """Sort entries into boards of one split digest, protocol and limit each.
 
     Several entries may have records in one row (further seeds or environments of a detector) as
-    long as they are results of the same thing: the same plug-in, version and parameters.
+    long as they are results of the same thing: the same plug-in, version, source and parameters.
 
     Parameters
     ----------
@@ -72,13 +72,15 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     """
     by_id = sorted(entries, key=lambda entry: entry.meta.id)
     owner: dict[int, SubmittedEntry] = {}
-    cells: dict[tuple[str, ...], SubmittedEntry] = {}
+    cells: dict[tuple[object, ...], SubmittedEntry] = {}
+    records: list[Record] = []
     for entry in by_id:
-        for record in entry.records:
+        for record in map(_anywhere, entry.records):
             _refuse_twice(record, entry, cells)
             owner[id(record)] = entry
+            records.append(record)
     found = []
-    for board in boards([record for entry in by_id for record in entry.records]):
+    for board in boards(records):
         _refuse_mixtures(board.records, owner)
         own = {owner[id(r)].meta.id: owner[id(r)] for r in board.records}
         rows: dict[Entry, dict[str, SubmittedEntry]] = {}
@@ -101,20 +103,43 @@ def _place(section: LeaderboardSection) -> tuple[int, str, int, int, str]:
     return known, name, limit, -board.protocol, board.digest
 
 
+def _anywhere(record: Record) -> Record:
+    """Return a record without the parameter that says where it was computed.
+
+    Seeds that ran on a processor and on an accelerator belong to one row.
+    """
+    if PLACE not in record.parameters:
+        return record
+    overrides = record.provenance.get("overrides", {})
+    return replace(
+        record,
+        parameters={k: v for k, v in record.parameters.items() if k != PLACE},
+        provenance=record.provenance
+        | {"overrides": {k: v for k, v in overrides.items() if k != PLACE}},
+    )
+
+
 def _refuse_twice(
-    record: Record, entry: SubmittedEntry, cells: dict[tuple[str, ...], SubmittedEntry]
+    record: Record, entry: SubmittedEntry, cells: dict[tuple[object, ...], SubmittedEntry]
 ) -> None:
-    other = cells.setdefault(record.identity, entry)
-    if other is not entry:
+    conditions = record.split_digest, record.protocol, record.provenance.get("limit")
+    place = record.environment, record.anomaly, record.seed
+    key = (entry_of(record), *place, *conditions)
+    if (other := cells.get(key)) is not None:
         raise ResultsError(
             f"entries {other.meta.id!r} and {entry.meta.id!r} both hold {record.cell} of split "
             f"digest {record.split_digest[:12]}, expected one: remove the entry that is replaced, "
             "or give the detector another name"
         )
+    cells[key] = entry
+
+
+def _source(record: Record) -> str:
+    return str(record.provenance.get("plugin_source", ""))[:12]
 
 
 def _refuse_mixtures(records: Sequence[Record], owner: Mapping[int, SubmittedEntry]) -> None:
-    """Refuse rows whose records are not of one plug-in, version and set of parameters."""
+    """Refuse rows whose records are not of one plug-in, version, source and parameters."""
     first: dict[Entry, Record] = {}
     for record in records:
         row = entry_of(record)
@@ -122,6 +147,7 @@ def _refuse_mixtures(records: Sequence[Record], owner: Mapping[int, SubmittedEnt
         for what, its, other in (
             ("plug-in", one.plugin, record.plugin),
             ("version", one.detector_version, record.detector_version),
+            ("source digest", _source(one), _source(record)),
             ("parameters", one.parameters, record.parameters),
         ):
             if its != other:

@@ -11,7 +11,7 @@ from oodd_eval.benchmark import PROTOCOL, SPLITS
 from oodd_eval.errors import ResultsError
 from oodd_eval.splits import published_digests
 from oodd_eval.submission import rules
-from oodd_eval.submission.files import MOST_BYTES, parse_json, read_bytes
+from oodd_eval.submission.files import parse_json, read_whole
 from oodd_eval.submission.findings import Findings, shown
 from oodd_eval.submission.format import ENTRY, SCHEMA, TRUST, Entry
 
@@ -31,7 +31,7 @@ FIELDS: Final[Mapping[str, rules.Rule]] = {
     "plugins": lambda value: "" if isinstance(value, list) else f"is {shown(value)}, not a list",
     "environment": rules.mapping,
     "created": rules.day,
-    "command": rules.text(4000),
+    "command": rules.command,
     "caption": rules.text(500),
     "files": rules.mapping,
 }
@@ -67,11 +67,7 @@ def check_entry(directory: Path, name: str, findings: Findings) -> Entry | None:
     """
     before = findings.count
     try:
-        text = read_bytes(directory / ENTRY, MOST_BYTES[ENTRY]).decode()
-        plain = parse_json(text)
-    except UnicodeDecodeError as error:
-        findings.refuse(ENTRY, "", f"is not UTF-8: {error.reason} at byte {error.start}")
-        return None
+        plain = parse_json(read_whole(directory, ENTRY))
     except ResultsError as error:
         findings.refuse(ENTRY, "", str(error))
         return None

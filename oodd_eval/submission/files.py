@@ -14,17 +14,25 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval import packed
 from oodd_eval.errors import ResultsError
 from oodd_eval.results import RECORDS
 from oodd_eval.submission.findings import Findings, shown
 from oodd_eval.submission.format import CURVES, ENTRY, SCORES
 
 MB: Final = 10**6
-MOST_BYTES: Final = {ENTRY: MB // 4, RECORDS: 64 * MB, CURVES: 16 * MB}
+MOST_PLAIN: Final = {RECORDS: packed.MOST, CURVES: 16 * MB}
+"""Largest sizes of files that may be packed, unpacked."""
+
+MOST_BYTES: Final = {
+    ENTRY: MB // 4,
+    **MOST_PLAIN,
+    **{name + packed.ENDING: 8 * MB for name in MOST_PLAIN},
+}
 """Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""
 
 MOST_SCORE_BYTES: Final = 64 * MB
-MOST_TOTAL_BYTES: Final = 512 * MB
+MOST_TOTAL_BYTES: Final = 128 * MB
 MOST_FILES: Final = 2000
 
 _SCORE_FILE: Final = re.compile(rf"{SCORES}/[a-z0-9][a-z0-9._-]{{0,159}}\.h5")
@@ -49,10 +57,38 @@ def list_files(entry: Path, findings: Findings) -> dict[str, int]:
             "files", "total size", f"is {total} bytes, expected at most {MOST_TOTAL_BYTES}"
         )
         return {}
+    for name in MOST_PLAIN:
+        if name in listed and name + packed.ENDING in listed:
+            findings.refuse(
+                name + packed.ENDING, "", f"is there beside {name}: expected one of the two"
+            )
     for name in (ENTRY, RECORDS):
-        if name not in listed:
+        if not {name, name + packed.ENDING} & listed.keys():
             findings.refuse(name, "", "is missing")
     return found
+
+
+def name_in(files: Mapping[str, int], name: str) -> str:
+    """Return the name under which a file is there, plain or packed; empty if it is not."""
+    return next((n for n in (name, name + packed.ENDING) if n in files), "")
+
+
+def read_whole(entry: Path, name: str) -> str:
+    """Read a text file of an entry, unpacked if its name says that it is packed.
+
+    Raises
+    ------
+    ResultsError
+        When it is too large, no plain file, not packed as it should be, or not UTF-8.
+    """
+    content = read_bytes(entry / name, MOST_BYTES[name])
+    if name.endswith(packed.ENDING):
+        content = packed.unpack(content, MOST_PLAIN[name.removesuffix(packed.ENDING)])
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ResultsError(f"is not UTF-8: {error.reason} in line {line}") from None
 
 
 def _scan(directory: Path, prefix: str, findings: Findings) -> dict[str, os.stat_result]:

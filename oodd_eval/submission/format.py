@@ -7,6 +7,8 @@
     curves.json      illustrations computed from the scores (optional)
     scores/*.h5      every score, as in a results directory (optional)
 
+Records or curves of more than a megabyte are packed: ``records.jsonl.gz``, ``curves.json.gz``.
+
 Reading here is for entries that were verified (`oodd_eval.submission.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.
 """
@@ -18,6 +20,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval import packed
 from oodd_eval.errors import ResultsError
 from oodd_eval.records import Record
 from oodd_eval.results import RECORDS, ResultsDirectory
@@ -125,8 +128,7 @@ class SubmittedEntry:
     @property
     def curves(self) -> Path | None:
         """The file of curves; None when the entry has none."""
-        path = self.path / CURVES
-        return path if path.is_file() else None
+        return packed.find(self.path / CURVES)
 
     @property
     def results(self) -> ResultsDirectory:

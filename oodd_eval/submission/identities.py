@@ -27,7 +27,7 @@ TOLERANCE: Final = 1e-9
 SUFFIXES: Final = ("", *(f"_{suffix}" for suffix in TARGETS))
 """Of the metrics under the standard alarm rule, and under each calibrated one."""
 
-_weights = functools.lru_cache(maxsize=16)(bootstrap_weights)
+_weights = functools.lru_cache(maxsize=8)(bootstrap_weights)
 
 Refuse = Callable[[str, str], None]
 """Takes the name of a field and what is wrong with it."""

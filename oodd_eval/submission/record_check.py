@@ -10,14 +10,13 @@ from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
 from oodd_eval.errors import ResultsError
 from oodd_eval.plan import Plan, Unit
 from oodd_eval.records import SCHEMA, STATUSES, Record
-from oodd_eval.results import RECORDS
 from oodd_eval.submission import rules
-from oodd_eval.submission.files import MB, MOST_BYTES, parse_json, read_bytes
+from oodd_eval.submission.files import MB, parse_json, read_whole
 from oodd_eval.submission.findings import Findings, shown
 
 MOST_RECORDS: Final = 20_000
 MOST_LINE: Final = 4 * MB
-MOST_TEST: Final = 5_000
+MOST_TEST: Final = 2_000
 """Largest number of test trajectories: with more, recomputing the intervals takes too much room."""
 
 _FIELDS: Final[Mapping[str, rules.Rule]] = {
@@ -66,37 +65,46 @@ _PROVENANCE: Final[Mapping[str, rules.Rule]] = {
         f"is {shown(value)}, expected null: an entry uses all trajectories of its split",
     "overrides": rules.mapping,
 }  # fmt: skip
-"""Fields of the provenance that something depends on; others are held to be plain."""
+"""Fields of the provenance that every record has and something depends on."""
+
+_OPTIONAL: Final[Mapping[str, rules.Rule]] = {
+    "inputs": rules.one_of(["observations", "observations+actions"]),
+    "steps_scored": rules.whole(0),
+}
+"""Fields of the provenance that are shown where they are there; all others are held to be plain."""
 
 
-def read_records(directory: Path, findings: Findings) -> dict[str, Record]:
-    """Read ``records.jsonl`` and check every field.
+def read_records(directory: Path, name: str, findings: Findings) -> dict[str, Record]:
+    """Read the records of an entry and check every field.
+
+    Parameters
+    ----------
+    directory
+        Of the entry.
+    name
+        Of the file: ``records.jsonl``, or its packed form.
 
     Returns
     -------
     The records whose fields are sound, by where they stand: ``records.jsonl:3 (<cell>)``.
     """
     try:
-        content = read_bytes(directory / RECORDS, MOST_BYTES[RECORDS]).decode()
-    except UnicodeDecodeError as error:
-        number = error.object[: error.start].count(b"\n") + 1
-        findings.refuse(f"{RECORDS}:{number}", "", f"is not UTF-8: {error.reason}")
-        return {}
+        content = read_whole(directory, name)
     except ResultsError as error:
-        findings.refuse(RECORDS, "", str(error))
+        findings.refuse(name, "", str(error))
         return {}
     *lines, rest = content.split("\n")
     if rest:
         lines.append(rest)
         findings.refuse(
-            f"{RECORDS}:{len(lines)}", "", "does not end with a new line: the file is cut off"
+            f"{name}:{len(lines)}", "", "does not end with a new line: the file is cut off"
         )
     if not lines or len(lines) > MOST_RECORDS:
-        findings.refuse(RECORDS, "", f"has {len(lines)} records, expected 1 to {MOST_RECORDS}")
+        findings.refuse(name, "", f"has {len(lines)} records, expected 1 to {MOST_RECORDS}")
         return {}
     found = {}
     for number, line in enumerate(lines, start=1):
-        where = f"{RECORDS}:{number}"
+        where = f"{name}:{number}"
         record = _read_record(line, where, findings)
         if record is not None:
             found[f"{where} ({record.cell})"] = record
@@ -143,9 +151,10 @@ def _check_parts(plain: Mapping[str, Any], findings: Findings, where: str) -> No
         if complaint := rules.parameter_name(name) or rules.plain(value):
             findings.refuse(where, f"parameters.{shown(name)[1:-1]}", complaint)
     provenance = part("provenance")
-    known = {name: value for name, value in provenance.items() if name in _PROVENANCE}
+    expected = {**_PROVENANCE, **{n: r for n, r in _OPTIONAL.items() if n in provenance}}
+    known = {name: value for name, value in provenance.items() if name in expected}
     if provenance or "provenance" in plain:
-        rules.check_fields(known, _PROVENANCE, findings, where, "provenance.")
+        rules.check_fields(known, expected, findings, where, "provenance.")
     for name, value in provenance.items():
         if complaint := rules.name(name) or rules.plain(value):
             findings.refuse(where, f"provenance.{shown(name)[1:-1]}", complaint)

@@ -100,8 +100,11 @@ def check_recomputed_curves(
     findings: Findings,
 ) -> None:  # fmt: skip
     """Recompute an entry's curves from its scores and compare."""
+    drawn = {unit["cell"] for unit in curves["units"]}
     try:
-        fresh = make_curves(records, ResultsDirectory(directory), split)
+        fresh = make_curves(
+            [r for r in records if r.cell in drawn], ResultsDirectory(directory), split
+        )  # fmt: skip
     except ResultsError as error:
         findings.refuse(CURVES, "", f"cannot be computed again: {error}")
         return

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Collection, Mapping
 from datetime import date
 from typing import Any, Final
@@ -82,6 +83,29 @@ def text(longest: int, *, least: int = 0) -> Rule:
         return ""
 
     return rule
+
+
+_line = text(4000)
+
+
+def command(value: Any) -> str:
+    """Complain of what is not commands of oodd-eval joined by ``&&``, or nothing.
+
+    Whoever re-runs an entry may paste its command into a shell, so that nothing else may be in it:
+    no other program, and no character that a shell would act on.
+    """
+    if complaint := _line(value):
+        return complaint
+    for part in value.split(" && ") if value else ():
+        try:
+            words = shlex.split(part)
+        except ValueError:
+            words = []
+        if words[:2] not in (["oodd-eval", "run"], ["oodd-eval", "reproduce"]):
+            return f"is {shown(part)}, expected oodd-eval run or oodd-eval reproduce"
+        if shlex.join(words) != part:
+            return f"is {shown(part)}, expected plain words, quoted as {shown(shlex.join(words))}"
+    return ""
 
 
 def one_of(known: Collection[Any]) -> Rule:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 import re
-import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,20 +17,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval import packed
 from oodd_eval.curves import make_curves, write_curves
 from oodd_eval.errors import OutputError, SplitError, UnknownNameError, UsageError
 from oodd_eval.records import Record
 from oodd_eval.results import RECORDS, ResultsDirectory
-from oodd_eval.selection import select
 from oodd_eval.splits import Split, load_split
 from oodd_eval.submission import rules
-from oodd_eval.submission.cells import joined, setting_of
+from oodd_eval.submission.cells import joined
+from oodd_eval.submission.curves_check import Extent, with_curves
 from oodd_eval.submission.findings import Findings
 from oodd_eval.submission.format import CURVES, ENTRY, SCORES, Entry, read_entries
+from oodd_eval.submission.selecting import made_with, selected
 from oodd_eval.submission.verify import Seen, Verdict, check_clashes, verify_entry
 
-LONGEST_COMMAND: Final = 4000
+LARGE: Final = 10 * 10**6
+"""Bytes beyond which an entry is said to be large: a repository keeps every version of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class Statement:
         Empty for one made of detectors and split.
     submitter, citation, url, caption
         See `oodd_eval.submission.format.Entry`.
-    trust, rerun
-        Level of trust that is claimed, and for ``"re-run"`` by whom and how.
+    trust
+        Level of trust that is claimed: ``"reported"``, or ``"re-scored"`` with the scores.
     """
 
     id: str = ""
@@ -58,7 +58,28 @@ class Statement:
     url: str = ""
     caption: str = ""
     trust: str = "reported"
-    rerun: dict[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """What became of a submission.
+
+    Attributes
+    ----------
+    place
+        Of the entry.
+    verdict
+        What verification found; when it found a problem, nothing is left at `place`.
+    left_out
+        A line for each seed of a row that was left out as incomplete.
+    size
+        Bytes of the entry.
+    """
+
+    place: Path
+    verdict: Verdict
+    left_out: list[str]
+    size: int
 
 
 def submit(
@@ -67,9 +88,12 @@ def submit(
     statement: Statement,
     *,
     detectors: str = "all",
+    cells: str = "",
+    complete: bool = False,
     scores: bool = False,
+    curves: Extent = "rows",
     split: str | Path | None = None,
-) -> tuple[Path, Verdict]:
+) -> Submission:
     """Write an entry, verify what was written, and move it to its place.
 
     Parameters
@@ -82,16 +106,15 @@ def submit(
         What its submitter says.
     detectors
         Names of the detectors to submit: comma lists, globs or ``"all"``.
+    cells, complete
+        See `oodd_eval.submission.selecting.selected`.
     scores
         Whether to include every score.
+    curves
+        Of which rows, see `oodd_eval.submission.curves_check.with_curves`.
     split
         Name or path of the split; default: where splits usually are. Without the split the entry
         has no curves.
-
-    Returns
-    -------
-    The place of the entry, and what verification found. When it found a problem, nothing is left
-    there.
 
     Raises
     ------
@@ -103,9 +126,9 @@ def submit(
         When the entry cannot be written.
     """
     source, root = ResultsDirectory(results), Path(root)
-    records = _selected(source.records(), detectors)
+    records, left_out = selected(source.records(), detectors, cells, complete=complete)
     _require_one_split(records)
-    entry = _entry(records, statement)
+    entry = _entry(records, statement, made_with(source.path, records))
     place = root / entry.id
     if os.path.lexists(place):
         raise UsageError(
@@ -115,41 +138,23 @@ def submit(
     with _written(place) as directory:
         text = "".join(record.to_json() + "\n" for record in records)
         (directory / RECORDS).write_text(text, encoding="utf-8")
+        packed.shrink(directory / RECORDS)
         opened = _split(records[0], split)
-        ok = [record for record in records if record.ok]
-        if opened is not None and ok:
-            write_curves(make_curves(ok, source, opened), directory / CURVES)
+        drawn = with_curves(records, curves)
+        if opened is not None and drawn:
+            write_curves(make_curves(drawn, source, opened), directory / CURVES)
+            packed.shrink(directory / CURVES)
         if scores:
-            _copy_scores(ok, source, directory)
+            _copy_scores([record for record in records if record.ok], source, directory)
         entry = replace(entry, files=_facts(directory))
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
             _check_clashes(verdict, root)
+        size = sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
         if verdict.ok:
             directory.rename(place)
-    return place, verdict
-
-
-def _selected(records: Sequence[Record], detectors: str) -> list[Record]:
-    """Return the records of some detectors, fit to be published, in the order of the board."""
-    if not records:
-        raise UsageError("these results have no records: expected those of a finished run")
-    names = select("detector of these results", detectors, sorted({r.detector for r in records}))
-    environments, anomalies = list(ENVIRONMENTS), list(ANOMALIES)
-    chosen = [replace(r, reason=_plain(r.reason)) for r in records if r.detector in names]
-    return sorted(
-        chosen,
-        key=lambda r: (
-            setting_of(r), environments.index(r.environment), anomalies.index(r.anomaly)
-        ),
-    )  # fmt: skip
-
-
-def _plain(reason: str) -> str:
-    """Return a reason without markup and control characters: exceptions may say anything."""
-    printable = "".join(c if c.isprintable() else " " for c in reason)
-    return printable.replace("<", "(").replace(">", ")").replace("](", "] (")[:1000]
+    return Submission(place, verdict, left_out, size)
 
 
 def _require_one_split(records: Sequence[Record]) -> None:
@@ -184,7 +189,7 @@ def _split(record: Record, place: str | Path | None) -> Split | None:
     return split if split.digest == record.split_digest else None
 
 
-def _entry(records: Sequence[Record], statement: Statement) -> Entry:
+def _entry(records: Sequence[Record], statement: Statement, command: str) -> Entry:
     """Return ``entry.json`` without its files."""
     first = records[0]
     detectors = sorted({r.detector for r in records})
@@ -212,9 +217,8 @@ def _entry(records: Sequence[Record], statement: Statement) -> Entry:
         plugins=_plugins(records),
         environment=_environment(records),
         created=datetime.now(UTC).date().isoformat(),
-        command=run_command(records),
+        command=command,
         caption=statement.caption,
-        rerun=statement.rerun,
     )
 
 
@@ -272,43 +276,6 @@ def _dependencies(distribution: str) -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return found
-
-
-def run_command(records: Sequence[Record]) -> str:
-    """Return the commands that make such records, joined by ``&&``.
-
-    Examples
-    --------
-    >>> run_command([])
-    ''
-    """
-    groups: dict[tuple[Any, ...], list[Record]] = {}
-    for record in records:
-        overrides = record.provenance.get("overrides", {})
-        key = (record.detector, tuple(sorted((k, repr(v)) for k, v in overrides.items())))
-        groups.setdefault(key, []).append(record)
-    # Detectors that are run alike share a command.
-    alike: dict[tuple[str, ...], list[str]] = {}
-    for (detector, _), own in groups.items():
-        alike.setdefault(_options(own), []).append(detector)
-    commands = [
-        shlex.join(["oodd-eval", "run", "--detector", ",".join(detectors), *options])
-        for options, detectors in alike.items()
-    ]
-    return " && ".join(commands)[:LONGEST_COMMAND]
-
-
-def _options(records: Sequence[Record]) -> tuple[str, ...]:
-    environments = [e for e in ENVIRONMENTS if any(r.environment == e for r in records)]
-    overrides = records[0].provenance.get("overrides", {})
-    texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in overrides.items()}
-    return (
-        "--env", "all" if len(environments) == len(ENVIRONMENTS) else ",".join(environments),
-        "--split", records[0].split.partition("@")[0],
-        "--horizon", ",".join(str(h) for h in sorted({r.horizon for r in records})),
-        "--seed", ",".join(str(s) for s in sorted({r.seed for r in records})),
-        *(word for k, v in texts.items() for word in ("--param", f"{k}={v}")),
-    )  # fmt: skip
 
 
 def _copy_scores(records: Iterable[Record], source: ResultsDirectory, directory: Path) -> None:

@@ -9,22 +9,24 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from oodd_eval.curves_format import check_curves
-from oodd_eval.errors import ResultsError
+from oodd_eval import packed
+from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.records import Record
 from oodd_eval.results import RECORDS
 from oodd_eval.submission.cells import Records, check_cells
+from oodd_eval.submission.curves_check import read_curves
 from oodd_eval.submission.entry_check import check_entry
-from oodd_eval.submission.files import MOST_BYTES, check_digests, list_files, parse_json, read_bytes
+from oodd_eval.submission.files import check_digests, list_files, name_in
 from oodd_eval.submission.findings import Findings, shown
 from oodd_eval.submission.format import CURVES, ENTRY, SCORES, TRUST, Entry
 from oodd_eval.submission.identities import check_identities
 from oodd_eval.submission.record_check import read_records
+from oodd_eval.submission.rerun import Rerun, compare_rerun
 from oodd_eval.submission.rescoring import check_recomputed_curves, check_rescored
 from oodd_eval.submission.score_check import check_scores
 from oodd_eval.submission.trajectories import check_against_split, find_split, read_facts
@@ -53,6 +55,8 @@ class Verdict:
         Sound records by where they stand.
     rescored
         Whether every metric was recomputed from the scores and agrees.
+    rerun
+        What the comparison with a run again came to; None without one.
     """
 
     name: str
@@ -60,14 +64,30 @@ class Verdict:
     entry: Entry | None = None
     records: Records | None = None
     rescored: bool = False
+    rerun: Rerun | None = None
 
     @property
     def ok(self) -> bool:
         """Whether nothing speaks against the entry."""
         return not self.findings.count
 
+    @property
+    def reached(self) -> str:
+        """The level of trust that was established here; empty for an entry that is refused."""
+        if not self.ok:
+            return ""
+        if self.rerun is not None and self.rerun.confirmed:
+            return "re-run"
+        return "re-scored" if self.rescored else "reported"
 
-def verify_entry(directory: Path, *, name: str = "", split: str | Path | None = None) -> Verdict:
+
+def verify_entry(
+    directory: Path,
+    *,
+    name: str = "",
+    split: str | Path | None = None,
+    rerun: Sequence[Record] = (),
+) -> Verdict:
     """Check one entry.
 
     Parameters
@@ -78,6 +98,8 @@ def verify_entry(directory: Path, *, name: str = "", split: str | Path | None = 
         What the directory is going to be called; default: as it is called now.
     split
         Name or path of the split; default: where splits usually are.
+    rerun
+        Records of a run that the verifier made, to compare the entry's with.
 
     Raises
     ------
@@ -93,14 +115,15 @@ def verify_entry(directory: Path, *, name: str = "", split: str | Path | None = 
     entry = check_entry(directory, name, findings) if ENTRY in files else None
     if entry is not None:
         check_digests(directory, files, entry.files, findings)
-    records = read_records(directory, findings) if RECORDS in files else {}
+    recorded, drawn = name_in(files, RECORDS), name_in(files, CURVES)
+    records = read_records(directory, recorded, findings) if recorded else {}
     for where, record in records.items():
         check_identities(record, findings, where)
     if entry is None or not records:
         return Verdict(name, findings, entry, records)
     check_cells(entry, records, findings)
     scored = check_scores(directory, files, records, findings)
-    curves = _read_curves(directory, records, findings) if CURVES in files else None
+    curves = read_curves(directory, drawn, records, findings) if drawn else None
     opened = find_split(entry, split, findings)
     rescored = False
     if opened is not None:
@@ -115,11 +138,16 @@ def verify_entry(directory: Path, *, name: str = "", split: str | Path | None = 
             check_recomputed_curves(curves, list(scored.values()), directory, opened, findings)
     complete = all(w in scored for w, r in records.items() if r.ok)
     rescored = rescored and complete and not findings.count
-    _judge_trust(entry, findings, complete=complete and bool(scored), rescored=rescored)
-    return Verdict(name, findings, entry, records, rescored)
+    again = compare_rerun(records, rerun, findings) if rerun else None
+    _judge_trust(
+        entry, findings, complete=complete and bool(scored), rescored=rescored, rerun=again
+    )  # fmt: skip
+    return Verdict(name, findings, entry, records, rescored, again)
 
 
-def _judge_trust(entry: Entry, findings: Findings, *, complete: bool, rescored: bool) -> None:
+def _judge_trust(
+    entry: Entry, findings: Findings, *, complete: bool, rescored: bool, rerun: Rerun | None
+) -> None:
     """Compare the trust level that an entry claims with what could be established."""
     if entry.trust == "re-scored" and not complete:
         findings.refuse(
@@ -129,61 +157,22 @@ def _judge_trust(entry: Entry, findings: Findings, *, complete: bool, rescored: 
         )  # fmt: skip
     elif entry.trust == "re-scored" and not rescored and not findings.count:
         findings.note("trust 're-scored' could not be confirmed here")
-    elif entry.trust == "reported" and rescored:
+    elif entry.trust == "re-run" and entry.rerun is not None and rerun is None:
+        findings.note(
+            f"trust 're-run' is what the entry says (by {entry.rerun['by']}: "
+            f"{entry.rerun['how']}); nothing here confirms it without a run of yours (--rerun)"
+        )
+    if entry.trust == "reported" and rescored:
         findings.note("every metric was recomputed from the scores: qualifies for 're-scored'")
-
-
-def _read_curves(directory: Path, records: Records, findings: Findings) -> dict[str, Any] | None:
-    """Read and check ``curves.json``; None when it is not sound."""
-    before = findings.count
-    try:
-        plain = parse_json(read_bytes(directory / CURVES, MOST_BYTES[CURVES]).decode())
-    except UnicodeDecodeError as error:
-        findings.refuse(CURVES, "", f"is not UTF-8: {error.reason} at byte {error.start}")
-        return None
-    except ResultsError as error:
-        findings.refuse(CURVES, "", str(error))
-        return None
-    try:
-        curves = check_curves(plain, CURVES)
-    except ResultsError as error:
-        # Its messages begin with the place: "curves.json: units[0].seed is False, ...".
-        place, _, message = str(error).removeprefix(f"{CURVES}: ").partition(" ")
-        findings.refuse(CURVES, place.removeprefix(CURVES).rstrip(":"), message)
-        return None
-    known = {record.cell: record for record in records.values() if record.ok}
-    for i, unit in enumerate(curves["units"]):
-        record = known.pop(unit["cell"], None)
-        if record is None:
-            findings.refuse(
-                CURVES, f"units[{i}].cell", f"is {shown(unit['cell'])}, which no record is of"
-            )
-            continue
-        for field, value in _identity(record).items():
-            if unit[field] != value:
-                findings.refuse(
-                    CURVES, f"units[{i}].{field}",
-                    f"is {shown(unit[field])}, but {shown(value)} in the record of its cell",
-                )  # fmt: skip
-        if unit["example"]["index"] >= record.counts["test"]:
-            findings.refuse(CURVES, f"units[{i}].example.index", "is no test trajectory")
-    for cell in known:
-        findings.refuse(CURVES, "units", f"lack {cell}: curves are of all evaluated cells")
-    return curves if findings.count == before else None
-
-
-def _identity(record: Record) -> dict[str, Any]:
-    names = ("detector", "horizon", "seed", "environment", "anomaly")
-    return {
-        **{name: getattr(record, name) for name in names},
-        "overrides": record.provenance["overrides"],
-    }
+    if entry.trust != "re-run" and rerun is not None and rerun.confirmed and not findings.count:
+        findings.note("the run again agrees: qualifies for 're-run'")
 
 
 def verify(
     path: Path | str,
     *,
     split: str | Path | None = None,
+    rerun: Sequence[Record] = (),
     progress: Callable[[Verdict], None] | None = None,
 ) -> list[Verdict]:
     """Check an entry, or all entries of a directory and that no two of them clash.
@@ -194,6 +183,8 @@ def verify(
         An entry, or a directory with entries.
     split
         Name or path of the split; default: where splits usually are.
+    rerun
+        Records of a run that the verifier made; for a single entry only.
     progress
         Called with each verdict as soon as it is known.
 
@@ -206,6 +197,8 @@ def verify(
     ------
     ResultsError
         When there is no directory at `path`.
+    UsageError
+        When `rerun` is given and `path` holds no single entry.
     OoddError
         When `split` is given and holds no split.
     """
@@ -219,9 +212,11 @@ def verify(
         if progress is not None:
             progress(verdict)
 
-    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS)):
-        add(verify_entry(path, split=split))
+    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + packed.ENDING)):
+        add(verify_entry(path, split=split, rerun=rerun))
         return verdicts
+    if rerun:
+        raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")
     stray = Findings()
     seen: Seen = {}
     for child in sorted(path.iterdir()):
