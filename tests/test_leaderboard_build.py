@@ -20,6 +20,7 @@ from oodd_eval.report.leaderboard import sections
 from oodd_eval.report.leaderboard_page import page
 from oodd_eval.report.standings import cost_of, ranked
 from oodd_eval.report.tables import UNDEFINED
+from oodd_eval.splits import published_digests
 from oodd_eval.submission.format import Entry, SubmittedEntry
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -302,6 +303,83 @@ def test_the_standard_split_comes_first():
     assert [s.ranks.board.split for s in found] == ["standard", "mini"]
 
 
+def test_other_splits_follow_from_the_most_data_to_the_least():
+    names = ("mini", "another", "reduced", "standard", "paper")
+    submitted = [
+        entry(name, [dataclasses.replace(record("riqn", [0.6] * SEEDS, digest=f"{i}e" * 32),
+                                         split=name)])
+        for i, name in enumerate(names)
+    ]  # fmt: skip
+    assert [s.ranks.board.split for s in sections(submitted)] == [
+        "standard", "paper", "reduced", "mini", "another"
+    ]  # fmt: skip
+
+
+def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone():
+    digests = published_digests()
+
+    def words(split, digest):
+        own = [dataclasses.replace(record("riqn", [0.6] * SEEDS, digest=digest), split=split)]
+        return page(sections([entry("one", own)]))
+
+    reduced = words("reduced", digests["reduced"])
+    assert "**Reduced tier.** Per environment 500 training and 50 calibration trajectories, " in (
+        reduced
+    )  # fmt: skip
+    assert "20 test seeds" in reduced
+    assert "the numbers are not those of standard" in reduced
+    mini = words("mini", digests["mini"])
+    assert "**Trial tier.** Per environment 40 training and 20 calibration" in mini
+    assert "episodes of at most 300 steps" in mini
+    standard = words("standard", digests["standard"])
+    assert "own split.** Per environment 500 training and 100 calibration trajectories" in standard
+    assert "**Not a published split.**" in words("standard", digests["mini"])
+    assert "**Not a published split.** mini@12345678 was" in words("mini@12345678", "12" * 32)
+
+
+def test_several_boards_are_listed_with_links_to_their_headings():
+    text = page(sections(entries()))
+    assert "- [Split mini, protocol 1](#split-mini-protocol-1), digest abababababab: 5 rows" in text
+    assert "](#split-mini-protocol-1-1), digest cdcdcdcdcdcd: 2 rows" in text
+    assert "(#split" not in page(sections(entries()[:1]))
+
+
+def test_many_findings_are_folded_and_few_are_not():
+    learned = [record(f"net-{i}", [0.5 - i / 100] * SEEDS) for i in range(9)]
+    clock = dataclasses.replace(record("clock", [0.6] * SEEDS), plugin="oodd-eval:trivial")
+    text = page(sections([entry("all", [*learned, clock])]))
+    assert "<details><summary><b>9 times a simple row has a higher mean" in text
+    assert text.count("- clock beats net-") == 9
+    few = page(sections([entry("few", [*learned[:2], clock])]))
+    assert "<details>" not in few
+    assert few.count("**clock beats net-") == 2
+
+
+def test_wide_tables_hold_default_rows_and_the_rest_is_in_files():
+    rows = [record("riqn", [0.7] * SEEDS)]
+    rows += [record("riqn", [0.7] * SEEDS, overrides={"members": i}) for i in range(1, 13)]
+    text = page(sections([entry("many", rows)]))
+    (header,) = [line for line in text.splitlines() if line.startswith("| Environment")]
+    assert "members" not in header
+    assert "Win rates" not in text
+    only = page(sections([entry("one", rows[1:3])]))
+    assert "| Environment" not in only
+
+
+def test_seeds_from_a_processor_and_an_accelerator_make_one_row():
+    here = [record("riqn", [0.5] * SEEDS)]
+    there = [
+        dataclasses.replace(r, parameters=r.parameters | {"device": "cuda"})
+        for r in [record("riqn", [0.7] * SEEDS, seed=1, overrides={"device": "cuda"})]
+    ]
+    (section,) = sections([entry("here", here), entry("there", there)])
+    (standing,) = section.ranks.standings
+    assert (standing.entry.label, standing.seeds) == ("riqn", 2)
+    again = [dataclasses.replace(r, seed=0) for r in there]
+    with pytest.raises(ResultsError, match=r"'here' and 'there' both hold"):
+        sections([entry("here", here), entry("there", again)])
+
+
 def test_nothing_depends_on_the_order_of_entries_or_records():
     turned = [
         dataclasses.replace(e, records=list(reversed(e.records))) for e in reversed(entries())
@@ -321,7 +399,12 @@ def test_a_cell_in_two_entries_is_refused():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("plugin", "oodd-x:x"), ("detector_version", "2.0"), ("parameters", {"members": 9})],
+    [
+        ("plugin", "oodd-x:x"),
+        ("detector_version", "2.0"),
+        ("parameters", {"members": 9}),
+        ("provenance", {"plugin_source": "other", "overrides": {}}),
+    ],
 )
 def test_a_row_of_two_different_things_is_refused(field, value):
     one = record("riqn", [0.5] * SEEDS)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from typing import Final
 
-from oodd_eval.report import ranking_tables, tables
+from oodd_eval.benchmark import GROUPS
+from oodd_eval.report import ranking_tables, tables, tiers
+from oodd_eval.report.board import Board, entry_of
 from oodd_eval.report.leaderboard import LeaderboardSection
 from oodd_eval.report.markdown import escape, table
 from oodd_eval.report.tables import Table
@@ -29,6 +33,12 @@ hold 95 % intervals.
 _TABLES = ("ranking", "cells", "comparisons")
 """Kinds of CSV files of a section."""
 
+MANY: Final = 6
+"""Findings beyond which they are folded away."""
+
+WIDEST: Final = 12
+"""Rows beyond which the matrix of win rates is left to ``comparisons.csv``."""
+
 
 def table_file(section: LeaderboardSection, kind: str) -> str:
     """Return the relative name of a section's CSV file of a kind."""
@@ -49,16 +59,37 @@ def page(sections: Sequence[LeaderboardSection], *, site: str = "") -> str:
     parts = [_INTRODUCTION]
     if site:
         parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
+    parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
     parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
     return "\n".join(parts)
+
+
+def _contents(sections: Sequence[LeaderboardSection]) -> str:
+    """Return links to the boards; no two of them are to be compared."""
+    seen: Counter[str] = Counter()
+    lines = ["Boards, which are not to be compared with one another:", ""]
+    for section in sections:
+        title = _title(section.ranks.board)
+        # As GitHub makes addresses of headings, equal ones numbered.
+        slug = re.sub(r"[^a-z0-9 _-]", "", title.lower()).replace(" ", "-")
+        address = f"{slug}-{seen[slug]}" if seen[slug] else slug
+        seen[slug] += 1
+        rows = len(section.ranks.standings)
+        digest = section.ranks.board.digest[:12]
+        lines.append(f"- [{escape(title)}](#{address}), digest {digest}: {rows} rows")
+    return "\n".join([*lines, ""])
+
+
+def _title(board: Board) -> str:
+    limited = f", first {board.limit} trajectories of each part" if board.limit is not None else ""
+    return f"Split {board.split}, protocol {board.protocol}{limited}"
 
 
 def _section(section: LeaderboardSection) -> str:
     ranks = section.ranks
     board = ranks.board
     ok = sum(r.ok for r in board.records)
-    limited = f", first {board.limit} trajectories of each part" if board.limit is not None else ""
     files = ", ".join(f"[{kind}]({table_file(section, kind)})" for kind in _TABLES)
     size = (
         f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: "
@@ -67,16 +98,17 @@ def _section(section: LeaderboardSection) -> str:
     rendered = [
         ranking_tables.alarms(ranks),
         ranking_tables.cost(ranks),
-        *(tables.anomaly_groups(board, horizon) for horizon in board.horizons),
+        *_as_in_the_paper(board),
         tables.ranking(board),
         tables.all_metrics(board),
         tables.calibrated(board),
         ranking_tables.pooled(ranks),
-        ranking_tables.wins(ranks),
+        ranking_tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
         _failures(section),
     ]
     parts = [
-        f"## Split {escape(board.split)}, protocol {board.protocol}{limited}\n",
+        f"## {escape(_title(board))}\n",
+        f"{tiers.about(board)}\n",
         f"{size} As CSV: {files}.\n",
         *(
             f"> {escape(e.meta.id)}: {escape(e.meta.caption)}\n"
@@ -87,11 +119,35 @@ def _section(section: LeaderboardSection) -> str:
         _LEGEND,
         *(f"- {escape(line)}" for line in ranking_tables.notes(ranks)),
         "",
-        *(f"**{escape(sentence)}**\n" for sentence in tables.findings(board)),
+        *_findings(board),
         *(table(one) for one in rendered if one),
         *(f"- {escape(line)}" for line in tables.notes(board)),
     ]
     return "\n".join(parts) + "\n"
+
+
+def _findings(board: Board) -> list[str]:
+    """Return what simple rows beat, in bold; folded away where it is much."""
+    found = [escape(sentence) for sentence in tables.findings(board)]
+    if len(found) <= MANY:
+        return [f"**{sentence}**\n" for sentence in found]
+    summary = f"{len(found)} times a simple row has a higher mean than a learned one"
+    listed = [f"- {sentence}" for sentence in found]
+    return [f"<details><summary><b>{summary}</b></summary>\n", *listed, "\n</details>\n"]
+
+
+def _as_in_the_paper(board: Board) -> list[Table]:
+    """Return the layout of the paper's Table 5 for each horizon and group of anomalies.
+
+    It has a column per row of the board, so that it is kept to rows with default parameters.
+    """
+    plain = [entry for entry in board.entries if entry.overrides == "{}"]
+    records = [r for r in board.records if entry_of(r) in plain]
+    if not records:
+        return []
+    own = Board(records)
+    groups = [group for group in GROUPS if own.in_group(group)]
+    return [tables.anomaly_groups(own, h, [group]) for h in own.horizons for group in groups]
 
 
 def _failures(section: LeaderboardSection) -> Table | None:
@@ -116,7 +172,7 @@ def _entry(entry: SubmittedEntry) -> str:
     lines = [
         ("Detectors", ", ".join(sorted(meta.detectors))),
         ("Split", f"{meta.split}, digest {meta.split_digest[:12]}, protocol {meta.protocol}"),
-        ("Submitted by", f"{meta.submitter}, {meta.created}"),
+        ("Submitted by", f"{meta.submitter or 'nobody named'}, {meta.created}"),
         ("Trust level", f"{meta.trust}{rerun}"),
         ("Citation", meta.citation),
         ("Plug-ins", "; ".join(plugins)),
