@@ -48,6 +48,7 @@ class FittedStore:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._made: set[str] = set()
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
 
@@ -59,8 +60,20 @@ class FittedStore:
         with lock:
             yield
 
-    def find(self, key: str) -> Fitted | None:
-        """Return what is kept under a key; None when nothing is, or its files were damaged."""
+    def has(self, key: str, *, fresh: bool) -> bool:
+        """Whether something is kept under a key; when `fresh`, by this very object.
+
+        Its files are not looked at: that is for `find`.
+        """
+        return (key in self._made or not fresh) and (self.path / key / INDEX).is_file()
+
+    def find(self, key: str, *, fresh: bool = False) -> Fitted | None:
+        """Return what is kept under a key; None when nothing is, or its files were damaged.
+
+        When `fresh`, what another object has kept, as an earlier run did, does not count.
+        """
+        if not self.has(key, fresh=fresh):
+            return None
         place = self.path / key
         try:
             index = json.loads((place / INDEX).read_text(encoding="utf-8"))
@@ -92,6 +105,11 @@ class FittedStore:
         # Another process may have been quicker; then its result, the same, stays.
         with contextlib.suppress(OSError):
             room.rename(self.path / key)
+            self._made.add(key)
+
+    def distrust(self, key: str) -> None:
+        """Take what is kept under a key for an earlier run's: it could not be loaded."""
+        self._made.discard(key)
 
     def drop(self, key: str) -> None:
         """Forget what is kept under a key."""

@@ -15,6 +15,7 @@ from oodd_eval import provenance
 from oodd_eval.evaluation import make_records
 from oodd_eval.executors import LOCAL as LOCAL_EXECUTOR
 from oodd_eval.executors import Executor, Orders, available_cores, opener
+from oodd_eval.executors.turns import Turns
 from oodd_eval.isolation import Limits
 from oodd_eval.keeping import Keeper
 from oodd_eval.plan import Plan
@@ -166,7 +167,14 @@ def _as_they_finish(
     units are in memory, however many there are.
     """
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
-    running: dict[Future[Scored], int] = {}
+    elsewhere = [(i, job) for i, job in enumerate(jobs) if job.offer.plugin != LOCAL]
+    turns = Turns(elsewhere, executor.fit_of)
+
+    def turn() -> tuple[int, Scored]:
+        with turns.take() as (index, job):
+            return index, score(job)
+
+    running: list[Future[tuple[int, Scored]]] = []
     waiting = enumerate(jobs)
     try:
         while True:
@@ -176,12 +184,14 @@ def _as_they_finish(
                 if job.offer.plugin == LOCAL:
                     yield index, score(job)  # in this thread, where it can be interrupted
                 else:
-                    running[pool.submit(score, job)] = index
+                    running.append(pool.submit(turn))
             if not running:
                 return
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in sorted(finished, key=running.__getitem__):
-                yield running.pop(future), future.result()
+            for future in [f for f in running if f in finished]:
+                running.remove(future)
+                yield future.result()
     finally:
         executor.stop()
+        turns.stop()
         pool.shutdown(wait=True, cancel_futures=True)

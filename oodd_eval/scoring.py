@@ -176,11 +176,11 @@ def _with_store(
     fresh: bool,
 ) -> Outcome:
     """Score with the fit that is kept under a key, or fit and keep it."""
-    fitted = None if fresh else store.find(key)
+    fitted = store.find(key, fresh=fresh)
     if fitted is None:
         with store.alone(key):
             # Meanwhile another unit of the same fit may have kept it.
-            fitted = None if fresh else store.find(key)
+            fitted = store.find(key, fresh=fresh)
             if fitted is None:
                 with store.room() as room:
                     outcome = isolated(save=str(room.absolute()))
@@ -192,6 +192,7 @@ def _with_store(
         outcome.seconds_fit = fitted.seconds_fit
     elif outcome.status != "ok" and not stop.is_set():
         # It ended before it was loaded; whatever the reason, a fit of its own is what counts.
+        store.distrust(key)
         return _with_store(isolated, store, key, stop, fresh=True)
     return outcome
 

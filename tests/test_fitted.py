@@ -129,6 +129,13 @@ def test_fresh_fits_again_and_keeps_that(tiny_split, log, tmp_path):
     assert log() == ["load"]
 
 
+def test_fresh_fits_once_what_the_units_of_a_run_share(tiny_split, log, tmp_path):
+    go(tiny_split, tmp_path / "out", anomalies=("iid",))
+    log()
+    go(tiny_split, tmp_path / "out", anomalies=("iid",), horizons=(1, 2), fresh=True)
+    assert log() == ["fit", "load"]
+
+
 @pytest.mark.parametrize("damage", ["bytes", "index", "gone"])
 def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path, damage):
     plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
@@ -158,6 +165,13 @@ def test_a_detector_that_cannot_load_itself_is_fitted(tiny_split, log, tmp_path)
     _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("drift",))
     assert log() == ["fit", "fit"]
     assert done.records[0].ok
+
+
+def test_a_fit_of_the_same_run_that_cannot_be_loaded_is_made_again(tiny_split, log, tmp_path):
+    _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",), horizons=(1, 2),
+                 fresh=True)  # fmt: skip
+    assert log() == ["fit", "fit"]
+    assert [r.status for r in done.records] == ["ok", "ok"]
 
 
 def test_the_key_tells_nothing_of_the_environment(tiny_split, log, tmp_path):

@@ -147,7 +147,7 @@ def test_scores_of_a_few_units_are_in_memory_at_a_time():
             most = max(most, begun - taken)
         return object()
 
-    executor = SimpleNamespace(jobs=2, stop=lambda: None)
+    executor = SimpleNamespace(jobs=2, stop=lambda: None, fit_of=lambda _job: "")
     jobs = [SimpleNamespace(offer=SimpleNamespace(plugin="x")) for _ in range(50)]
     for _ in _as_they_finish(jobs, score, executor):
         taken += 1
@@ -157,7 +157,7 @@ def test_scores_of_a_few_units_are_in_memory_at_a_time():
 
 
 def test_jobs_go_on_while_the_caller_is_busy():
-    executor = SimpleNamespace(jobs=1, stop=lambda: None)
+    executor = SimpleNamespace(jobs=1, stop=lambda: None, fit_of=lambda _job: "")
     jobs = [SimpleNamespace(offer=SimpleNamespace(plugin="x")) for _ in range(2)]
     second = threading.Event()
 

@@ -32,6 +32,13 @@ class Executor(Protocol):
         """Carry out a unit, or find its scores in an earlier run's results."""
         ...
 
+    def fit_of(self, job: UnitJob) -> str:
+        """Key of the fit that a unit would make, or wait for while another one makes it.
+
+        Empty when it would do neither: the fit is kept, or shared with nobody.
+        """
+        ...
+
     def stop(self) -> None:
         """Give up what is under way: calls return soon, or raise, and no process is left."""
         ...

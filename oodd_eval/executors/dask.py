@@ -106,6 +106,10 @@ class DaskExecutor:
         except ExecutorError as error:
             raise ExecutorError(f"Dask worker {outcome['worker']}: {error}") from None
 
+    def fit_of(self, job: UnitJob) -> str:  # noqa: ARG002  as every executor's
+        """Nothing: workers keep no fits, so that no unit waits for another's."""
+        return ""
+
     def stop(self) -> None:
         """Tell the workers that nobody waits any more."""
         self._stopping.set()

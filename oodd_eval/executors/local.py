@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 
 from oodd_eval.isolation import Limits
-from oodd_eval.results import ResultsDirectory
+from oodd_eval.results import ResultsDirectory, fit_key
 from oodd_eval.scoring import Scored, UnitJob
 
 
@@ -23,6 +23,13 @@ class LocalExecutor:
     def __call__(self, job: UnitJob) -> Scored:
         """Carry out a unit."""
         return job(self.limits, self.stopping, self.results, fresh=self.fresh)
+
+    def fit_of(self, job: UnitJob) -> str:
+        """Key of the fit, unless it is kept."""
+        if self.results is None:
+            return ""
+        key = fit_key(job.plan, job.unit, job.offer)
+        return "" if self.results.fitted.has(key, fresh=self.fresh) else key
 
     def stop(self) -> None:
         """Kill the workers."""
