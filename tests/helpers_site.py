@@ -1,5 +1,7 @@
-"""Entries of a leaderboard made by hand: small ones for the site, and one as large as it gets."""
+"""Entries of a leaderboard made by hand, and the data of a site as large as it gets."""
 
+import functools
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +12,14 @@ from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.curves import Sweep, cell_curves, thresholds, write_curves
 from oodd_eval.cusum import Standardization
 from oodd_eval.intervals import bootstrap_weights, interval
-from oodd_eval.metrics import METRICS, AlarmRule, Contribution
+from oodd_eval.metrics import METRICS, POOLED, AlarmRule, Contribution
 from oodd_eval.records import Metric
+from oodd_eval.site.data import site_data
 from oodd_eval.submission.format import Entry, read_entries
 
 DIGEST = "ab" * 32
+
+_weights = functools.cache(bootstrap_weights)
 
 
 def write_entry(root, identity, records, *, curves=(), **fields):
@@ -30,20 +35,19 @@ def write_entry(root, identity, records, *, curves=(), **fields):
     given = {
         "title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
         "url": "https://example.org/page", "trust": "reported", "created": "2026-11-21",
-        "command": "oodd-eval run --detector all", "caption": "",
+        "command": "oodd-eval run --detector all", "caption": "", "plugins": [],
     } | fields  # fmt: skip
     entry = Entry(
         id=identity, detectors=sorted({r.detector for r in records}), split=first.split,
-        split_digest=first.split_digest, protocol=first.protocol, plugins=[], environment={},
-        **given,
+        split_digest=first.split_digest, protocol=first.protocol, environment={}, **given,
     )  # fmt: skip
     (directory / "entry.json").write_text(entry.to_json(), encoding="utf-8")
 
 
-def make_curves(record, seed):
+def make_curves(record, seed, twins_seed=0):
     """Curves of one cell, of random scores that are shifted from the onset on."""
-    rng = np.random.default_rng(seed)
-    twins = [rng.normal(size=120) for _ in range(3)]
+    twins = list(np.random.default_rng([0, twins_seed]).normal(size=(3, 120)))
+    rng = np.random.default_rng([1, seed])
     anomalous = [rng.normal(size=110) for _ in range(3)]
     onsets = [35, 50, 62]
     for scores, onset in zip(anomalous, onsets, strict=True):
@@ -65,7 +69,7 @@ def describe(record, *, inputs="observations", **fields):
     metrics = {}
     for name, pair in columns.items():
         c = Contribution(*map(np.array, pair))
-        weights = bootstrap_weights(len(c.numerator), key=record.environment)
+        weights = _weights(len(c.numerator), key=record.environment)
         metrics[name] = Metric(c.value, *interval(c, weights), n=c.n)
     fields = {"metrics": metrics, "per_trajectory": columns} | fields
     provenance = {**record.provenance, "inputs": inputs, "steps_scored": 1000}
@@ -125,24 +129,53 @@ def example(root):
     return read_entries(root)
 
 
-def full(root, rows=12, n=10):
-    """One entry of all 56 cells for each of many detectors, with curves, as on the real board."""
+def full(root, detectors=14, splits=2):
+    """Data and curves of a site as large as the real one gets: all cells, and all metrics.
+
+    One row is computed, of numbers as long as real ones; the others are copies of other names.
+    """
     rng = np.random.default_rng(0)
-    sample = None
-    for i in range(rows):
-        name = f"detector-{i}"
-        records = [
-            describe(make_record(name, e, a, values=values(rng, 0.5 + i / 25, n)))
-            for e in ENVIRONMENTS
-            for a in ANOMALIES
-        ]
-        write_entry(root, name, records)
-        # Curves cost time, and it is their size that counts here.
-        sample = sample or make_curves(records[0], 0)
-        units = [
-            {**sample, "cell": r.cell, "detector": name, "environment": r.environment,
-             "anomaly": r.anomaly}
-            for r in records
-        ]  # fmt: skip
-        write_curves({"units": units}, root / name / "curves.json")
-    return read_entries(root)
+    records, units = [], []
+    for e in ENVIRONMENTS:
+        for a in ANOMALIES:
+            given = {
+                name: list(rng.uniform(0, 40 if "delay" in name else 1, 10)) for name in METRICS
+            }
+            record = describe(make_record("detector-0", e, a, values=given))
+            calibrated = {
+                name.replace("1pct", "01pct"): m
+                for name, m in record.metrics.items()
+                if name.endswith("_at_1pct")
+            }
+            others = [*POOLED, "threshold_at_1pct", "threshold_at_01pct"]
+            more = calibrated | {name: Metric(rng.uniform()) for name in others}
+            records.append(replace(record, metrics=record.metrics | more))
+            units.append(make_curves(record, len(units), twins_seed=list(ENVIRONMENTS).index(e)))
+    write_entry(root, "one", records)
+    write_curves({"units": units}, root / "one" / "curves.json")
+    data, curves = site_data(read_entries(root))
+    (board,) = data["boards"]
+    (row,) = board["rows"]
+    names = [f"detector-{i}" for i in range(detectors)]
+    data["boards"] = [
+        board
+        | {
+            "id": f"split-{split}",
+            "rows": [
+                row
+                | {
+                    "id": f"split-{split}/{name}",
+                    "label": name,
+                    "rank": i + 1,
+                    "curves": split * detectors + i,
+                }
+                for i, name in enumerate(names)
+            ],
+            "comparisons": [
+                [one, other, 0.0123456, -0.0123456, 0.0234567, 0.00149985]
+                for one, other in itertools.permutations(names, 2)
+            ],
+        }
+        for split in range(splits)
+    ]
+    return data, curves * (splits * detectors)

@@ -16,22 +16,24 @@ from typing import Any, Final
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.curves_format import read_curves
 from oodd_eval.cusum import DRIFT, THRESHOLD
-from oodd_eval.metrics import HIGHER_IS_BETTER, METRICS
+from oodd_eval.metrics import HIGHER_IS_BETTER, METRICS, POOLED
 from oodd_eval.records import Record
 from oodd_eval.report.leaderboard import LeaderboardSection, sections
 from oodd_eval.report.standings import Standing
 from oodd_eval.report.tables import PERCENT, TITLES
+from oodd_eval.site.packing import packed
 from oodd_eval.site.selections import Cell, selection_intervals, selections
-from oodd_eval.submission.format import SubmittedEntry
+from oodd_eval.submission.format import Entry, SubmittedEntry
 
 WITH_INTERVALS: Final = (
-    "auc_matched", "auc", "delay", "delay_censored", "missed", "far", "far_twin",
+    "auc_matched", "auc", "delay", "delay_null", "delay_censored", "missed", "far", "far_twin",
     "delay_censored_at_1pct", "missed_at_1pct", "far_twin_at_1pct",
 )  # fmt: skip
-"""Metrics whose means have intervals on the site: those that comparisons are made with."""
+"""Metrics that have intervals on the site: those that comparisons are made with."""
 
 ENTRY_FIELDS: Final = (
-    "id", "title", "submitter", "trust", "created", "citation", "url", "caption", "command",
+    "id", "title", "submitter", "trust", "rerun", "created", "citation", "url", "caption",
+    "command",
 )  # fmt: skip
 """What the site says of an entry."""
 
@@ -41,6 +43,8 @@ SUFFIXES: Final = {"": "", "at_1pct": "1 %", "at_01pct": "0.1 %"}
 _ORDER: Final = {
     (e, a): (i, j) for i, e in enumerate(ENVIRONMENTS) for j, a in enumerate(ANOMALIES)
 }
+
+_THRESHOLD: Final = {"threshold": "smallest threshold that meets the target on calibration data"}
 
 _PAPER = Path(__file__).parents[1] / "paper" / "tables.json"
 
@@ -94,25 +98,27 @@ def _metric(name: str) -> Json:
     base, _, suffix = name.partition("_at_")
     target = SUFFIXES[f"at_{suffix}" if suffix else ""]
     title = TITLES.get(base, base) + (f" at {target}" if target else "")
-    meaning = METRICS.get(base, "smallest threshold that meets the target on calibration data")
+    meaning = (METRICS | POOLED | _THRESHOLD)[base]
     under = f"; with a false-alarm rate calibrated to {target}" if base in METRICS else ""
     return {
         "title": title[0].upper() + title[1:],
         "meaning": meaning + (under if target else ""),
-        "kind": "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate",
+        "kind": _kind(name),
         "higher": base in HIGHER_IS_BETTER,
     }
+
+
+def _kind(metric: str) -> str:
+    base = metric.partition("_at_")[0]
+    return "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate"
 
 
 def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Json:
     ranks, board = section.ranks, section.ranks.board
     found = {name for r in board.records for name in r.metrics}
-    names = [
-        name
-        for suffix in SUFFIXES
-        for name in (f"{m}_{suffix}" if suffix else m for m in (*METRICS, "threshold"))
-        if name in found
-    ]
+    calibrated = [f"{m}_{s}" for s in SUFFIXES if s for m in (*METRICS, *_THRESHOLD)]
+    # The plain ones stand there even where every cell of the board has failed.
+    names = [*METRICS, *(name for name in (*calibrated, *POOLED) if name in found)]
     have = {(r.environment, r.anomaly) for r in board.records}
     chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
     return {
@@ -125,7 +131,7 @@ def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Jso
         "environments": board.environments,
         "anomalies": board.anomalies,
         "metrics": names,
-        "intervals": [name for name in WITH_INTERVALS if name in names],
+        "intervals": _with_intervals(names),
         "rows": [_row(section, s, names, chosen, units, curves) for s in ranks.standings],
         "comparisons": [
             [c.first, c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
@@ -148,7 +154,7 @@ def _row(
     sources = [source.meta for source in section.sources[row]]
     own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
     if own:
-        curves.append(own)
+        curves.append(packed(own))
     return {
         "id": f"{section.name}/{row.label}",
         "label": row.label,
@@ -167,10 +173,22 @@ def _row(
         "wins": _short(standing.wins),
         "cost": {name: _short(getattr(cost, name)) for name in ("fit", "step", "peak")},
         "trust": section.trust[row],
-        "entries": [{name: getattr(meta, name) for name in ENTRY_FIELDS} for meta in sources],
+        "entries": [_entry(meta, records[0].plugin) for meta in sources],
         "cells": [_cell(r, names) for r in sorted(records, key=_place)],
         "intervals": _intervals(records, names, chosen),
         "curves": len(curves) - 1 if own else None,
+    }
+
+
+def _entry(meta: Entry, plugin: str) -> Json:
+    """Tell who an entry is from, and the digest of the plug-in's source that it names."""
+    digests = [
+        named["source_digest"]
+        for named in meta.plugins
+        if f"{named['distribution']}:{named['plugin']}" == plugin
+    ]
+    return {name: getattr(meta, name) for name in ENTRY_FIELDS} | {
+        "source_digest": digests[0] if digests else ""
     }
 
 
@@ -180,7 +198,7 @@ def _place(record: Record) -> tuple[int, int, int]:
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:
-    """One record: its values, and interval and n of each, in the order of the board's metrics."""
+    """One record: its values, and its intervals, in the orders of the board's lists of names."""
     plain: Json = {
         "environment": record.environment,
         "anomaly": record.anomaly,
@@ -189,23 +207,29 @@ def _cell(record: Record, names: Sequence[str]) -> Json:
     if not record.ok:
         return plain | {"status": record.status, "reason": record.reason}
     metrics = [record.metrics.get(name) for name in names]
+    bounds = [(record.metrics.get(name), _kind(name)) for name in _with_intervals(names)]
     return plain | {
         "values": [m and _short(m.value) for m in metrics],
-        "low": [m and _short(m.low) for m in metrics],
-        "high": [m and _short(m.high) for m in metrics],
-        "n": [m and m.n for m in metrics],
+        "low": [m and _printed(m.low, kind) for m, kind in bounds],
+        "high": [m and _printed(m.high, kind) for m, kind in bounds],
     }
 
 
 def _intervals(
     records: Sequence[Record], names: Sequence[str], chosen: Mapping[str, Sequence[Cell]]
 ) -> Json:
-    found: Json = {}
-    for metric in WITH_INTERVALS:
-        if metric in names:
-            for key, (low, high) in selection_intervals(records, metric, chosen).items():
-                found.setdefault(key, {})[metric] = [_short(low), _short(high)]
+    """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
+    metrics = _with_intervals(names)
+    found: dict[str, list[list[float | None] | None]] = {}
+    for i, metric in enumerate(metrics):
+        for key, pair in selection_intervals(records, metric, chosen).items():
+            bounds = [_printed(value, _kind(metric)) for value in pair]
+            found.setdefault(key, [None] * len(metrics))[i] = bounds
     return found
+
+
+def _with_intervals(names: Sequence[str]) -> list[str]:
+    return [name for name in WITH_INTERVALS if name in names]
 
 
 def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
@@ -225,3 +249,13 @@ def _short(value: float | None) -> float | None:
         return None
     near = float(f"{value:.6g}")
     return int(near) if near.is_integer() else near
+
+
+def _printed(value: float | None, kind: str) -> float | None:
+    """Round an end of an interval to what is printed: nothing is computed from it."""
+    if value is None or not math.isfinite(value):
+        return None
+    # A percentage is rounded as one, so that the page and other tables have the same digits.
+    if kind == "percent":
+        return _short(round(round(100 * value, 1) / 100, 3))
+    return _short(round(value, 1 if kind == "steps" else 3))

@@ -1,10 +1,11 @@
 // What the columns of the main table are: one list for each of its views.
 
 /** Values that others are read beside: large or small, they are no merit in a row. */
-const BESIDE = ["auc_null", "auc_placebo", "delay_null"];
+const BESIDE = ["auc_null", "auc_placebo", "delay_null", "far_at_", "far_twin_at_"];
 
 /** Whether a metric's best value is marked: delays at different false-alarm rates do not compare. */
-const isMarked = (metric, kind) => !BESIDE.includes(metric) && (kind === "percent" || metric.includes("_at_"));
+const isMarked = (metric, kind) =>
+  !BESIDE.some((name) => metric.startsWith(name)) && (kind === "percent" || metric.includes("_at_"));
 
 const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
 
@@ -25,9 +26,12 @@ function metricColumn(board, metric, options = {}) {
   };
 }
 
+/** A cost: two digits are more than what two machines agree on. */
+const costText = (value) => isNumber(value) && value < 0.001 ? "< 0.001" : brief(value, 2);
+
 /** A column of a plain number of a row. */
 function plainColumn(key, title, unit, hint, of, options = {}) {
-  return { key, title, unit, hint, better: "lower", plain: true, marked: true, of: (row) => ({ value: of(row), cells: 1 }), ...options };
+  return { key, title, unit, hint, better: "lower", text: costText, of: (row) => ({ value: of(row), cells: 1 }), ...options };
 }
 
 function paperColumn(metric, title, unit, kind) {
@@ -41,7 +45,7 @@ function paperColumn(metric, title, unit, kind) {
 
 const RANK = plainColumn(
   "rank", "Rank", "", "1 plus the number of rows that are significantly better over all cells",
-  (row) => row.rank, { digits: 0 },
+  (row) => row.rank,
 );
 
 const LISTS = {
@@ -65,7 +69,7 @@ const LISTS = {
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
         plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",
-          (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", digits: 0, fixed: true }),
+          (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", marked: true, text: (share) => isNumber(share) ? share.toFixed(0) : UNDEFINED }),
       );
       return columns;
     },
@@ -78,14 +82,14 @@ const LISTS = {
       metricColumn(board, "auc", { interval: true }),
       paperColumn("auc", "Paper\u2019s AUC", "%", "percent"),
       metricColumn(board, "auc_null"),
-      ...["auc_pooled", "average_precision", "fpr95"].map((m) => m in DATA.metrics && metricColumn(board, m)),
+      ...["auc_pooled", "average_precision", "fpr95"].filter((m) => board.metrics.includes(m)).map((m) => metricColumn(board, m)),
     ],
   },
   alarms: {
     title: "Alarms",
     columns: (board) => [
       metricColumn(board, "delay", { interval: true }),
-      metricColumn(board, "delay_null"),
+      metricColumn(board, "delay_null", { interval: true }),
       metricColumn(board, "delay_censored", { interval: true }),
       metricColumn(board, "missed", { interval: true }),
       metricColumn(board, "far", { interval: true }),
@@ -129,6 +133,7 @@ const LISTS = {
   },
   cost: {
     title: "Cost",
+    over: "all fits of a row, whatever is selected",
     columns: () => [
       plainColumn("fit", "Fit", "s", "Mean seconds of a fit", (row) => row.cost.fit),
       plainColumn("step", "Score", "\u00b5s per step", "Microseconds per scored step", (row) => row.cost.step),
@@ -139,6 +144,6 @@ const LISTS = {
 
 /** Columns of a view that this board has numbers for. */
 function columnsOf(board, state) {
-  const columns = LISTS[state.view].columns(board, state).filter(Boolean);
+  const columns = LISTS[state.view].columns(board, state);
   return columns.filter((c) => !c.paper || board.rows.some((row) => isNumber(c.of(row, state).value)));
 }

@@ -26,6 +26,9 @@ function build(node, attributes, children) {
   return node;
 }
 
+/** A table's caption. It stays in sight where the table is wider than the window. */
+const captionOf = (text) => element("caption", {}, element("span", {}, text));
+
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 
 /** Mean of the numbers among some values; null when there is none. */

@@ -4,7 +4,7 @@ function detectorPage(board, row, chosen) {
   const first = row.cells.find((c) => !c.status) ?? row.cells[0];
   const cell = row.cells.find((c) => chosen && c.environment === chosen[0] && c.anomaly === chosen[1]) ?? first;
   return [
-    element("p", { class: "back" }, element("a", { href: "#/" }, "\u2190 All detectors")),
+    element("p", { class: "back" }, element("a", { href: tableAddress() }, "\u2190 All detectors")),
     element("h1", { tabindex: "-1" }, row.label, " ", badges(row)),
     element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${underLabel(row)}`),
     summary(board, row),
@@ -32,12 +32,12 @@ function summary(board, row) {
     return isNumber(low) ? `95 % interval ${show(low, kind)} to ${show(high, kind)}` : "no interval";
   };
   return element("dl", { class: "cards" },
-    card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched?.meaning),
+    card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched.meaning),
     card("Rank", row.rank ?? UNDEFINED, row.rank ? `of ${board.rows.filter((r) => r.rank).length} ranked${row.ties && `, tie groups ${row.ties}`}` : row.state),
-    card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc?.meaning),
-    card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay?.meaning),
-    card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin?.meaning),
-    card("Cost", `${brief(row.cost.fit, 2)} s`, `per fit; ${brief(row.cost.step, 2)} \u00b5s per step, ${brief(row.cost.peak, 2)} MB`));
+    card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc.meaning),
+    card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay.meaning),
+    card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin.meaning),
+    card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`));
 }
 
 /** Colours of a matched AUC: from white at chance to teal at 1, or to orange at 0. */
@@ -76,7 +76,7 @@ function heat(board, row, chosen) {
   const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
   const ordered = groups.flatMap((g) => inGroup(board, g));
   return element("div", { class: "scroll" }, element("table", { class: "heat" },
-    element("caption", {}, "Matched AUC (%): white is 50, chance; teal is better, orange is worse than chance"),
+    captionOf("Matched AUC (%): white is 50, chance; teal is better, orange is worse than chance"),
     element("thead", {},
       element("tr", {}, element("td", {}), groups.map((g) => element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
       element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
@@ -108,7 +108,7 @@ function cellPart(board, row, cell) {
     `What changes: ${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}; delay ${text("delay")}, ` +
     `against ${text("delay_null")} from false alarms alone; missed ${text("missed")}; ` +
     `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`);
-  const curves = row.curves === null ? null : curvesOf(row)[`${cell.environment}/${cell.anomaly}`];
+  const curves = row.curves === null ? null : curvesOf(row, `${cell.environment}/${cell.anomaly}`);
   if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
   const at = (metric) => of(metric).value;
   const calibrated = board.metrics.includes("far_twin_at_1pct") ? [at("far_twin_at_1pct"), at("delay_censored_at_1pct")] : null;
@@ -120,12 +120,23 @@ function cellPart(board, row, cell) {
 
 const readCurves = new Map();
 
-/** Curves of a row, parsed when first asked for. */
-function curvesOf(row) {
+/** Curves of one cell of a row, unpacked; undefined where there are none. */
+function curvesOf(row, name) {
   if (!readCurves.has(row.curves)) {
     readCurves.set(row.curves, JSON.parse(document.getElementById(`curves-${row.curves}`).textContent));
   }
-  return readCurves.get(row.curves);
+  const { lists, cells } = readCurves.get(row.curves);
+  const cell = cells[name];
+  if (!cell) return undefined;
+  const looked = (places) => Object.fromEntries(Object.entries(places).map(([key, place]) => [key, lists[place]]));
+  const scaled = (values, step) => step === null ? values : values.map((v) => v === null ? null : v * step);
+  const { scores, twin, score_step, cusum, twin_cusum, cusum_step } = cell.example;
+  const example = {
+    ...cell.example,
+    scores: scaled(scores, score_step), twin: scaled(twin, score_step),
+    cusum: scaled(cusum, cusum_step), twin_cusum: scaled(twin_cusum, cusum_step),
+  };
+  return { seed: cell.seed, roc: looked(cell.roc), delay_far: looked(cell.delay_far), example };
 }
 
 /** The row against every other ranked row. */
@@ -137,7 +148,7 @@ function comparisons(board, row) {
   const links = new Map(board.rows.map((r) => [r.label, r.id]));
   const verdict = (p, other) => p <= 0.05 ? "better" : back.get(other)?.[5] <= 0.05 ? "worse" : "not told apart";
   return section("Against the others", "comparisons", element("div", { class: "scroll" }, element("table", { class: "plain" },
-    element("caption", {}, `Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
+    captionOf(`Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
     element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
       element("th", { scope: "col", class: i ? null : "left" }, t)))),
     element("tbody", {}, found.sort((a, b) => a[2] - b[2]).map(([, other, difference, low, high, p]) => element("tr", {},
@@ -162,7 +173,7 @@ function paperPart(board, row) {
       element("td", { class: "paper" }, show(paperMean(row, metric, selection), kind))];
   });
   return section("Beside the paper", "paper", element("div", { class: "scroll" }, element("table", { class: "plain" },
-    element("caption", {}, "Here, and in the paper\u2019s Table 5 (\u0394 = 1). Policies, split and alarm unit are not the paper\u2019s, so digits are not expected to agree."),
+    captionOf("Here, and in the paper\u2019s Table 5 (\u0394 = 1). Policies, split and alarm unit are not the paper\u2019s, so digits are not expected to agree."),
     element("thead", {},
       element("tr", {}, element("td", {}), columns.map(({ metric, group }) => element("th", { scope: "colgroup", colspan: 2 },
         `${DATA.metrics[metric].title}, ${group}`))),
@@ -174,7 +185,7 @@ function paperPart(board, row) {
 
 function metricsTable(board, row) {
   return element("div", { class: "scroll" }, element("table", { class: "plain" },
-    element("caption", {}, "Means over all cells"),
+    captionOf("Means over all cells"),
     element("thead", {}, element("tr", {}, ["Metric", "Mean", "95 % interval", "Meaning"].map((t, i) =>
       element("th", { scope: "col", class: i % 3 ? null : "left" }, t)))),
     element("tbody", {}, board.metrics.map((metric) => {
@@ -204,11 +215,13 @@ function facts(row) {
         ["Entry", entry.id],
         ["Submitted by", entry.submitter],
         ["Trust", `${entry.trust}: ${(TRUST[entry.trust] ?? "").toLowerCase()}`],
+        ["Run again by", entry.rerun && `${entry.rerun.by}, ${entry.rerun.how}`],
         ["Date", entry.created],
         ["Made by", element("code", {}, entry.command)],
         ["Citation", entry.citation],
         ["Address", /^https?:\/\//.test(entry.url)
           ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],
+        ["Source digest", entry.source_digest],
         ["Note", entry.caption],
       ]),
     ]),

@@ -18,7 +18,7 @@ function drawFilters() {
       type: "radio", name: "view", value: name, checked: state.view === name, onchange: choose("view"),
     }), element("span", {}, list.title)));
   document.getElementById("filters").replaceChildren(
-    select("board", "Board", DATA.boards.map((b) => [b.id, boardTitle(b)])),
+    select("board", "Split", DATA.boards.map((b) => [b.id, boardTitle(b)])),
     select("environment", "Environment", environments),
     select("group", "Group", groups),
     select("anomaly", "Anomaly", anomalies),

@@ -1,9 +1,10 @@
-// Which view an address asks for: `#/` the table, `#/detector/ROW[/ENVIRONMENT/ANOMALY]` a row.
+// Which view an address asks for: `#/[?FILTERS]` the table, `#/detector/ROW[/PLACE/ANOMALY]` a row.
 
 let shown = null;
 
 function route() {
-  const [view, id, ...cell] = location.hash.replace(/^#\/?/, "").split("/").map(decoded);
+  const wanted = location.hash.replace(/^#\/?/, "");
+  const [view, id, ...cell] = wanted.split("/").map(decoded);
   const found = view === "detector" ? ROWS.get(id) : null;
   const page = document.getElementById("detector");
   document.getElementById("overview").hidden = Boolean(found);
@@ -11,11 +12,15 @@ function route() {
   document.title = found ? `${found.row.label} \u2013 ${TITLE}` : TITLE;
   if (!found) {
     page.replaceChildren();
+    restore(wanted.startsWith("?") ? wanted : "");
+    drawFilters();
+    drawTable();
     const link = shown && document.querySelector(`[data-row="${CSS.escape(shown)}"] a`);
     if (link) link.focus();
     shown = null;
     return;
   }
+  state.board = found.board.id;
   page.replaceChildren(...detectorPage(found.board, found.row, cell).filter(Boolean));
   if (shown !== id) {
     window.scrollTo(0, 0);
@@ -38,8 +43,6 @@ function decoded(piece) {
 const TITLE = document.title;
 
 if (DATA.boards.length) {
-  drawFilters();
-  drawTable();
   window.addEventListener("hashchange", route);
   route();
 } else {

@@ -18,9 +18,15 @@ function selects(selection, cell) {
 /** Number of different cells, seeds aside. */
 const distinct = (cells) => new Set(cells.map((c) => `${c.environment}/${c.anomaly}`)).size;
 
-/** Number of different cells of a selection that any row of a board has. */
+const counted = new Map();
+
+/** Number of different cells of a selection that any row of a board has; counted once. */
 function cellsOf(board, selection) {
-  return distinct(board.rows.flatMap((row) => row.cells.filter((c) => selects(selection, c))));
+  const key = [board.id, selection.environment, selection.group, selection.anomaly].join("|");
+  if (!counted.has(key)) {
+    counted.set(key, distinct(board.rows.flatMap((row) => row.cells.filter((c) => selects(selection, c)))));
+  }
+  return counted.get(key);
 }
 
 /**
@@ -40,9 +46,10 @@ function mean(board, row, metric, selection = EVERYTHING) {
   const index = board.metrics.indexOf(metric);
   found.value = meanOf(cells.map((cell) => cell.values[index]));
   const key = `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
-  const known = row.intervals[key]?.[metric];
+  const place = board.intervals.indexOf(metric);
+  const known = row.intervals[key]?.[place];
   if (known) [found.low, found.high] = known;
-  else if (cells.length === 1) [found.low, found.high] = [cells[0].low[index], cells[0].high[index]];
+  else if (cells.length === 1 && place >= 0) [found.low, found.high] = [cells[0].low[place], cells[0].high[place]];
   return found;
 }
 

@@ -145,14 +145,12 @@ function delayFigure(points, calibrated) {
     }));
 }
 
-/** A vertical axis over some numbers: linear, or bent where a few are very large. */
-function axisOf(values, unit, label) {
+/** A vertical axis over some numbers: linear, or bent where a few are very large (no step). */
+function axisOf(values, unit, step, label) {
   const numbers = values.filter(isNumber);
   const low = Math.min(0, ...numbers);
   const high = Math.max(unit, ...numbers);
-  const sizes = numbers.map(Math.abs).sort((a, b) => a - b);
-  const typical = Math.max(unit, sizes[Math.floor(sizes.length / 2)] ?? 0);
-  if (Math.max(high, -low) > 30 * typical) {
+  if (step === null) {
     return { range: [low * 1.1, high * 1.1], ticks: bentTicks(unit, low * 1.1, high * 1.1), label, bend: bent(unit) };
   }
   const room = 0.05 * (high - low);
@@ -169,8 +167,8 @@ function trajectoryFigure(example) {
     shape("line", { x1: plot.sx(example.onset), x2: plot.sx(example.onset), y1: plot.top, y2: plot.bottom }),
     text && shape("text", { x: plot.sx(example.onset), y: plot.top - 6, "text-anchor": "middle" }, `onset \u03c4 = ${example.onset}`));
 
-  const scoreAxis = axisOf([...example.scores, ...example.twin], 1, "score (s.d.)");
-  const cusumAxis = axisOf([...example.cusum, ...example.twin_cusum], DATA.threshold, "CUSUM");
+  const scoreAxis = axisOf([...example.scores, ...example.twin], 1, example.score_step, "score (s.d.)");
+  const cusumAxis = axisOf([...example.cusum, ...example.twin_cusum], DATA.threshold, example.cusum_step, "CUSUM");
   const scores = chart("Scores", { ...x, label: null }, scoreAxis, { ...wide, height: 210, top: 22 });
   scores.drawing.append(onset(scores, true),
     line(scores, rows(example.twin), example.twin, TWIN),

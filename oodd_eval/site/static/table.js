@@ -1,9 +1,31 @@
 // The main view: filters, and one sortable table of a board's rows.
 
-const state = {
+const DEFAULTS = {
   board: DATA.boards[0]?.id, ...EVERYTHING, horizon: "all", inputs: "all", trivial: true,
   view: "ranking", sort: "auc_matched", ascending: false,
 };
+const state = { ...DEFAULTS };
+
+/** The address of the table as it is: what differs from a first visit. */
+function tableAddress() {
+  const changed = Object.entries(state).filter(([name, value]) => value !== DEFAULTS[name]);
+  return "#/" + (changed.length ? `?${new URLSearchParams(changed)}` : "");
+}
+
+/** Take over what an address says; what it does not say, or says wrongly, is as on a first visit. */
+function restore(text) {
+  const given = new URLSearchParams(text);
+  const known = {
+    board: (v) => DATA.boards.some((b) => b.id === v),
+    group: (v) => Object.hasOwn(GROUP_TITLES, v),
+    view: (v) => Object.hasOwn(LISTS, v),
+  };
+  for (const [name, usual] of Object.entries(DEFAULTS)) {
+    const value = given.get(name);
+    if (typeof usual === "boolean") state[name] = value === null ? usual : value === "true";
+    else state[name] = value !== null && (known[name]?.(value) ?? true) ? value : usual;
+  }
+}
 
 /** Rows that the filters leave. */
 function rowsOf(board) {
@@ -39,26 +61,37 @@ function drawTable() {
   const board = DATA.boards.find((b) => b.id === state.board);
   const columns = columnsOf(board, state);
   const rows = sorted(board, rowsOf(board), columns);
+  const found = new Map(rows.map((row) => [row, columns.map((column) => column.of(row, state))]));
+  const best = columns.map((column, i) => bestOf(column, rows.filter((r) => !r.trivial).map((r) => found.get(r)[i].value)));
+  const start = axisStart(board);
   const focused = document.activeElement?.dataset?.sort;
   const table = element("table", { id: "ranking", class: "board" },
-    element("caption", {}, captionOf(board, rows)),
+    captionOf(what(board, rows)),
     element("thead", {}, element("tr", {}, [
-      header(RANK),
-      header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", left: true, better: "lower" }),
+      header({ ...RANK, class: "rank" }),
+      header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", class: "left", better: "lower" }),
       ...columns.map(header),
     ])),
-    element("tbody", {}, rows.map((row) => tableRow(board, row, columns, rows))),
+    element("tbody", {}, rows.map((row) => tableRow(row, columns, found.get(row), best, start))),
   );
   const place = document.getElementById("table");
   place.replaceChildren(columns.length ? table : element("p", { class: "note" }, LISTS[state.view].empty));
   if (focused) place.querySelector(`[data-sort="${focused}"]`)?.focus();
   document.getElementById("notes").replaceChildren(...notesOf(board, rows));
+  history.replaceState(null, "", tableAddress());
+}
+
+/** The value that a column marks; null where it marks none. */
+function bestOf(column, values) {
+  const numbers = values.filter(isNumber);
+  if (!column.marked || !numbers.length) return null;
+  return column.better === "higher" ? Math.max(...numbers) : Math.min(...numbers);
 }
 
 function header(column) {
   const active = state.sort === column.key;
   const order = active ? (state.ascending ? "ascending" : "descending") : "none";
-  return element("th", { scope: "col", "aria-sort": order, class: column.left && "left" },
+  return element("th", { scope: "col", "aria-sort": order, class: column.class },
     element("button", {
       type: "button", "data-sort": column.key, title: column.hint,
       onclick: () => sortBy(column.key, column.better),
@@ -67,26 +100,20 @@ function header(column) {
     column.unit && element("span", { class: "unit" }, column.unit));
 }
 
-function tableRow(board, row, columns, rows) {
-  const best = (column) => {
-    const numbers = rows.filter((r) => !r.trivial).map((r) => column.of(r, state).value).filter(isNumber);
-    return column.better === "higher" ? Math.max(...numbers) : Math.min(...numbers);
-  };
+function tableRow(row, columns, values, best, start) {
   return element("tr", { class: row.trivial ? "trivial" : null, "data-row": row.id },
     element("td", { class: "rank" }, row.rank ?? element("span", { title: row.state }, UNDEFINED),
       row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
     element("th", { scope: "row" },
       element("a", { href: address("detector", row.id) }, row.label), " ", badges(row),
       element("span", { class: "under" }, underLabel(row))),
-    columns.map((column) => {
-      const found = column.of(row, state);
-      const text = column.plain
-        ? (isNumber(found.value) ? (column.fixed ? found.value.toFixed(column.digits) : brief(found.value)) : UNDEFINED)
-        : meanText(found, column.kind);
-      const strong = isNumber(found.value) && !row.trivial && column.marked && found.value === best(column);
+    columns.map((column, i) => {
+      const found = values[i];
+      const text = column.text ? column.text(found.value) : meanText(found, column.kind);
+      const strong = isNumber(found.value) && !row.trivial && found.value === best[i];
       return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.state ? reasonOf(row) : null },
+        column.whisker && whisker(found, start),
         element(strong ? "strong" : "span", { class: "value" }, text),
-        column.whisker && whisker(board, found),
         column.interval && isNumber(found.low) && element("span", { class: "interval" },
           `[${show(found.low, column.kind)}, ${show(found.high, column.kind)}]`));
     }));
@@ -115,11 +142,15 @@ function badges(row) {
 
 const reasonOf = (row) => row.cells.find((cell) => cell.status)?.reason ?? "";
 
-/** A small drawing of a mean with its interval, on an axis that all rows share. */
-function whisker(board, found) {
-  if (!isNumber(found.value)) return null;
+/** Where the axis of the small drawings begins: it is the same for all rows and ends at 1. */
+function axisStart(board) {
   const lows = board.rows.map((r) => mean(board, r, "auc_matched", state)).map((m) => m.low ?? m.value);
-  const left = Math.min(0.4, Math.floor(10 * Math.min(...lows.filter(isNumber))) / 10);
+  return Math.min(0.4, Math.floor(10 * Math.min(...lows.filter(isNumber))) / 10);
+}
+
+/** A small drawing of a mean with its interval. */
+function whisker(found, left) {
+  if (!isNumber(found.value)) return null;
   const x = (value) => (4 + 172 * (value - left) / (1 - left)).toFixed(1);
   const upright = (name, value, y) => shape("line", { class: name, x1: x(value), x2: x(value), y1: y, y2: 16 - y });
   const bar = isNumber(found.low) && [
@@ -132,15 +163,17 @@ function whisker(board, found) {
 }
 
 /** What the table is over, in words. */
-function captionOf(board, rows) {
+function what(board, rows) {
   const cells = cellsOf(board, state);
   const where = state.environment === "all" ? "all environments"
     : { classic: "classic-control environments", bullet: "Bullet environments" }[state.environment]
       ?? DATA.environments[state.environment].title;
-  const what = state.anomaly !== "all" ? DATA.anomalies[state.anomaly].title
+  const anomalies = state.anomaly !== "all" ? DATA.anomalies[state.anomaly].title
     : state.group === "all" ? "all anomalies" : `${state.group} anomalies`;
   const shown = rows.length === board.rows.length ? `${rows.length} rows` : `${rows.length} of ${board.rows.length} rows`;
-  return `${LISTS[state.view].title}: ${where}, ${what} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown})`;
+  const { title, over } = LISTS[state.view];
+  return over ? `${title}: ${over} (${shown})`
+    : `${title}: ${where}, ${anomalies} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown})`;
 }
 
 /** What has to stand below a table. */
