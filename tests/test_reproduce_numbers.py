@@ -17,6 +17,7 @@ from oodd_eval.report.tables import UNDEFINED
 from oodd_eval.reproduce import captions, costs, paper, returns
 from oodd_eval.reproduce.evidence import Estimate, Evidence, Term
 from oodd_eval.reproduce.experiments import ALL, EXPERIMENTS, GROUPED, RIQN, TIERS, Setup
+from oodd_eval.reproduce.figures import figures
 from oodd_eval.reproduce.header import Header
 from oodd_eval.reproduce.numbers import compute, csv_lines, layout, show
 from oodd_eval.reproduce.publish import publish
@@ -74,6 +75,13 @@ def test_difference_uses_the_detector_seeds_that_both_sides_have():
     alone = evidence.combine([term(RIQN)], ["ant"])
     assert (alone.value, alone.seeds) == (pytest.approx(0.5), 2)
     assert evidence.combine([term(RIQN)], ["ant"], [RF]).value == pytest.approx(0.9)
+
+
+def test_where_networks_computed_makes_no_other_row():
+    records = everywhere("riqn", [0.8, 0.6], overrides={"device": "cuda"}, environments=["ant"])
+    records += everywhere("riqn", [0.8, 0.6], overrides={"samples": 4}, environments=["hopper"])
+    estimate = Evidence(records).combine([term(RIQN)], ["ant", "hopper"])
+    assert (estimate.value, estimate.environments) == (pytest.approx(0.7), 1)
 
 
 def test_detector_seeds_widen_the_interval():
@@ -172,6 +180,27 @@ def test_table_has_ours_and_the_papers_below():
     assert below == ["", "", "paper", "83.1", "86.5", "79.6", "84.7"]
     mean = next(row for row in shown.rows if row[0] == "Mean")
     assert mean[4].endswith("(2 of 7)")
+
+
+def test_a_mean_without_all_environments_is_in_the_table_and_not_in_the_figure():
+    table = BY_ID["table-4"]
+    numbers = compute(table, Evidence(everywhere("riqn", [0.8, 0.6])))
+    [figure] = figures(table, numbers).values()
+    panel = figure.panels[0]
+    [drawn] = [dots for dots in panel.series if dots.label == "e = 5"]
+    shown = dict(zip(panel.categories, drawn.values, strict=True))
+    assert shown["Ant"] == pytest.approx(70.0)
+    assert math.isnan(shown["CartPole"])
+    assert math.isnan(shown["Mean"])
+
+
+def test_the_papers_mean_stands_only_where_it_has_every_environment():
+    numbers = compute(BY_ID["table-3"], Evidence([]))
+    assert math.isnan(numbers["mean", "Δ = 1: RIQN", "all", "auc"].paper)
+    numbers = compute(BY_ID["table-4"], Evidence([]))
+    seven = [89.01, 86.7, 86.0, 86.5, 87.0, 86.7, 85.1]
+    mean = numbers["mean", "Δ = 1: e = 5", "all", "auc"].paper
+    assert 100 * mean == pytest.approx(sum(seven) / 7)
 
 
 def test_every_experiment_lays_out_every_number():

@@ -42,6 +42,16 @@ def test_every_unit_is_there_once(mini):
     assert all(len(w.unit.anomalies) == 8 for w in mini)
 
 
+def test_a_device_is_given_to_those_that_have_one():
+    table_5 = [e for e in EXPERIMENTS if e.id == "controls"]
+    placed = lay_out(table_5, TIERS["mini"], load_split("mini"), discover(), "auto")
+    devices = {w.unit.detector: w.unit.overrides for w in placed}
+    assert devices["riqn"] == devices["npn"] == {"device": "auto"}
+    assert devices["rf"] == devices["clock"] == {}
+    usual = lay_out(table_5, TIERS["mini"], load_split("mini"), discover(), "cpu")
+    assert all(w.unit.overrides == {} for w in usual)
+
+
 def test_stages_follow_one_another_and_each_goes_environment_by_environment(mini):
     order = [(w.stage, list(ENVIRONMENTS).index(w.unit.environment)) for w in mini]
     assert order == sorted(order)

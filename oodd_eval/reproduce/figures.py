@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.records import NAN
 from oodd_eval.report.tables import PERCENT, TITLES
+from oodd_eval.reproduce.evidence import Estimate
 from oodd_eval.reproduce.experiments import Experiment
 from oodd_eval.reproduce.numbers import MEAN, Number, Numbers
 from oodd_eval.reproduce.plots import Dots, Figure, Panel
@@ -133,8 +134,12 @@ def returns_figure(returns: Returns, paper: Sequence[Sequence[float]]) -> Figure
 
 
 def _dots(label: str, numbers: Sequence[Number]) -> Dots:
+    """Return a series; a mean that lacks environments is left out, beside others it would mislead.
+
+    Tables have it, and say so.
+    """
     unit = 100.0 if numbers[0].metric in PERCENT else 1.0
-    run = [n.estimate for n in numbers]
+    run = [Estimate() if n.estimate.partial else n.estimate for n in numbers]
     return Dots(
         label,
         tuple(unit * e.value for e in run),

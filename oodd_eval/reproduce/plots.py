@@ -168,8 +168,9 @@ def draw(figure: Figure) -> dict[str, bytes]:
                 axes.set_ylabel("")
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11, fontweight="bold")
         handles, labels = _legend(figure)
-        wide = 0.075 * max(map(len, labels)) + 0.55  # inches of a legend's column, roughly
-        columns = max(1, min(len(labels), int(size[0] / wide)))
+        widths = [0.075 * len(label) + 0.6 for label in labels]  # inches, roughly
+        one_row = sum(widths) <= size[0]
+        columns = len(labels) if one_row else max(1, int(size[0] / max(widths)))
         canvas.legend(handles, labels, loc="outside lower center", ncols=columns)
         return {suffix: _saved(canvas, suffix, key) for suffix in ("png", "svg")}
 
