@@ -1,4 +1,4 @@
-"""Alarms with a false-alarm rate chosen in advance: calibrated thresholds.
+"""Alarms with a false-alarm rate chosen in advance, and alarms as they come.
 
 A threshold is found on the calibration trajectories, which are nominal and apart from training and
 test, so that delay and misses are compared at the same target instead of at whatever rate a fixed
@@ -28,6 +28,51 @@ MIN_STEPS: Final = {"at_1pct": 1_000, "at_01pct": 20_000}
 
 CALIBRATED: Final = ("far", "far_twin", "delay", "delay_censored", "missed")
 """Metrics that are reported again at each target."""
+
+
+class Monitor:
+    """Alarms of one episode as its scores come in, beside a running robot.
+
+    The statistic and the alarms are those of `cusum.cusum` on the whole episode, bit for bit.
+
+    Parameters
+    ----------
+    rule
+        Standardization, drift and threshold; see `calibrate` for a threshold with a false-alarm
+        rate chosen in advance.
+
+    Attributes
+    ----------
+    statistic : float
+        ``S_t`` after the last score, before the reset that an alarm brings; 0 at the beginning.
+
+    Examples
+    --------
+    >>> from oodd_eval.cusum import Standardization
+    >>> monitor = Monitor(AlarmRule(Standardization(mean=0.0, std=0.01), drift=0.25, threshold=1))
+    >>> [(monitor.update(score), monitor.statistic) for score in (0.5, 0.5, 2.0, 0.0)]
+    [(False, 0.25), (False, 0.5), (True, 2.25), (False, 0.0)]
+    """
+
+    def __init__(self, rule: AlarmRule) -> None:
+        self.rule = rule
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self.statistic = self._carried = 0.0
+
+    def update(self, score: float) -> bool:
+        """Take the next score, NaN where undefined; return whether it raises an alarm."""
+        x = float(self.rule.standardization(np.array([score]))[0]) - self.rule.drift
+        self.statistic = 0.0
+        if x != x:  # noqa: PLR0124  # NaN: not defined yet
+            return False
+        self._carried = self.statistic = max(0.0, self._carried + x)
+        alarm = self.statistic > self.rule.threshold
+        if alarm:
+            self._carried = 0.0
+        return alarm
 
 
 def false_alarm_rate(scores: Sequence[Floats], rule: AlarmRule) -> float:

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.alarms import MIN_STEPS, calibrate, calibrated_contributions, false_alarm_rate
+from oodd_eval.alarms import (
+    MIN_STEPS,
+    Monitor,
+    calibrate,
+    calibrated_contributions,
+    false_alarm_rate,
+)
 from oodd_eval.cusum import Standardization, cusum
 from oodd_eval.metrics import AlarmRule
 
@@ -56,3 +62,26 @@ def test_a_target_is_offered_only_where_the_calibration_part_can_support_it():
     assert set(found) == {
         f"{m}_at_1pct" for m in ("far", "far_twin", "delay", "delay_censored", "missed")
     }
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_monitor_raises_the_alarms_of_the_whole_episode(seed):
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(1, 2, 200)
+    scores[[0, 1, 2, 60]] = np.nan
+    rule_ = AlarmRule(Standardization(1.0, 2.0))
+    statistic, expected = cusum(rule_.standardization(scores))
+    monitor = Monitor(rule_)
+    found = [(monitor.update(s), monitor.statistic) for s in scores]
+    assert [alarm for alarm, _ in found] == expected.tolist()
+    assert [s for _, s in found] == statistic.tolist()
+    assert expected.any()
+
+
+def test_a_monitor_begins_anew_with_each_episode():
+    monitor = Monitor(AlarmRule(Standardization(0.0, 0.01), drift=0.0, threshold=3.0))
+    assert [monitor.update(2.0), monitor.update(2.0)] == [False, True]
+    assert not monitor.update(2.0)
+    monitor.reset()
+    assert monitor.statistic == 0
+    assert not monitor.update(2.0)
