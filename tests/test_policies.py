@@ -109,7 +109,7 @@ def test_environment_names_are_checked():
 
 
 def test_a_missing_file_says_how_to_train_one(tmp_path):
-    with pytest.raises(PolicyError, match="policies train --env ant"):
+    with pytest.raises(PolicyError, match="policies train ant"):
         load_policy("ant", tmp_path / "ant.npz")
 
 

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from helpers_docs import parse
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -51,8 +52,6 @@ def test_relative_links_lead_somewhere(path):
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_in_documents_parse(path, capsys):
-    from oodd_eval.cli import build_parser
-
     blocks = "\n".join(re.findall(r"```(?:sh|console)\n(.*?)```", path.read_text(), re.DOTALL))
-    for line in re.findall(r"^(?:\$ )?oodd-eval ([^\n|`]*)$", blocks, re.MULTILINE):
-        build_parser().parse_args(line.split("#")[0].split())
+    for line in re.findall(r"^(?:\$ )?(oodd-eval [^\n|`]*)$", blocks, re.MULTILINE):
+        parse(line)

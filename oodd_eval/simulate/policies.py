@@ -57,7 +57,7 @@ class TD3Policy:
         hidden = np.maximum(row.astype(np.float64) @ w1 + b1, 0)
         hidden = np.maximum(hidden @ w2 + b2, 0)
         action = np.tanh(hidden @ w3 + b3)
-        return np.clip(np.round(action * ACTION_GRID) / ACTION_GRID, -1, 1).astype(np.float32)
+        return (np.rint(action * ACTION_GRID) / ACTION_GRID).astype(np.float32)
 
 
 class IQNPolicy:
@@ -121,7 +121,7 @@ def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     except FileNotFoundError:
         raise PolicyError(
             f"no policy for {environment}: {file.name} does not exist; train one with "
-            f"`oodd-eval policies train --env {environment}`"
+            f"`oodd-eval policies train {environment}`"
         ) from None
     # TypeError: a single array instead of an npz, which cannot be entered.
     except (BadZipFile, ValueError, TypeError, OSError, EOFError, zlib.error) as error:
