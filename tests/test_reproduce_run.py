@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers_reproduce import install_quick
 
+from oodd_eval import packed
 from oodd_eval.cli import main
 from oodd_eval.reproduce import publish
 from oodd_eval.reproduce.plots import Dots, Figure, Panel, draw, drawing_key
@@ -126,6 +127,10 @@ def test_tables_are_made_from_records_that_lie_elsewhere_in_any_order(finished, 
     for name, part in (("a", lines[:30]), ("b/c", lines[30:]), ("d", others), ("e", others)):
         (entries / name).mkdir(parents=True)
         (entries / name / "records.jsonl").write_text("".join(part))
+    # As a large entry is kept.
+    whole = entries / "a" / "records.jsonl"
+    whole.with_name("records.jsonl.gz").write_bytes(packed.pack(whole.read_bytes()))
+    whole.unlink()
     assert render(kept, "--records", str(entries)) == 0
     mine, theirs = contents(kept), contents(finished)
     assert mine | {"records.jsonl": theirs["records.jsonl"]} == theirs
