@@ -1,0 +1,157 @@
+"""The committed leaderboard: valid entries, and no number that the records do not give.
+
+Without entries there must be no tables either. Numbers are compared to their last printed digit:
+sums may be rounded otherwise on another processor. `leaderboard build --check` compares bytes.
+"""
+
+import re
+import shutil
+from itertools import zip_longest
+from pathlib import Path
+
+import pytest
+
+from oodd_eval.commands import leaderboard_build
+from oodd_eval.submission.format import read_entries
+from oodd_eval.submission.verify import verify
+
+BOARD = Path(__file__).parents[1] / "leaderboard"
+
+NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
+
+
+def rendered(board):
+    """Return the names of all files of a board that are made from its entries."""
+    files = [board / "README.md", *(board / "tables").glob("*.csv"), *(board / "site").glob("*")]
+    return {f.relative_to(board).as_posix() for f in files if f.is_file()}
+
+
+def digit(text):
+    """Return what one unit of a number's last printed digit is worth; nothing for whole numbers."""
+    if text.lstrip("-").isdigit():
+        return 0.0
+    mantissa, _, exponent = text.partition("e")
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+def unlike(fresh, committed):
+    """Return a line for each line of two texts that differs by more than rounding."""
+    found = []
+    pairs = zip_longest(fresh.splitlines(), committed.splitlines(), fillvalue="")
+    for i, (new, old) in enumerate(pairs, start=1):
+        if new == old:
+            continue
+        words = [NUMBER.sub("#", re.sub(r" +|-{3,}", " ", text)) for text in (new, old)]
+        numbers = zip(NUMBER.findall(new), NUMBER.findall(old), strict=False)
+        near = all(abs(float(a) - float(b)) <= 1.001 * digit(b) for a, b in numbers)
+        if words[0] != words[1] or not near:
+            found.append(f"line {i}: {old[:200]!r} is committed, the records give {new[:200]!r}")
+    return found
+
+
+def check_board(board, scratch):
+    """Return what is wrong with a board: a line for every file or line of one."""
+    results = board / "results"
+    entries = read_entries(results) if results.is_dir() else []
+    if not entries:
+        return [f"{name} is committed, but there are no entries" for name in rendered(board)]
+    leaderboard_build.build(entries, scratch)
+    new, old = rendered(scratch), rendered(board)
+    lines = [f"{name} is missing" for name in sorted(new - old)]
+    lines += [f"{name} is of no entry" for name in sorted(old - new)]
+    for name in sorted(new & old):
+        texts = ((place / name).read_text(encoding="utf-8") for place in (scratch, board))
+        lines += [f"{name}: {line}" for line in unlike(*texts)]
+    return lines
+
+
+def test_every_number_of_the_committed_board_comes_from_its_records(tmp_path):
+    assert check_board(BOARD, tmp_path) == []
+
+
+def test_every_committed_entry_is_valid():
+    verdicts = verify(BOARD / "results") if (BOARD / "results").is_dir() else []
+    assert [p.text for v in verdicts for p in v.findings.problems] == []
+
+
+# The comparison itself
+
+
+@pytest.fixture(scope="module")
+def built(submissions, tmp_path_factory):
+    """A board with an entry, as it would be committed."""
+    board = tmp_path_factory.mktemp("board")
+    shutil.copytree(submissions.plain, board / "results" / submissions.plain.name)
+    leaderboard_build.build(read_entries(board / "results"), board)
+    return board
+
+
+@pytest.fixture
+def board(built, tmp_path):
+    return Path(shutil.copytree(built, tmp_path / "board"))
+
+
+def test_a_board_that_was_built_passes(board, tmp_path):
+    assert check_board(board, tmp_path / "fresh") == []
+
+
+def edited(path, pattern, change):
+    """Change the last place where a pattern stands."""
+    text = path.read_text()
+    place = list(re.finditer(pattern, text))[-1]
+    path.write_text(text[: place.start()] + change(place[0]) + text[place.end() :])
+
+
+@pytest.mark.parametrize("kind", ["ranking", "cells"])
+def test_a_number_that_was_edited_in_a_file_is_found(board, tmp_path, kind):
+    (file,) = (board / "tables").glob(f"*-{kind}.csv")
+    edited(file, r"0\.\d{4,}", lambda text: f"{float(text) + 0.001:.6g}")
+    (line,) = check_board(board, tmp_path / "fresh")
+    assert line.startswith(f"tables/{file.name}: line ")
+
+
+def test_a_number_that_was_edited_on_the_page_is_found(board, tmp_path):
+    edited(board / "README.md", r"\d+\.\d \\\[", lambda t: f"{float(t.split()[0]) + 0.3:.1f} \\[")
+    (line,) = check_board(board, tmp_path / "fresh")
+    assert line.startswith("README.md: line ")
+
+
+def test_a_number_that_was_edited_on_the_site_is_found(board, tmp_path):
+    edited(board / "site" / "index.html", r"0\.\d{5,}", lambda text: f"{float(text) + 0.01}")
+    assert len(check_board(board, tmp_path / "fresh")) == 1
+
+
+def test_a_record_that_was_changed_afterwards_is_found(board, tmp_path):
+    (entry,) = (board / "results").iterdir()
+    records = entry / "records.jsonl"
+    edited(records, r'"auc_matched": \[\[[^,]*', lambda _: '"auc_matched": [[0.123')
+    assert any("-ranking.csv" in line for line in check_board(board, tmp_path / "fresh"))
+
+
+def test_tables_of_entries_that_are_gone_are_found(board, tmp_path):
+    (board / "tables" / "old-cells.csv").write_text("x\n")
+    assert check_board(board, tmp_path / "fresh") == ["tables/old-cells.csv is of no entry"]
+    shutil.rmtree(board / "results")
+    lines = check_board(board, tmp_path / "fresh")
+    assert "README.md is committed, but there are no entries" in lines
+
+
+@pytest.mark.parametrize(
+    ("fresh", "committed", "same"),
+    [
+        ("a,0.123456", "a,0.123457", True),
+        ("a,0.123456", "a,0.123458", False),
+        ("a,0.123456,1", "a,0.123457,1", True),
+        ("a,0.123456,1", "a,0.123456,2", False),
+        ("| 85.3 \\[83.0, 87.0] |", "|  85.4 \\[83.0, 87.1] |", True),
+        ("| 85.3 |", "| 85.5 |", False),
+        ("a,1e-07", "a,1.1e-07", True),
+        ("a,1e-07", "a,3e-07", False),
+        ("riqn,1", "npn,1", False),
+        ("a,,1", "a,1,1", False),
+        ("digest 12ab", "digest 13ab", False),
+        ("one\ntwo", "one", False),
+    ],
+)
+def test_rounding_alone_is_no_difference(fresh, committed, same):
+    assert (unlike(fresh, committed) == []) is same

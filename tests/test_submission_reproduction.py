@@ -1,0 +1,277 @@
+"""Entries of many setups, as a reproduction leaves them: what is kept, left out, packed, drawn."""
+
+import json
+import shlex
+import shutil
+from dataclasses import replace
+
+import pytest
+from helpers_split import make_split
+from helpers_submission import Draft, assert_refused
+
+from oodd_eval import cli, packed
+from oodd_eval.api import evaluate
+from oodd_eval.benchmark import ENVIRONMENTS
+from oodd_eval.results import ResultsDirectory
+from oodd_eval.submission import rules
+from oodd_eval.submission.curves_check import with_curves
+from oodd_eval.submission.format import read_entries
+from oodd_eval.submission.selecting import run_command
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    """Results of several horizons, seeds and parameters; one seed lacks an environment."""
+    home = tmp_path_factory.mktemp("many")
+    split = make_split(home / "split", ("cartpole", "hopper"), calibration=20, name="many")
+    out = home / "results"
+    for detector, more in (
+        ("random", {"seed": 0}),
+        ("random", {"seed": 1}),
+        ("random", {"seed": 2, "environments": "cartpole"}),
+        ("persistence", {"horizon": 3}),
+        ("mewma", {"parameters": {"order": 2}}),
+        ("mewma", {}),
+    ):
+        evaluate(detector, split, output=out, **more)
+    plain = {"tier": {"name": "reduced", "split": "reduced"}}
+    (out / "reproduction.json").write_text(json.dumps(plain))
+    return split, out
+
+
+def submit(many, root, *options):
+    split, out = many
+    return cli.main(
+        ["leaderboard", "submit", str(out), "--results", str(root), "--split", str(split),
+         "--id", "all", *options]
+    )  # fmt: skip
+
+
+def labels(entry):
+    return {record.cell.partition("::")[2] for record in entry.records}
+
+
+ALL = {
+    "mewma[h=1,seed=0]", "mewma[h=1,seed=0,order=2]", "persistence[h=3,seed=0]",
+    "random[h=1,seed=0]", "random[h=1,seed=1]",
+}  # fmt: skip
+
+
+def test_seeds_that_lack_cells_are_left_out_and_named(many, tmp_path, capsys):
+    assert submit(many, tmp_path, "--complete") == 0
+    out = capsys.readouterr().out
+    assert "left out: random[h=1,seed=2], which has 8 of 16 cells" in out
+    (entry,) = read_entries(tmp_path)
+    assert labels(entry) == ALL
+    assert entry.meta.command == "oodd-eval reproduce --tier reduced --split many"
+    assert entry.meta.detectors == ["mewma", "persistence", "random"]
+
+
+def test_without_being_asked_nothing_is_left_out_and_what_is_partial_is_said(
+    many, tmp_path, capsys
+):
+    assert submit(many, tmp_path) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "random[h=1,seed=2] is partial: 1 of 7 environments" in out
+    (entry,) = read_entries(tmp_path)
+    assert labels(entry) == ALL | {"random[h=1,seed=2]"}
+
+
+def test_cells_are_selected_by_expression(many, tmp_path, capsys):
+    assert submit(many, tmp_path, "-k", "random or order=2", "--complete") == 0
+    (entry,) = read_entries(tmp_path)
+    assert labels(entry) == {
+        "mewma[h=1,seed=0,order=2]", "random[h=1,seed=0]", "random[h=1,seed=1]"
+    }  # fmt: skip
+    assert submit(many, tmp_path / "b", "-k", "nowhere") == 4
+    assert "-k 'nowhere' selects none of the 88 records" in capsys.readouterr().err
+
+
+def test_where_no_row_is_complete_this_is_said(many, tmp_path, capsys):
+    lacking = "(random and cartpole and seed=2) or (mewma and hopper)"
+    assert submit(many, tmp_path, "--complete", "-k", lacking) == 4
+    assert "no row of these results has all 16 cells" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_row_without_some_anomalies_is_refused_or_left_out(many, tmp_path, capsys):
+    some = "random or (mewma and not order and not iid)"
+    assert submit(many, tmp_path, "-k", some) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "cartpole lacks iid" in out
+    assert "run them, or leave out what is not complete" in out
+    assert submit(many, tmp_path, "-k", some, "--complete") == 0
+    assert "left out: mewma[h=1,seed=0], which has 14 of 16 cells" in capsys.readouterr().out
+
+
+# Size
+
+
+def test_large_files_are_packed_and_read_like_plain_ones(many, tmp_path, monkeypatch, capsys):
+    assert submit(many, tmp_path / "plain", "--complete") == 0
+    monkeypatch.setattr(packed, "LARGE", 10_000)
+    assert submit(many, tmp_path / "packed", "--complete") == 0
+    ((plain,), (small,)) = (read_entries(tmp_path / name) for name in ("plain", "packed"))
+    assert {p.name for p in small.path.iterdir()} == {
+        "entry.json", "records.jsonl.gz", "curves.json.gz"
+    }  # fmt: skip
+    assert small.meta.files.keys() == {"records.jsonl.gz", "curves.json.gz"}
+    assert [r.to_json() for r in small.records] == [r.to_json() for r in plain.records]
+    assert packed.read_text(small.curves) == plain.curves.read_text()
+    boards = [tmp_path / f"board-{name}" for name in ("plain", "packed")]
+    for entry, board in zip((plain, small), boards, strict=True):
+        root = str(entry.path.parent)
+        assert cli.main(["leaderboard", "build", root, "--output", str(board), "-q"]) == 0
+    one, other = (
+        {p.relative_to(b): p.read_bytes() for b in [board] for p in b.rglob("*") if p.is_file()}
+        for board in boards
+    )
+    assert one == other
+
+
+def test_packing_gives_the_same_bytes_and_no_name_or_time():
+    content = b"a record\n" * 1000
+    once = packed.pack(content)
+    assert once == packed.pack(content)
+    # RFC 1952: no flags, no time.
+    assert once[3:8] == bytes(5)
+    assert packed.unpack(once) == content
+
+
+def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
+    from oodd_eval.submission import submit as submission
+
+    monkeypatch.setattr(submission, "LARGE", 1000)
+    assert submit(many, tmp_path, "--complete") == 0
+    out = capsys.readouterr().out
+    assert "MB; next:" in out
+    assert "a burden to the repository" in " ".join(out.split())
+
+
+# Curves
+
+
+@pytest.mark.parametrize(
+    ("extent", "expected"),
+    [
+        ("rows", ALL - {"random[h=1,seed=1]"}),
+        ("detectors", {"mewma[h=1,seed=0]", "persistence[h=3,seed=0]", "random[h=1,seed=0]"}),
+        ("none", set()),
+    ],
+)
+def test_curves_are_of_first_seeds_and_of_as_many_rows_as_asked_for(many, extent, expected):
+    records = ResultsDirectory(many[1]).records()
+    drawn = with_curves(records, extent)
+    assert {r.cell.partition("::")[2] for r in drawn} == expected
+    assert len(drawn) == 16 * len(expected)
+
+
+def test_a_first_seed_that_failed_gives_way_to_the_next(many):
+    records = [
+        replace(r, status="error", reason="no") if (r.detector, r.seed) == ("random", 0) else r
+        for r in ResultsDirectory(many[1]).records()
+    ]
+    drawn = with_curves(records, "detectors")
+    assert {r.seed for r in drawn if r.detector == "random"} == {1}
+
+
+def test_curves_of_some_rows_pass_and_none_leave_no_file(many, tmp_path, capsys):
+    assert submit(many, tmp_path / "a", "--complete", "--curves", "detectors") == 0
+    (entry,) = read_entries(tmp_path / "a")
+    assert len(json.loads(entry.curves.read_text())["units"]) == 48
+    assert submit(many, tmp_path / "b", "--complete", "--curves", "none") == 0
+    (entry,) = read_entries(tmp_path / "b")
+    assert entry.curves is None
+
+
+@pytest.fixture(scope="module")
+def drawn(many, tmp_path_factory):
+    root = tmp_path_factory.mktemp("drawn")
+    assert submit(many, root, "--complete") == 0
+    return root / "all"
+
+
+def test_nobody_chooses_the_seed_that_looks_best(drawn, tmp_path):
+    draft = Draft(drawn, tmp_path)
+    curves = json.loads(draft.file("curves.json").read_text())
+    for unit in curves["units"]:
+        if unit["detector"] == "random":
+            unit.update(seed=1, cell=unit["cell"].replace("seed=0", "seed=1"))
+    draft.file("curves.json").write_text(json.dumps(curves))
+    assert_refused(draft.verdict(), "units", "are of random[h=1,seed=1], but a row's curves are of")
+
+
+def test_nobody_chooses_the_cells_that_look_best(drawn, tmp_path):
+    draft = Draft(drawn, tmp_path)
+    curves = json.loads(draft.file("curves.json").read_text())
+    curves["units"] = [
+        u for u in curves["units"] if (u["detector"], u["anomaly"]) != ("random", "iid")
+    ]
+    draft.file("curves.json").write_text(json.dumps(curves))
+    assert_refused(draft.verdict(), "units", "lack many/cartpole/iid::random")
+
+
+# The command
+
+
+def commands_of(records):
+    return [shlex.split(part) for part in run_command(records).split(" && ")]
+
+
+def test_a_command_names_the_runs_and_no_others(many):
+    records = [r for r in ResultsDirectory(many[1]).records() if r.seed != 2]
+    found = {" ".join(words[2:]) for words in commands_of(records)}
+    both = "--env cartpole,hopper --split many --horizon"
+    assert found == {
+        f"--detector random {both} 1 --seed 0,1",
+        f"--detector persistence {both} 3 --seed 0",
+        f"--detector mewma {both} 1 --seed 0",
+        f"--detector mewma {both} 1 --seed 0 --param order=2",
+    }
+    assert not rules.command(run_command(records))
+
+
+def test_runs_that_are_alike_share_a_command(many):
+    (first,) = [
+        r for r in ResultsDirectory(many[1]).records()
+        if r.cell.endswith("cartpole/iid::random[h=1,seed=0]")
+    ]  # fmt: skip
+    records = [
+        replace(first, detector=d, horizon=h, seed=s, environment=e)
+        for d in ("random", "clock") for h in (1, 10) for s in (0, 1, 10, 2) for e in ENVIRONMENTS
+    ]  # fmt: skip
+    (words,) = commands_of(records)
+    assert words[2:] == [
+        "--detector", "clock,random", "--env", "all", "--split", "many", "--horizon", "1,10",
+        "--seed", "0,1,2,10",
+    ]  # fmt: skip
+
+
+def test_commands_that_are_too_long_end_with_a_whole_one(many):
+    first = ResultsDirectory(many[1]).records()[0]
+    records = [
+        replace(first, provenance=first.provenance | {"overrides": {"width": i}})
+        for i in range(100)
+    ]
+    text = run_command(records)
+    assert 3800 < len(text) <= 4000
+    assert not rules.command(text)
+    assert text.rpartition("--param ")[2].startswith("width=")
+
+
+def test_results_of_a_damaged_reproduction_have_a_plain_command(many, tmp_path):
+    from oodd_eval.submission.selecting import made_with
+
+    records = ResultsDirectory(many[1]).records()
+    assert made_with(tmp_path, records) == run_command(records)
+    for text in ("no json", "[]", '{"tier": {"name": "x; rm", "split": "y"}}'):
+        (tmp_path / "reproduction.json").write_text(text)
+        assert made_with(tmp_path, records) == run_command(records)
+
+
+def test_records_of_a_packed_entry_serve_where_results_do(many, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(packed, "LARGE", 10_000)
+    assert submit(many, tmp_path / "entries", "--complete") == 0
+    entry = tmp_path / "entries" / "all"
+    assert cli.main(["compare", str(many[1]), "--against", str(entry)]) == 0
+    shutil.rmtree(entry)
