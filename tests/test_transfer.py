@@ -389,8 +389,9 @@ def test_a_cut_off_archive_is_refused(tiny_split, home, tmp_path, name, share):
     archive = pack(tiny_split, tmp_path / name)
     content = archive.read_bytes()
     archive.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(SplitError):
+    with pytest.raises(SplitError) as refused:
         fetch(str(archive))
+    assert "\n" not in str(refused.value)
     assert not list(home.glob("*/manifest.json"))
 
 

@@ -89,9 +89,11 @@ class ArchiveSource:
             except (OSError, EOFError, zlib.error, *_NO_ARCHIVE) as error:
                 if isinstance(error, SplitError):
                     raise
+                # tarfile's longest message has a line for every kind that it has tried.
+                why = (str(error) or type(error).__name__).splitlines()[0].rstrip(":")
                 raise SplitError(
-                    f"{path.name} cannot be read as a tar or zip archive ({error}): it is "
-                    "truncated or something else, fetch it again"
+                    f"{path.name} cannot be read as a tar or zip archive ({why}): it is truncated "
+                    "or something else, fetch it again"
                 ) from error
             self._stack = stack.pop_all()
 
