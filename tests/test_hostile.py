@@ -15,6 +15,7 @@ import pytest
 from helpers_plugins import install
 
 from oodd_eval.processes import LONGEST_REASON
+from oodd_eval.records import STATUSES
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks into /proc")
 
@@ -310,6 +311,12 @@ def test_plugins_that_fail_at_import_are_named(hostile):
     err = hostile[0][0].stderr
     assert "plug-in 'leavesatimport' of oodd-leavesatimport is broken: SystemExit: 0" in err
     assert "plug-in 'brokenatimport' of oodd-brokenatimport is broken: ModuleNotFoundError" in err
+
+
+def test_the_page_about_isolation_tells_every_state():
+    page = (Path(__file__).parents[1] / "docs" / "isolation.md").read_text()
+    told = re.findall(r"^\| `(\w+)` \| ", page, re.MULTILINE)
+    assert ("ok", *told) == STATUSES
 
 
 def test_no_process_is_left_behind(hostile):

@@ -21,8 +21,10 @@ from oodd_eval.testing import (
     Result,
     checks_manners,
     detector_checks,
+    problem,
     run_checks,
 )
+from oodd_eval.testing.supervise import MOST_DEATHS
 
 NAMES = [check.name for check in detector_checks()]
 
@@ -75,6 +77,35 @@ def test_a_good_detector_passes_every_check(check):
 def test_a_good_detector_passes_at_any_horizon(horizon):
     report = run_checks(GOOD, horizon=horizon)
     assert {result.status for result in report.results} == {"passed"}, report
+
+
+# The page about them
+
+PAGE = (Path(__file__).parents[1] / "docs" / "conformance.md").read_text()
+
+
+def rows_of_the_page():
+    """Name, what, why, and how to mend: the rows of the page's tables of checks."""
+    found = [re.split(r" \| ", line.strip("| ")) for line in PAGE.splitlines() if "|" in line]
+    return [row for row in found if len(row) == 4 and row[0].startswith("`")]
+
+
+def test_the_page_has_every_check_in_its_order_and_its_own_words():
+    told = [(name.strip("`"), what) for name, what, *_ in rows_of_the_page()]
+    assert told == [(check.name, check.summary) for check in detector_checks()]
+
+
+def test_the_page_says_of_every_check_why_and_how_to_mend_it():
+    reasons = [row[2:] for row in rows_of_the_page()]
+    assert all(len(text) >= 10 for row in reasons for text in row)
+    assert len({text for row in reasons for text in row}) == 2 * len(NAMES)
+
+
+def test_the_page_names_the_budgets_and_the_size_of_the_problem():
+    for text in (f"{checks_manners.MOST_SECONDS:g} s", f"{checks_manners.MOST_MEGABYTES:g} MB",
+                 f"{problem.EPISODES} short nominal episodes", f"{problem.SENSORS} sensors",
+                 f"{problem.ACTIONS} action", f"{MOST_DEATHS} such ends"):  # fmt: skip
+        assert text in PAGE
 
 
 # Results
