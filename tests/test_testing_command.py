@@ -64,6 +64,9 @@ class ClosesAll(Fine):
     def fit(self, nominal):
         os.closerange(0, 100); time.sleep(600)
 
+class Ugly(Fine):
+    def fit(self, nominal): raise ValueError("\\udcff \\x1b[2J [/red] " + "no " * 10**5)
+
 class Raises(Fine):
     def score(self, x): raise RuntimeError("no mood")
 
@@ -139,6 +142,14 @@ def test_verbose_prints_where_a_detector_raised(check):
     assert "Traceback" in out
     assert 'raise RuntimeError("no mood")' in out
     assert "Traceback" not in check("raises", "-k", "fits")[1]
+
+
+def test_messages_of_a_detector_are_made_fit_to_print(check):
+    code, out, err = check("ugly", "-v", "-k", "fits")
+    assert (code, err) == (1, "")
+    assert "fit raised ValueError: \ufffd \ufffd[2J [/red] no no" in " ".join(out.split())
+    assert {c for c in out if not c.isprintable()} == {"\n"}
+    assert len(out) < 10_000
 
 
 def test_horizon_and_parameters_reach_the_detector(check):
