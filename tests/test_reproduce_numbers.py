@@ -1,6 +1,7 @@
 """Numbers of a reproduction: means, seeds, what is missing, the paper's digits, tables and CSV."""
 
 import csv
+import dataclasses
 import io
 import json
 import math
@@ -254,15 +255,22 @@ def test_caption_names_data_seeds_and_a_reduced_tier(tmp_path):
     records = everywhere("riqn", [0.8, 0.6]) + everywhere("riqn", [0.8, 0.6], seed=1)
     records += everywhere("riqn", [0.8, 0.6], horizon=10)
     numbers = compute(table, Evidence(records))
-    text = captions.caption(header(), table, numbers)
+    whole = header(tier=TIERS["full"], split="standard", train=500, calibration=100, test=50)
+    text = captions.caption(whole, table, numbers)
     assert "Detector seeds: 2 for Δ = 1; 1 for Δ = 10." in text
-    assert "2 test seeds" in text
+    assert "50 test seeds" in text
     assert "reduced" not in text
-    reduced = header(tier=TIERS["reduced"], split="reduced")
+    reduced = dataclasses.replace(whole, tier=TIERS["reduced"], split="reduced", calibration=50,
+                                  test=20)  # fmt: skip
     less = "the first 50 of 100 calibration trajectories and 20 of 50 test seeds of split standard"
     assert less in captions.caption(reduced, table, numbers)
     assert less in captions.of_returns(reduced)
     assert less in "\n".join(captions.opening(reduced, records))
+    mini = captions.caption(header(), table, numbers)
+    assert "(**reduced**: split standard has 500 training trajectories, 100 calibration " in mini
+    assert "and 50 test seeds, and episodes end after 300 steps here)" in mini
+    own = captions.caption(dataclasses.replace(whole, split="mine", test=10), table, numbers)
+    assert "(**reduced**: split standard has 50 test seeds)" in own
 
 
 def test_page_tells_of_failures_with_their_reasons(tmp_path):

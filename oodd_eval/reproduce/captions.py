@@ -76,10 +76,8 @@ def caption(header: Header, experiment: Experiment, numbers: Numbers) -> str:
 def of_returns(header: Header) -> str:
     """Return the caption of Table 2."""
     definition = SPLITS.get(header.split)
-    cap = definition.episode_cap if definition else None
-    short = f" Episodes end after {cap} steps here, so returns are smaller than the paper's." if (
-        cap
-    ) else ""  # fmt: skip
+    cut = definition and definition.episode_cap
+    short = " Returns are smaller than the paper's because episodes are cut." if cut else ""
     return (
         f"In the paper: Table 2. {_data(header)}. Mean over test seeds with a 95 % bootstrap "
         f"interval.{short} Policies are this benchmark's own, of the paper's algorithms."
@@ -110,18 +108,26 @@ def _data(header: Header) -> str:
 
 
 def _reduction(header: Header) -> str:
-    """Say what a split lacks whose trajectories are the first ones of another published split."""
-    own = SPLITS.get(header.split)
-    for whole in SPLITS.values():
-        if own and whole.seed_base == own.seed_base and whole.test > own.test:
-            sizes = {
-                "training trajectories": (own.train, whole.train),
-                "calibration trajectories": (own.calibration, whole.calibration),
-                "test seeds": (own.test, whole.test),
-            }
-            less = [f"{few} of {all_} {what}" for what, (few, all_) in sizes.items() if few < all_]
-            return f" (**reduced**: the first {' and '.join(less)} of split {whole.name})"
-    return ""
+    """Say what the data lacks beside split standard; nothing where it lacks nothing."""
+    whole, own = SPLITS["standard"], SPLITS.get(header.split)
+    sizes = {
+        "training trajectories": (header.train, whole.train),
+        "calibration trajectories": (header.calibration, whole.calibration),
+        "test seeds": (header.test, whole.test),
+    }
+    less = [f"{few} of {all_} {what}" for what, (few, all_) in sizes.items() if few < all_]
+    if own and own.seed_base == whole.seed_base:
+        first = f"the first {_listed(less)} of split {whole.name}"
+        return f" (**reduced**: {first})" if less else ""
+    usual = [f"{all_} {what}" for what, (few, all_) in sizes.items() if few < all_]
+    lacks = [f"split {whole.name} has {_listed(usual)}"] if usual else []
+    if own and own.episode_cap:
+        lacks.append(f"episodes end after {own.episode_cap} steps here")
+    return f" (**reduced**: {', and '.join(lacks)})" if lacks else ""
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]])) if names else ""
 
 
 def _origin(record: Record) -> str:
