@@ -271,6 +271,11 @@ def test_unknown_cost_is_a_dash():
     assert bare.rows[0][3:] == [UNDEFINED, UNDEFINED, UNDEFINED]
 
 
+def test_a_cost_too_small_to_matter_is_said_to_be_small():
+    tiny = dataclasses.replace(record("clock", [0.5] * SEEDS), seconds_fit=8.4e-05)
+    assert ranking_tables.cost(ranked([tiny])).rows[0][3:] == ["< 0.001", "50", "100"]
+
+
 def test_few_test_seeds_are_said_to_be_few():
     assert any("With 12 test seeds" in line for line in ranking_tables.notes(ranked(board())))
 

@@ -157,7 +157,12 @@ def _percent(rate: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Return two significant digits, or the integer part of what is larger."""
+    """Return two significant digits, the integer part of what is larger, no more than thousandths.
+
+    A cost that is smaller than that is none.
+    """
     if math.isnan(value):
         return UNDEFINED
+    if 0 < value < 0.001:
+        return "< 0.001"
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
