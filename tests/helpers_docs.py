@@ -41,8 +41,12 @@ NOT_RUN = [
 PARSED_ONLY = [
     Rule(r"^oodd-eval data build (standard|paper|reduced)\b", "hours of simulation"),
     Rule(r"^oodd-eval data fetch https?:", "needs a network; test_transfer serves one"),
+    Rule(r"^oodd-eval reproduce .*--render-only", "renders what hours computed; "
+         "test_reproduce_run renders what minutes did"),
+    Rule(r"leaderboard submit reproduction\b", "submits what hours computed; "
+         "test_submission_reproduction submits what minutes did"),
     Rule(r"--executor dask://", "needs a cluster; test_executors starts one"),
-]
+]  # fmt: skip
 """Commands whose options are checked, and no more."""
 
 QUICKER = [
@@ -50,9 +54,11 @@ QUICKER = [
     Rule(r"(?<=--env )all\b", "one environment shows what seven do", "cartpole"),
     Rule(r"--detector (\S*(riqn|npn)\S*)", "trains for minutes",
          r"--detector \1 --param updates=2"),
-    Rule(r"^(oodd-eval run .*(riqn|npn|rf|pyod:|sklearn:|forecast:).*)$", "quick enough on a few",
-         r"\1 --limit 4"),
-    Rule(r"--train \d+ --calibration \d+ --test \d+ --cap \d+", "a few episodes do", TINY_SPLIT),
+    Rule(r"^(oodd-eval run .*(riqn|npn|\brf\b|pyod:|sklearn:|forecast:).*)$",
+         "quick enough on a few", r"\1 --limit 4"),
+    Rule(r"--param trees=\d+", "small forests are forests", "--param trees=2"),
+    Rule(r"--train \d+ --calibration \d+ --test \d+( --cap \d+)?", "a few episodes do",
+         TINY_SPLIT),
     Rule(r"^(oodd-eval data build (?!.*--env).*)$", "one environment shows what seven do",
          r"\1 --env cartpole"),
     Rule(r"--episodes \d+", "one shows what twenty do", "--episodes 1"),
@@ -147,8 +153,9 @@ class Session:
             env[name] = value
         known = {"oodd-eval": "oodd_eval", "pytest": "pytest"}
         program = [sys.executable, "-m", known[words[0]]] if words[0] in known else words[:1]
-        if words[0] in {"python", "python3"}:
-            program = [sys.executable]
+        if words[0] == "python" and words[1].endswith(".py"):
+            # Scripts of the repository, which the documents call from its root.
+            program = [sys.executable, str(ROOT / words.pop(1))]
         done = subprocess.run(
             [*program, *words[1:]], env=env, capture_output=True, text=True, check=False
         )

@@ -68,6 +68,22 @@ KNOWN = dict(
                 Rule(r"--horizon 1,10 --seed 0,1", "two fits show what four do", "--seed 0,1"),
             ),
         ),
+        page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
+        page(
+            "docs/submitting.md",
+            before=("oodd-eval new mine", "pip install -e ./oodd-mine"),
+            rules=(
+                Rule(r"mine-standard", "an entry is named after its split", "mine-mini"),
+                Rule(r"--env (hopper,)?cartpole|--env hopper", "one shows it", "--env cartpole"),
+                Rule(r"(?<=--trust re-scored)$", "the entry is there", " --results another"),
+                # In another order, so that it is not made quicker still.
+                Rule(
+                    r"--train 500 --calibration 100 --test 50",
+                    "enough to come out alike",
+                    "--test 8 --train 12 --calibration 8 --cap 200 --env cartpole",
+                ),
+            ),
+        ),
         page(
             "detectors/README.md",
             files={"oodd_range.py": "```python", "pyproject.toml": "```toml"},
