@@ -121,6 +121,17 @@ class Browser:
             if e["method"] == "Network.requestWillBeSent"
         ]
 
+    def processor_seconds(self):
+        """Seconds that the page's process has run on a processor, whatever else runs."""
+        self._command("Performance.enable")
+        found = self._command("Performance.getMetrics")["metrics"]
+        (seconds,) = [metric["value"] for metric in found if metric["name"] == "ProcessTime"]
+        return seconds
+
+    def _command(self, name):
+        body = {"cmd": name, "params": {}}
+        return self._call("POST", f"{self._session}/goog/cdp/execute", body)
+
     def screenshot(self, path):
         path.write_bytes(base64.b64decode(self._call("GET", f"{self._session}/screenshot")))
 

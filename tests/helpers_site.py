@@ -2,7 +2,9 @@
 
 import functools
 import itertools
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from helpers_records import make_record
@@ -50,7 +52,8 @@ def make_curves(record, seed, twins_seed=0):
     rng = np.random.default_rng([1, seed])
     anomalous = [rng.normal(size=110) for _ in range(3)]
     onsets = [35, 50, 62]
-    for scores, onset in zip(anomalous, onsets, strict=True):
+    for scores, twin, onset in zip(anomalous, twins, onsets, strict=True):
+        scores[:onset] = twin[:onset]
         scores[onset:] += 1.5
     rule = AlarmRule(Standardization(mean=0.0, std=1.0))
     sweep = Sweep.over(twins, rule, thresholds(twins, rule))
@@ -129,11 +132,17 @@ def example(root):
     return read_entries(root)
 
 
-def full(root, detectors=14, splits=2):
-    """Data and curves of a site as large as the real one gets: all cells, and all metrics.
+def stricter_target(columns):
+    """Columns by metric, and those at the target of 1 % again as those at 0.1 %."""
+    return columns | {
+        name.replace("_1pct", "_01pct"): column
+        for name, column in columns.items()
+        if name.endswith("_1pct")
+    }
 
-    One row is computed, of numbers as long as real ones; the others are copies of other names.
-    """
+
+def one_row(root):
+    """Data and curves of a site of one detector on all cells."""
     rng = np.random.default_rng(0)
     records, units = [], []
     for e in ENVIRONMENTS:
@@ -142,18 +151,25 @@ def full(root, detectors=14, splits=2):
                 name: list(rng.uniform(0, 40 if "delay" in name else 1, 10)) for name in METRICS
             }
             record = describe(make_record("detector-0", e, a, values=given))
-            calibrated = {
-                name.replace("1pct", "01pct"): m
-                for name, m in record.metrics.items()
-                if name.endswith("_at_1pct")
-            }
             others = [*POOLED, "threshold_at_1pct", "threshold_at_01pct"]
-            more = calibrated | {name: Metric(rng.uniform()) for name in others}
-            records.append(replace(record, metrics=record.metrics | more))
+            metrics = stricter_target(record.metrics)
+            metrics |= {name: Metric(rng.uniform()) for name in others}
+            columns = stricter_target(record.per_trajectory)
+            records.append(replace(record, metrics=metrics, per_trajectory=columns))
             units.append(make_curves(record, len(units), twins_seed=list(ENVIRONMENTS).index(e)))
     write_entry(root, "one", records)
     write_curves({"units": units}, root / "one" / "curves.json")
-    data, curves = site_data(read_entries(root))
+    return site_data(read_entries(root))
+
+
+@functools.cache
+def full(detectors=14, splits=2):
+    """Data and curves of a site as large as the real one gets: all cells, and all metrics.
+
+    One row is computed, of numbers as long as real ones; the others are copies of other names.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        data, curves = one_row(Path(directory))
     (board,) = data["boards"]
     (row,) = board["rows"]
     names = [f"detector-{i}" for i in range(detectors)]

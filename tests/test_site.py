@@ -280,6 +280,7 @@ def test_every_metric_of_the_page_is_explained(page):
             if (pooled := POOLED.get(metric)) is not None:
                 assert data["metrics"][metric]["meaning"] == pooled
     assert set(data["boards"][0]["intervals"]) <= set(WITH_INTERVALS)
+    assert set(METRICS) >= {name.partition("_at_")[0] for name in WITH_INTERVALS}
 
 
 def test_the_papers_digits_are_those_of_its_table(page):
@@ -354,12 +355,17 @@ def test_unpacked_curves_are_those_of_the_entry_to_a_pixel(entries, page):
             (("cusum", "twin_cusum"), cell["example"]["cusum_step"]),
         ):
             largest = max(abs(v) for name in names for v in example[name] if v is not None)
+            same = cell["example"][f"same_{names[0]}"]
+            assert same >= example["onset"] - example["start"]
             for name in names:
-                shown = [v if v is None else v * step for v in cell["example"][name]]
+                kept_here = cell["example"][name]
+                if name == names[1]:
+                    kept_here = [*cell["example"][names[0]][:same], *kept_here]
+                shown = [v if v is None else v * step for v in kept_here]
                 assert shown == pytest.approx(example[name], abs=largest / 250)
                 compared += len(shown)
-        same = ("index", "auc_matched", "onset", "length", "start", "alarms", "twin_alarms")
-        assert {n: cell["example"][n] for n in same} == {n: example[n] for n in same}
+        plain = ("index", "auc_matched", "onset", "length", "start", "alarms", "twin_alarms")
+        assert {n: cell["example"][n] for n in plain} == {n: example[n] for n in plain}
     assert compared > 8 * 4 * 90
 
 
@@ -370,6 +376,15 @@ def test_lists_that_cells_share_are_kept_once():
     assert found["lists"] == [[0, 1], [0.5, 1]]
     assert found["cells"]["ant/iid"]["roc"] == {"fpr": 0, "tpr": 1}
     assert found["cells"]["ant/drift"]["delay_far"] == {"far": 0}
+
+
+def test_a_twin_keeps_only_what_differs():
+    example = {"scores": [None, 1, 2, 3], "twin": [None, 1, 2.5, 3, 1],
+               "cusum": [0, 0, 0], "twin_cusum": [0]}  # fmt: skip
+    one = {"roc": {}, "delay_far": {}, "example": example}
+    found = packed({"ant/iid": one})["cells"]["ant/iid"]["example"]
+    assert (found["same_scores"], found["same_cusum"], found["twin_cusum"]) == (2, 1, [])
+    assert [v * found["score_step"] for v in found["twin"]] == [2.5, 3, 1]
 
 
 @pytest.mark.parametrize(
@@ -398,8 +413,8 @@ def test_an_example_without_defined_scores_is_kept():
 # -- size -----------------------------------------------------------------------------------------
 
 
-def test_a_full_site_of_two_splits_is_below_five_megabytes(tmp_path, monkeypatch):
-    data, curves = helpers_site.full(tmp_path)
+def test_a_full_site_of_two_splits_is_below_five_megabytes(monkeypatch):
+    data, curves = helpers_site.full()
     assert len(curves) == sum(len(b["rows"]) for b in data["boards"]) == 28
     assert all(len(r["cells"]) == 56 for b in data["boards"] for r in b["rows"])
     monkeypatch.setattr(site, "site_data", lambda _: (data, curves))

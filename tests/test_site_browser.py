@@ -166,6 +166,17 @@ def test_the_keyboard_reaches_every_control_and_opens_a_detector(browser):
     assert browser.run("return document.activeElement.textContent") == "riqn"
 
 
+def test_the_arrow_keys_choose_columns_and_filters(browser):
+    browser.run("document.querySelector('[name=view]:checked').focus()")
+    browser.press("right")
+    assert browser.text("caption").startswith("AUCs:")
+    assert browser.run("return document.activeElement.value") == "aucs"
+    browser.run("document.querySelector('[name=group]').focus()")
+    browser.press("down")
+    assert "sensor anomalies" in browser.text("caption")
+    assert browser.run("return document.activeElement.name") == "group"
+
+
 def test_means_and_intervals_are_the_boards_for_every_selection(browser, entries):
     section = sections(entries)[0]
     board = section.ranks.board
@@ -334,7 +345,8 @@ def test_curves_are_drawn_from_the_entrys_numbers(browser, entries):
     assert f"onset τ = {example['onset']}" in browser.texts(".onset text")
     assert f"Test trajectory {example['index']}," in browser.texts("figcaption")[2]
     first = next(t for t in example["alarms"] if t >= example["onset"]) - example["onset"]
-    assert f"anomalous {first} steps after the onset" in browser.texts("figcaption")[2]
+    when = "at the onset" if first == 0 else f"{first} step{'s' * (first > 1)} after the onset"
+    assert f"anomalous {when}" in browser.texts("figcaption")[2]
     # Every point of the ROC curve, and its corner, is on the line.
     path = browser.run("return document.querySelector('#cell .line.anomalous').getAttribute('d')")
     assert path.count("L") == len(unit["roc"]["fpr"])
@@ -545,31 +557,28 @@ def test_a_board_on_which_everything_failed_is_shown(window, tmp_path):
 @pytest.fixture(scope="module")
 def large(tmp_path_factory):
     """Address of the page of 14 detectors on two splits, all cells and curves: some 4 MB."""
-    data, curves = helpers_site.full(tmp_path_factory.mktemp("large"))
+    data, curves = helpers_site.full()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(site, "site_data", lambda _: (data, curves))
         return site.render([], tmp_path_factory.mktemp("site")).as_uri()
 
 
-def test_the_first_view_takes_less_than_a_second(window, large, tmp_path):
-    def milliseconds(url):
-        """Until the page is drawn and its script has run."""
+def test_the_first_view_takes_less_than_a_second(window, large):
+    walls, processors = [], []
+    paint = "performance.getEntriesByName('first-contentful-paint')[0]"
+    load = "performance.getEntriesByType('navigation')[0]"
+    while len(walls) < 8 and min(walls, default=1.0) >= 1.0:
         window.open("about:blank")
-        window.open(url)
-        paint = "performance.getEntriesByName('first-contentful-paint')[0]"
-        load = "performance.getEntriesByType('navigation')[0]"
+        before = window.processor_seconds()
+        window.open(large)
         window.wait_for(f"{paint} && {load}.loadEventEnd > 0")
-        return window.run(f"return Math.max({paint}.startTime, {load}.loadEventEnd)")
-
-    def rows():
-        return len(window.texts(LABELS))
-
-    blank = tmp_path / "blank.html"
-    blank.write_text("<!doctype html><title>Blank</title><p>Nothing.</p>")
-    # The best of several, less what a page without content takes: a busy machine is not our fault.
-    shortest = min(milliseconds(large) for _ in range(5))
-    assert rows() == 14
-    assert shortest - min(milliseconds(blank.as_uri()) for _ in range(3)) < 1000
+        processors.append(window.processor_seconds() - before)
+        # Until the page is drawn and its script has run, whichever is later.
+        drawn = window.run(f"return Math.max({paint}.startTime, {load}.loadEventEnd)")
+        walls.append(drawn / 1000)
+    assert len(window.texts(LABELS)) == 14
+    # Where other programs take the processors, what the page itself needs of them has to be little.
+    assert min(walls) < 1.0 or 0.0 < min(processors) < 0.6, (walls, processors)
 
 
 def test_all_cells_of_a_large_site_open(window, large):

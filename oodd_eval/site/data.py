@@ -27,7 +27,8 @@ from oodd_eval.submission.format import Entry, SubmittedEntry
 
 WITH_INTERVALS: Final = (
     "auc_matched", "auc", "delay", "delay_null", "delay_censored", "missed", "far", "far_twin",
-    "delay_censored_at_1pct", "missed_at_1pct", "far_twin_at_1pct",
+    *(f"{name}_{suffix}" for suffix in ("at_1pct", "at_01pct")
+      for name in ("delay", "delay_censored", "missed", "far_twin")),
 )  # fmt: skip
 """Metrics that have intervals on the site: those that comparisons are made with."""
 

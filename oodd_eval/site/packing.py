@@ -1,10 +1,11 @@
-"""Curves as the page keeps them: a list that cells share stands there once, examples on a grid.
+"""Curves as the page keeps them: what is shared stands there once, and examples are on a grid.
 
-What is drawn from them is the same to the pixel; the page is a third smaller.
+What is drawn from them is the same to the pixel; the page is much smaller.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,7 +36,8 @@ def packed(curves: Mapping[str, Json]) -> Json:
     -------
     dict
         ``lists``: every list of ``roc`` and ``delay_far``, once. ``cells``: the same as `curves`,
-        but with places in ``lists`` for these lists; examples are those of `gridded`.
+        but with places in ``lists`` for these lists; examples are those of `gridded`, and their
+        twins lack the first ``same_scores`` and ``same_cusum`` values, which are no others.
 
     Examples
     --------
@@ -55,7 +57,7 @@ def packed(curves: Mapping[str, Json]) -> Json:
             part: {key: place(numbers) for key, numbers in cell[part].items()}
             for part in ("roc", "delay_far")
         }
-        | {"example": gridded(cell["example"])}
+        | {"example": _without_same(gridded(cell["example"]))}
         for name, cell in curves.items()
     }
     return {"lists": [list(numbers) for numbers in places], "cells": cells}
@@ -87,6 +89,17 @@ def gridded(example: Json) -> Json:
         if step is not None:
             for name in names:
                 found[name] = [None if v is None else round(v / step) for v in example[name]]
+    return found
+
+
+def _without_same(example: Json) -> Json:
+    """Leave out the beginnings of the twin's series: up to the onset both are the same."""
+    found = dict(example)
+    for name, twin in (("scores", "twin"), ("cusum", "twin_cusum")):
+        pairs = zip(example[name], example[twin], strict=False)
+        same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+        found[f"same_{name}"] = same
+        found[twin] = example[twin][same:]
     return found
 
 

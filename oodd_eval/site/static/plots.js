@@ -184,7 +184,7 @@ function trajectoryFigure(example) {
   const bending = Boolean(scoreAxis.bend || cusumAxis.bend);
   const first = (alarms) => {
     const found = alarms.find((t) => t >= example.onset);
-    return found === undefined ? "none in this window" : `${found - example.onset} steps after the onset`;
+    return found === undefined ? "none in this window" : found === example.onset ? "at the onset" : `${found - example.onset} step${found === example.onset + 1 ? "" : "s"} after the onset`;
   };
   const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;
   return figure([scores.drawing, cusum.drawing],
