@@ -80,7 +80,7 @@ def _groups_of_anomalies() -> list[Claim]:
     each = [
         Claim(
             f"sensor-above-dynamics-{name}",
-            f"Sensor anomalies give {label} a higher AUC than dynamics anomalies",
+            f"Sensor anomalies give a higher AUC than dynamics anomalies: {label}",
             place,
             "sensor minus dynamics, Δ = 1",
             "auc",
@@ -88,13 +88,14 @@ def _groups_of_anomalies() -> list[Claim]:
             BETTER,
             EVERYWHERE,
         )
-        for name, label, setups in [*named, ("models", "the four models", MODEL_SETUPS)]
+        for name, label, setups in [*named, ("models", "mean over models", MODEL_SETUPS)]
     ]
     return [
         *each,
         Claim(
             "sensor-above-dynamics-everywhere",
-            "The same for the mean over models, in every environment",
+            "The mean over models is higher for sensor than for dynamics anomalies in every "
+            "environment",
             place,
             "least clear of the environments",
             "auc",
