@@ -155,7 +155,7 @@ function axisOf(values, unit, step, label) {
   }
   const room = 0.05 * (high - low);
   const range = [low < 0 ? low - room : 0, high + room];
-  return { range, ticks: ticks(...range, 4), label };
+  return { range, ticks: ticks(...range, 6), label };
 }
 
 function trajectoryFigure(example) {
