@@ -240,7 +240,8 @@ def test_a_budget_that_is_used_up_leaves_units_and_says_so(tiny_split, quick, tm
     assert re.search(r"the budget is used up: (9|10) units left", said)
     page = (tmp_path / "out" / "README.md").read_text()
     assert re.search(r"\b[0-8] of 72 fits and scorings have been run\.", page)
-    assert "Not run." in page
+    assert "**Unfinished**" in page
+    assert "not run |" in page
 
 
 def test_the_plan_says_what_remains_and_does_nothing(finished, tiny_split, quick, tmp_path, capsys):
