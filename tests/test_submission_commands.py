@@ -215,6 +215,21 @@ def test_a_detectors_name_belongs_to_one_distribution(submissions, tmp_path, cap
     assert "a name stands for one detector" in capsys.readouterr().out
 
 
+def test_a_cell_that_was_computed_elsewhere_is_the_same_cell(submissions, tmp_path, capsys):
+    first = Draft(submissions.plain, tmp_path)
+    first.write()
+    second = Draft(submissions.full, tmp_path)
+    for record in second.records:
+        record["parameters"] = record["provenance"]["overrides"] = {"device": "cuda"}
+        record["cell"] = record["cell"].replace("]", ",device=cuda]")
+    for path in (second.path / "scores", second.file("curves.json")):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    second.entry["files"] = {"records.jsonl": {}}
+    second.write()
+    assert verify(submissions, tmp_path) == 1
+    assert "cell: is in entry persistence-random-small too" in capsys.readouterr().out
+
+
 def test_a_partial_entry_is_said_to_be_one(submissions, capsys):
     assert verify(submissions, submissions.plain) == 0
     assert "persistence[h=1,seed=0] is partial: 1 of 7 environments" in capsys.readouterr().out

@@ -40,7 +40,10 @@ def many(tmp_path_factory):
 
 
 def submit(many, root, *options):
+    """Submit; without curves, which take their time, unless they are asked for."""
     split, out = many
+    if "--curves" not in options:
+        options = (*options, "--curves", "none")
     return cli.main(
         ["leaderboard", "submit", str(out), "--results", str(root), "--split", str(split),
          "--id", "all", *options]
@@ -108,9 +111,10 @@ def test_a_row_without_some_anomalies_is_refused_or_left_out(many, tmp_path, cap
 
 
 def test_large_files_are_packed_and_read_like_plain_ones(many, tmp_path, monkeypatch, capsys):
-    assert submit(many, tmp_path / "plain", "--complete") == 0
+    options = ("-k", "random and seed=0", "--curves", "rows")
+    assert submit(many, tmp_path / "plain", *options) == 0
     monkeypatch.setattr(packed, "LARGE", 10_000)
-    assert submit(many, tmp_path / "packed", "--complete") == 0
+    assert submit(many, tmp_path / "packed", *options) == 0
     ((plain,), (small,)) = (read_entries(tmp_path / name) for name in ("plain", "packed"))
     assert {p.name for p in small.path.iterdir()} == {
         "entry.json", "records.jsonl.gz", "curves.json.gz"
@@ -184,10 +188,25 @@ def test_curves_of_some_rows_pass_and_none_leave_no_file(many, tmp_path, capsys)
     assert entry.curves is None
 
 
+@pytest.mark.parametrize(
+    ("option", "advice"), [("--curves=rows", "--curves none"), ("--scores", "leave out --scores")]
+)
+def test_scores_that_are_missing_are_named_with_what_to_do(many, tmp_path, option, advice, capsys):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    shutil.copy(many[1] / "records.jsonl", bare)
+    arguments = ["--results", str(tmp_path / "entries"), "--split", str(many[0]), "-k", "random",
+                 "--complete", "--curves", "none", option]  # fmt: skip
+    assert cli.main(["leaderboard", "submit", str(bare), *arguments]) == 4
+    said = capsys.readouterr().err
+    assert "scores are not there in" in said
+    assert advice in said
+
+
 @pytest.fixture(scope="module")
 def drawn(many, tmp_path_factory):
     root = tmp_path_factory.mktemp("drawn")
-    assert submit(many, root, "--complete") == 0
+    assert submit(many, root, "-k", "random", "--complete", "--curves", "rows") == 0
     return root / "all"
 
 

@@ -64,7 +64,7 @@ def _add_submit(actions: Commands[Parser]) -> None:
     add("--citation", default="", metavar="TEXT", help="how to cite the method")
     add("--url", default="", metavar="URL", help="page of the method or its code")
     add("--caption", default="", metavar="TEXT",
-        help="a note under the tables, such as a reduced setting")  # fmt: skip
+        help="a note above the tables, such as a reduced setting")  # fmt: skip
     add("--scores", action="store_true",
         help="include every score, so that others can recompute the metrics")  # fmt: skip
     add("--split", metavar="PATH", help="where the split is, if not at its usual place")

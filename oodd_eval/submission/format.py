@@ -45,7 +45,7 @@ class Entry:
     id
         Name of the entry and of its directory.
     title, submitter, citation, url, caption
-        Plain text for people; the caption is a note under the tables. All but the title may be
+        Plain text for people; the caption is a note above the tables. All but the title may be
         empty.
     detectors
         Names of the detectors in the records, sorted.

@@ -142,6 +142,7 @@ def submit(
         opened = _split(records[0], split)
         drawn = with_curves(records, curves)
         if opened is not None and drawn:
+            _require_scores(drawn, source, "submit with --curves none, or")
             write_curves(make_curves(drawn, source, opened), directory / CURVES)
             packed.shrink(directory / CURVES)
         if scores:
@@ -280,13 +281,23 @@ def _dependencies(distribution: str) -> dict[str, str]:
 
 def _copy_scores(records: Iterable[Record], source: ResultsDirectory, directory: Path) -> None:
     (directory / SCORES).mkdir()
+    for file in _require_scores(records, source, "leave out --scores, or"):
+        shutil.copyfile(file, directory / SCORES / file.name)
+
+
+def _require_scores(
+    records: Iterable[Record], source: ResultsDirectory, instead: str
+) -> list[Path]:
+    """Return the score files of records, each once; refuse when one is not there."""
+    files = []
     for key in sorted({str(r.provenance.get("scores", "")) for r in records}):
         file = source.path / SCORES / f"{key}.h5"
         if rules.score_key(key) or not file.is_file():
             raise UsageError(
-                f"--scores: {str(file)!r} is not there: run again, or submit without --scores"
+                f"scores are not there in {str(file)!r}: {instead} run again into this directory"
             )
-        shutil.copyfile(file, directory / SCORES / file.name)
+        files.append(file)
+    return files
 
 
 def _facts(directory: Path) -> dict[str, dict[str, Any]]:

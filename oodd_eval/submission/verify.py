@@ -7,6 +7,7 @@ records among each other, scores, and last the trajectories of the split, where 
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ from oodd_eval import packed
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.records import Record
 from oodd_eval.results import RECORDS
-from oodd_eval.submission.cells import Records, check_cells
+from oodd_eval.submission.cells import PLACE, Records, check_cells
 from oodd_eval.submission.curves_check import read_curves
 from oodd_eval.submission.entry_check import check_entry
 from oodd_eval.submission.files import check_digests, list_files, name_in
@@ -231,6 +232,16 @@ def verify(
     return verdicts
 
 
+def _cell_key(record: Record) -> str:
+    """Return what only one entry may have: a cell of a split, wherever it was computed."""
+    overrides = {k: v for k, v in record.provenance.get("overrides", {}).items() if k != PLACE}
+    parts = [
+        record.detector, record.horizon, record.seed, overrides, record.environment,
+        record.anomaly, record.split_digest, record.protocol,
+    ]  # fmt: skip
+    return json.dumps(parts, sort_keys=True)
+
+
 def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -> None:
     """Refuse what another entry has too: a cell, or a detector's name from another place.
 
@@ -244,7 +255,7 @@ def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -
         Of this entry.
     """
     for where, record in records.items():
-        key = f"{record.cell} {record.split_digest} {record.protocol}"
+        key = _cell_key(record)
         other, _ = seen.setdefault(key, (name, ""))
         if other != name:
             findings.refuse(
