@@ -2,14 +2,16 @@
 
 For each environment the unit of a build's work is timed, a chunk of seeds: policy, fresh simulator
 per episode, reset, anomalies, checks, stacking and writing. Against it, the same actions are
-stepped through the bare simulator: one simulator, no policy, nothing kept, its reset not counted.
+stepped through the bare simulator as its authors made it: one simulator, no policy, nothing kept,
+its reset not counted.
 Both are CPU time of this process and interleaved, so that a busy machine slows both alike.
 
-Run it with ``python benchmarks/bench_build.py [ENVIRONMENT ...]``.
+Run it with ``python benchmarks/bench_build.py [--rounds N] [ENV ...]``.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import sys
 import tempfile
@@ -22,8 +24,8 @@ from oodd_eval.benchmark import ENVIRONMENTS
 from oodd_eval.simulate.build import Chunk, record_chunk
 from oodd_eval.simulate.environments import make
 from oodd_eval.simulate.policies import load_policy
+from oodd_eval.simulate.quiet import quiet_streams
 
-ROUNDS = 7
 FIRST_SEED = 990 * 10**6
 SHARE = 0.75
 """What is asked for, of the four PyBullet robots."""
@@ -45,25 +47,27 @@ def recorded(environment, part, seed, work):
 
 def stepped(environment, seed, actions):
     """Step the bare simulator through an episode's actions; return CPU seconds."""
-    simulator = make(environment)
-    simulator.reset(seed)
+    simulator = type(make(environment).env)()
+    with quiet_streams():
+        simulator.reset(seed=seed)
     if ENVIRONMENTS[environment].discrete:
         actions = actions.argmax(axis=1).tolist()
-    step = simulator.env.step
+    step = simulator.step
     start = time.process_time()
     for action in actions:
         step(action)
     seconds = time.process_time() - start
-    simulator.close()
+    with quiet_streams():
+        simulator.close()
     return seconds
 
 
-def shares(environment, part):
+def shares(environment, part, rounds):
     """Return rates of both in steps per CPU second and their ratio, medians over the rounds."""
     found = []
     with tempfile.TemporaryDirectory() as work:
         seed = FIRST_SEED
-        while len(found) < ROUNDS:
+        while len(found) < rounds:
             seed += 1
             steps, seconds, actions = recorded(environment, part, seed, Path(work))
             if not steps:
@@ -76,13 +80,18 @@ def shares(environment, part):
     return own, simulators, statistics.median(a / b for a, b in found)
 
 
-def main(names):
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("environments", nargs="*", default=list(ENVIRONMENTS), metavar="ENV")
+    parser.add_argument("--rounds", type=int, default=7, help="seeds of each part (default: 7)")
+    options = parser.parse_args()
     print(f"{'environment':12} {'part':6} {'recorded/s':>11} {'stepped/s':>11} {'share':>6}")
     low = []
-    for environment in names or ENVIRONMENTS:
+    for environment in options.environments:
         for part in ("train", "test"):
-            own, simulators, share = shares(environment, part)
-            print(f"{environment:12} {part:6} {own:11.0f} {simulators:11.0f} {share:6.0%}")
+            own, simulators, share = shares(environment, part, options.rounds)
+            row = f"{environment:12} {part:6} {own:11.0f} {simulators:11.0f} {share:6.0%}"
+            print(row, flush=True)
             if ENVIRONMENTS[environment].family == "bullet" and share < SHARE:
                 low.append(f"{environment} {part}")
     if low:
@@ -91,4 +100,4 @@ def main(names):
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

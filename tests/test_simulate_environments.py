@@ -273,3 +273,22 @@ def test_sensor_lists_are_sorted_and_within_the_observation(environment):
     listed = VARYING_SENSORS[environment]
     assert list(listed) == sorted(set(listed))
     assert set(listed) <= set(range(ENVIRONMENTS[environment].observation_dim))
+
+
+def test_each_bullet_client_has_functions_of_its_own():
+    first, second = make("hopper"), make("hopper")
+    for simulator in (first, second):
+        simulator.reset(1)
+    clients = [
+        vars(s.env._p)["stepSimulation"].keywords["physicsClientId"] for s in (first, second)
+    ]
+    assert len(set(clients)) == 2
+    action = np.full(3, 0.5, np.float32)
+    rows = [first.step(action)[0] for _ in range(5)]
+    second.close()
+    rows.append(first.step(action)[0])
+    first.close()
+    alone = make("hopper")
+    alone.reset(1)
+    assert np.array_equal(rows, [alone.step(action)[0] for _ in range(6)])
+    alone.close()

@@ -8,6 +8,8 @@ seed. Attributes that anomalies change (gravity, link lengths, motor power) are 
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 import types
 import warnings
@@ -25,6 +27,7 @@ try:
     # Box2D's C module warns while it is imported, and crashes where warnings are errors.
     with quiet_streams(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        import pybullet
         import pybullet_envs_gymnasium.gym_locomotion_envs as bullet
         from gymnasium.envs.box2d import lunar_lander
         from gymnasium.envs.classic_control.acrobot import AcrobotEnv
@@ -227,6 +230,13 @@ class LunarLander:
         self.env.close()
 
 
+_FUNCTIONS = {
+    name: function
+    for name, function in vars(pybullet).items()
+    if inspect.isbuiltin(function) and name != "disconnect"  # the client keeps track of this one
+}
+
+
 class Bullet:
     """One of the four PyBullet robots in a client of its own; wind adds to every motor command."""
 
@@ -238,7 +248,12 @@ class Bullet:
 
     def reset(self, seed: int) -> Row:
         with quiet_streams():
-            return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
+            row = np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
+        # The client binds a function to itself whenever one is called, some twenty times a step.
+        client = self.env._p  # noqa: SLF001  # the simulator's only handle
+        for name, function in _FUNCTIONS.items():
+            setattr(client, name, functools.partial(function, physicsClientId=client._client))  # noqa: SLF001
+        return row
 
     def step(self, action: NDArray[np.float32]) -> tuple[Row, float, bool]:
         if self.wind:
