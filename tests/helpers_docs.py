@@ -153,9 +153,11 @@ class Session:
             env[name] = value
         known = {"oodd-eval": "oodd_eval", "pytest": "pytest"}
         program = [sys.executable, "-m", known[words[0]]] if words[0] in known else words[:1]
-        if words[0] == "python" and words[1].endswith(".py"):
-            # Scripts of the repository, which the documents call from its root.
-            program = [sys.executable, str(ROOT / words.pop(1))]
+        if words[0] == "python":
+            program = [sys.executable]
+            if words[1].endswith(".py"):
+                # Scripts of the repository, which the documents call from its root.
+                words[1] = str(ROOT / words[1])
         done = subprocess.run(
             [*program, *words[1:]], env=env, capture_output=True, text=True, check=False
         )
