@@ -293,16 +293,17 @@ def _alarms() -> list[Claim]:
             ),
             Claim(
                 f"delay-at-least-{h}",
-                f"Δ = {h} is a lower bound of the delay",
+                f"Mean delays at Δ = {h} are at least Δ in every environment",
                 "section 3",
-                f"delay at Δ = {h} minus {h}, steps",
+                f"delay at Δ = {h} minus {h}, steps, least clear of the environments",
                 "delay",
                 (Part(1.0, (far,), ALL.anomalies),),
                 LATER,
                 EVERYWHERE,
+                everywhere=True,
                 offset=float(h),
-                note="a score compares with the observation of its own time, so an alarm at once "
-                "is possible",
+                note="called a lower bound of any delay; yet a score is about the observation of "
+                "its own time, so that an alarm may come at once",
             ),
             Claim(
                 f"far-no-gain-{h}",
