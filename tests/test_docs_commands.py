@@ -68,6 +68,10 @@ KNOWN = dict(
                 Rule(r"--horizon 1,10 --seed 0,1", "two fits show what four do", "--seed 0,1"),
             ),
         ),
+        page(
+            "docs/resuming.md",
+            rules=(Rule(r"--detector rf,mewma", "fits in no time", "--detector random,mewma"),),
+        ),
         page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
         page(
             "docs/submitting.md",
