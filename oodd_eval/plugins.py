@@ -253,7 +253,10 @@ def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = N
 
 def describe(error: BaseException) -> str:
     """Return an exception in one line: its type and its message."""
-    message = " ".join(str(error).split())
+    try:
+        message = " ".join(str(error).split())
+    except Exception:  # noqa: BLE001  foreign exceptions may fail to say what they are
+        message = "(its text cannot be had)"
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
@@ -295,7 +298,9 @@ def _load(plugins: Plugins, point: EntryPoint) -> None:
         plugins.manager.register(module, name=name)
         plugins.manager.check_pending()
         _add_offers(plugins, module, point)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  foreign code may raise anything
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001  foreign code may raise anything
         if plugins.manager.has_plugin(name):
             plugins.manager.unregister(name=name)
         plugins.broken.append(Broken(name, distribution, describe(error)))

@@ -35,6 +35,11 @@ def test_an_installed_plugin_is_found_with_its_origin(monkeypatch, tmp_path):
         ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
         ("raise RuntimeError('not today')", "RuntimeError: not today"),
         ("import sys; sys.exit(3)", "SystemExit: 3"),
+        ("class Odd(BaseException): pass\nraise Odd('on purpose')", "Odd: on purpose"),
+        (
+            "class Mute(Exception):\n    def __str__(self): raise ValueError\nraise Mute",
+            r"Mute: \(its text cannot be had\)",
+        ),
         ("def f(:", "SyntaxError"),
         ("@hookimpl\ndef oodd_detectors(): return [1]", r"returned \[1\], expected a list of oodd"),
         ("@hookimpl\ndef oodd_detectors(): return 1 / 0", "ZeroDivisionError"),
