@@ -284,6 +284,7 @@ CASES = {
     "missing-field": (drop("anomaly"), "anomaly", "is missing"),
     "unknown-metric-field": (metric("auc", code="import os"), "metrics.auc.code", "is no field"),
     "negative-cost": (field("seconds_fit", -1.0), "seconds_fit", "expected at least 0"),
+    "endless-cost": (field("seconds_fit", 1e308), "seconds_fit", "at most 1e+09"),
     "truth-as-cost": (field("peak_rss_mb", True), "peak_rss_mb", "is True"),
     "formula-as-inputs": (
         field("provenance.inputs", "=HYPERLINK(1)"), "provenance.inputs", "expected observations",

@@ -21,6 +21,9 @@ Rule = Callable[[Any], str]
 LARGEST: Final = 2**53
 """Whole numbers beyond are not exact in a double."""
 
+MOST_COST: Final = 1e9
+"""Seconds (thirty years) or megabytes (a thousand terabytes): what is more was not measured."""
+
 _DEEPEST: Final = 5
 _ITEMS: Final = 200
 
@@ -150,7 +153,9 @@ def cost(value: Any) -> str:
     """Complain of a cost that is neither unknown (null) nor a number of at least 0."""
     if complaint := number_or_null(value):
         return complaint
-    return f"is {value}, expected at least 0" if value is not None and value < 0 else ""
+    if value is None or 0 <= value <= MOST_COST:
+        return ""
+    return f"is {value}, expected at least 0 and at most {MOST_COST:g}"
 
 
 def day(value: Any) -> str:
