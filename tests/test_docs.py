@@ -76,6 +76,12 @@ def test_every_document_is_a_page(site):
     assert len(built) > 30
 
 
+def test_no_page_is_twice_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    pages = re.findall(r"\S+\.(?:md|html)$", navigation, re.MULTILINE)
+    assert sorted(pages) == sorted({*pages})
+
+
 def test_every_page_is_reached_from_the_home_page(site, pages):
     seen, new = set(), [site / "index.html"]
     while new:
