@@ -19,8 +19,26 @@ class Slow(Good):
         time.sleep(self.pause / 100)
         return super().score(x) + self.seed
 
+class Keeps(Slow):
+    \"\"\"The same with a fit that is slow to save, and shared by all horizons.\"\"\"
+    def fit(self, nominal):
+        self.horizon = "any"
+        super().fit(nominal)
+        self.dimension = nominal[0].observation_dim
+    def save(self, directory):
+        for name in ("one", "two"):
+            (directory / name).write_text(str(self.dimension))
+            time.sleep(self.pause)
+    def load(self, directory):
+        self.dimension = int((directory / "one").read_text())
+
 @hookimpl
-def oodd_detectors(): return [DetectorSpec("slow", Slow, "", parameters={"pause": 0.1})]
+def oodd_detectors():
+    known = {"pause": 0.1}
+    return [
+        DetectorSpec("slow", Slow, "", parameters=known),
+        DetectorSpec("keeps", Keeps, "", parameters=known, fit_ignores=("horizon",)),
+    ]
 """
 
 

@@ -14,6 +14,7 @@ import pytest
 from helpers_plugins import install
 from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
 
+from oodd_eval.fitted import FittedStore
 from oodd_eval.keeping import Keeper
 from oodd_eval.records import Record
 from oodd_eval.results import ResultsDirectory
@@ -44,9 +45,9 @@ def plugin(tmp_path_factory):
     return path
 
 
-def start(tiny_split, plugin, fits, output, *, seeds="0,1,2,3", jobs=2, pause=0.1):
+def start(tiny_split, plugin, fits, output, *more, seeds="0,1,2,3", jobs=2, pause=0.1):
     return oodd_eval(
-        "run", "--detector", "slow", "--env", "all", "--anomaly", "iid,gravity", "--split",
+        "run", "--detector", "slow", *more, "--env", "all", "--anomaly", "iid,gravity", "--split",
         tiny_split, "--seed", seeds, "--jobs", jobs, "--output", output, "--param",
         f"pause={pause}", env=environment(plugin, fits, RUN=str(output)),
     )  # fmt: skip
@@ -65,10 +66,14 @@ def fits_in(log):
 
 
 def units_by_file(output):
-    """Names of score files, with the unit each is of as the log of fits names it."""
+    """Names of score files, with the fit that each is of as the log of fits names it."""
     dimensions = {"cartpole": "4", "hopper": "15"}
     return {
-        f"{r.provenance['scores']}.h5": (dimensions[r.environment], str(r.horizon), str(r.seed))
+        f"{r.provenance['scores']}.h5": (
+            dimensions[r.environment],
+            "any" if r.detector == "keeps" else str(r.horizon),
+            str(r.seed),
+        )
         for r in ResultsDirectory(output).records()
     }
 
@@ -77,18 +82,22 @@ def test_killed_at_many_random_moments_it_ends_like_an_uninterrupted_run(
     tiny_split, plugin, tmp_path
 ):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
+    more = ("--detector", "slow,keeps", "--horizon", "1,2")
     begun = time.monotonic()
-    finish(start(tiny_split, plugin, tmp_path / "whole-fits", whole))
+    finish(start(tiny_split, plugin, tmp_path / "whole-fits", whole, *more, seeds="0"))
     length = time.monotonic() - begun
-    units = set(fits_in(tmp_path / "whole-fits"))
+    begun_fits = fits_in(tmp_path / "whole-fits")
     unit_of = units_by_file(whole)
-    assert len(units) == len(unit_of) == 8
+    # On two environments one detector fits for each of two horizons, the other for both at once.
+    assert len(unit_of) == 8
+    assert len(begun_fits) == 6
+    assert set(begun_fits) == set(unit_of.values())
 
     moments = random.Random(4)
     kept, marker, fits = {}, f"RUN={killed}".encode(), []
     for attempt in range(KILLS):
         log = tmp_path / f"fits-{attempt}"
-        process = start(tiny_split, plugin, log, killed)
+        process = start(tiny_split, plugin, log, killed, *more, seeds="0")
         # Half of the time soon after the work has begun, half of the time anywhere in the run.
         if attempt % 2:
             wait_until(lambda log=log, process=process: log.exists() or process.poll() is not None)
@@ -109,16 +118,18 @@ def test_killed_at_many_random_moments_it_ends_like_an_uninterrupted_run(
         if (killed / "records.jsonl").exists():
             assert set(stable(killed)) <= set(stable(whole))
     last = tmp_path / "last-fits"
-    finish(start(tiny_split, plugin, last, killed))
+    finish(start(tiny_split, plugin, last, killed, *more, seeds="0"))
     assert not {unit_of[name] for name in kept} & set(fits_in(last))
 
     assert stable(killed) == stable(whole)
-    assert units <= {*fits, *fits_in(last)}
-    for part in ("", "scores", "logs"):
+    assert set(begun_fits) <= {*fits, *fits_in(last)}
+    for part in ("", "scores", "logs", "fitted"):
         assert not list((killed / part).glob(".*"))
-    assert {f.name for f in (killed / "scores").iterdir()} == {
-        f.name for f in (whole / "scores").iterdir()
-    }
+    for part in ("scores", "fitted"):
+        names = [{f.name for f in (place / part).iterdir()} for place in (whole, killed)]
+        assert names[0] == names[1]
+    for fit in (killed / "fitted").iterdir():
+        assert FittedStore(killed / "fitted").find(fit.name), "a fit is not whole"
 
 
 def test_finished_units_are_not_fitted_again_after_a_kill(tiny_split, plugin, tmp_path):
