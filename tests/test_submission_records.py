@@ -203,6 +203,9 @@ CASES = {
     "negative-rate": (metric("far", value=-0.1), "metrics.far.value", "within [0, 1]"),
     "negative-delay": (metric("delay", value=-2.0), "metrics.delay.value", "at least 0"),
     "far-no-whole-alarms": (metric("far", value=0.0123), "metrics.far.value", "whole number of"),
+    "endless-rate": (metric("far", value=1e308), "metrics.far.value", "within [0, 1]"),
+    "endless-misses": (metric("missed", value=-1e308), "metrics.missed.value", "within [0, 1]"),
+    "endless-delay": (metric("delay", value=1e308), "metrics.delay.value", "per_trajectory gives"),
     "missed-no-whole-n": (metric("missed", value=0.5), "metrics.missed.value", "times n = 3"),
     "censored-too-small": (
         censored_too_small, "metrics.delay_censored.value",

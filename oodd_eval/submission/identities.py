@@ -273,5 +273,7 @@ def _check_pooled(name: str, metric: Metric, far: Contribution, refuse: Refuse) 
 
 
 def _is_whole(value: float) -> bool:
-    """Whether a count recovered from a rate is whole; an undefined one is."""
-    return math.isnan(value) or abs(value - round(value)) <= 1e-6 * max(1.0, abs(value))
+    """Whether a count recovered from a rate is whole; an undefined one is, one without end not."""
+    if not math.isfinite(value):
+        return math.isnan(value)
+    return abs(value - round(value)) <= 1e-6 * max(1.0, abs(value))
