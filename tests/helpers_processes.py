@@ -65,8 +65,8 @@ def alive(pid):
         return False
 
 
-def wait_until(condition, *, seconds=20):
-    """Wait for a condition; return whether it came true."""
+def wait_until(condition, *, seconds=120):
+    """Wait for a condition, on a busy machine for long; return whether it came true."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:

@@ -54,7 +54,7 @@ def start(tiny_split, plugin, fits, output, *more, seeds="0,1,2,3", jobs=2, paus
 
 
 def finish(process):
-    output, _ = process.communicate(timeout=120)
+    output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     return output
 
@@ -153,7 +153,7 @@ def test_a_fitting_worker_and_its_children_end_with_a_killed_harness(tiny_split,
     assert workers_of(marker)
     process.kill()
     process.communicate()
-    assert wait_until(lambda: not workers_of(marker), seconds=5)
+    assert wait_until(lambda: not workers_of(marker), seconds=20)
 
 
 def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, plugin, tmp_path):
@@ -161,7 +161,7 @@ def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, pl
     process = start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1)
     assert wait_until(lambda: len(list((output / "scores").glob("slow-*.h5"))) >= 2)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=20)
+    process.communicate(timeout=60)
     assert process.returncode == 2
     assert ResultsDirectory(output).records()
     assert not workers_of(f"RUN={output}".encode())
