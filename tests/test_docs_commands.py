@@ -68,10 +68,6 @@ KNOWN = dict(
                 Rule(r"--horizon 1,10 --seed 0,1", "two fits show what four do", "--seed 0,1"),
             ),
         ),
-        page(
-            "docs/resuming.md",
-            rules=(Rule(r"--detector rf,mewma", "fits in no time", "--detector random,mewma"),),
-        ),
         page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
         page(
             "docs/submitting.md",
@@ -160,8 +156,8 @@ def test_commands_are_found_in_blocks_and_in_indented_lines():
         ("oodd-eval list envs", "oodd-eval list envs"),
         ("oodd-eval run --detector a,b --env all", "oodd-eval run --detector a,b --env cartpole"),
         (
-            "oodd-eval run --detector riqn --env hopper",
-            "oodd-eval run --detector riqn --param updates=2 --env hopper --limit 4",
+            "oodd-eval run --detector npn --env ant",
+            "oodd-eval run --detector npn --param updates=2 --param members=1 --env ant --limit 2",
         ),
         ("oodd-eval reproduce --tier full", "oodd-eval reproduce --tier full --plan"),
         ("oodd-eval reproduce --plan", "oodd-eval reproduce --plan"),
