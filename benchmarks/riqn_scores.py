@@ -1,6 +1,6 @@
-"""Why RIQN's score is not the best use of its samples: three scores of the same fits.
+"""Why RIQN stays behind its own network without quantiles: scores that can be made of one fit.
 
-``python benchmarks/riqn_scores.py [--fits DIR] [--env NAMES]``, ten minutes on one core.
+``python benchmarks/riqn_scores.py [--fits DIR] [--env NAMES]``, fifteen minutes on one core.
 
 RIQN's score is the mean distance of what came to samples of the predicted distribution, E|o - X|.
 That has two parts: how surprising o is, and how wide the distribution is, which an anomaly need not
@@ -9,16 +9,18 @@ change. Beside it stand
 - CRPS, E|o - X| - E|X - X'| / 2: the width subtracted, the proper score of a distribution;
 - median, |o - median(X)|: the distance to a point forecast from the same samples.
 
-Matched AUC (%), mini split, horizon 1, detector seed 0, mean over the eight anomalies. Nothing here
-enters a detector: choosing among them by these numbers would be tuning on test data.
+The same for NPN, whose X are the five members' forecasts. Matched AUC (%), mean over the eight
+anomalies, and the mean of a score on nominal calibration trajectories, in standard deviations of a
+sensor: how good the forecast is. Mini split, horizon 1, detector seed 0. Nothing here enters a
+detector: to choose by these numbers would be tuning on test data.
 """
 
 import argparse
-import statistics
 from pathlib import Path
 
 import numpy as np
 import torch
+from oodd_npn import npn
 from oodd_riqn import riqn
 from oodd_torch.forecast import Forecaster
 from oodd_torch.training import arrange
@@ -30,12 +32,14 @@ from oodd_eval.metrics import auc_contributions
 from oodd_eval.selection import select
 
 SCORES = ("E|o - X|", "CRPS", "median")
+DETECTORS = {"riqn": (riqn, 8), "npn": (npn, 1)}
+"""Factory, and samples of each member."""
 
 
-def fitted(data, environment, fits):
-    """Return a fit of riqn, loaded where there is one and kept where fits are."""
-    detector = riqn(seed=0, horizon=1)
-    place = fits / environment if fits else None
+def fitted(name, data, environment, fits):
+    """Return a fitted detector, loaded where there is a fit and kept where fits are."""
+    detector = DETECTORS[name][0](seed=0, horizon=1)
+    place = fits / name / environment if fits else None
     if place and place.exists():
         detector.load(place)
         return detector
@@ -47,58 +51,58 @@ def fitted(data, environment, fits):
 
 
 @torch.no_grad()
-def three_scores(detector, trajectory):
+def three_scores(detector, samples, trajectory):
     """Return the scores of a trajectory, arrays of shape (T + 1,) in the order of `SCORES`."""
     network, scale = detector.network_, detector.scale_
     rows = scale(trajectory)
-    forecaster = Forecaster.of(network, horizon=1, samples=8, mean_sampling=False, seed=0)
+    forecaster = Forecaster.of(network, horizon=1, samples=samples, mean_sampling=False, seed=0)
     x = arrange([[rows]], 1)[0].expand(network.members, -1, -1, -1)
     drawn, _ = forecaster.forecast(x, network.start(1), range(1, len(rows)))
-    samples = np.sort(drawn[:, :, 0].permute(1, 3, 0, 2).flatten(2).numpy(), axis=2)  # (T, D, E M)
+    drawn = np.sort(drawn[:, :, 0].permute(1, 3, 0, 2).flatten(2).numpy(), axis=2)  # (T, D, E M)
     truth = rows[1:, :, None]
-    distance = np.abs(truth - samples).mean(2)
-    n = samples.shape[2]
+    distance = np.abs(truth - drawn).mean(2)
+    n = drawn.shape[2]
     # Of sorted values, the sum of all distances between pairs is a weighted sum.
-    width = 2 * (samples * (2 * np.arange(n) - n + 1)).sum(2) / n**2
-    median = np.abs(truth[..., 0] - np.median(samples, axis=2))
+    width = 2 * (drawn * (2 * np.arange(n) - n + 1)).sum(2) / n**2
+    median = np.abs(truth[..., 0] - np.median(drawn, axis=2))
     found = (distance, distance - width / 2, median)
     return [np.concatenate([[np.nan], each.mean(1)]) for each in found]
 
 
-def matched_auc(data, detector):
-    """Return the mean over anomalies of the matched AUC, for every score."""
+def evaluated(data, detector, samples):
+    """Return matched AUCs (%) and nominal means of every score."""
+
+    def scored(trajectories):
+        return list(zip(*(three_scores(detector, samples, t) for t in trajectories), strict=True))
+
+    twins = scored(data.twins)
     cells = []
-    twins = [three_scores(detector, twin) for twin in data.twins]
     for anomaly in ANOMALIES:
         group = data.anomalous(anomaly)
-        scores = [three_scores(detector, trajectory) for trajectory in group]
-        cells.append([
-            auc_contributions(
-                [s[i] for s in scores], [t[i] for t in twins], list(group.onsets)
-            )["auc_matched"].value
-            for i in range(len(SCORES))
-        ])  # fmt: skip
-    return np.mean(cells, axis=0)
+        pairs = zip(scored(group), twins, strict=True)
+        onsets = list(group.onsets)
+        cells.append([auc_contributions(s, t, onsets)["auc_matched"].value for s, t in pairs])
+    nominal = [np.nanmean(np.concatenate(scores)) for scores in scored(data.calibration)]
+    return [*(100 * np.mean(cells, axis=0)), *nominal]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--fits", type=Path, metavar="DIR", help="load fits from here, or keep them"
-    )
+    parser.add_argument("--fits", type=Path, metavar="DIR", help="keep the fits here")
     parser.add_argument("--env", default="all", metavar="NAMES")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    split, table = load_split("mini"), []
-    for environment in select("environment", options.env, ENVIRONMENTS):
-        data = split.environment(environment)
-        found = 100 * matched_auc(data, fitted(data, environment, options.fits))
-        table.append([environment, *found])
-        print(environment, *(f"{v:.1f}" for v in found), flush=True)
-    table.append(
-        ["mean", *(statistics.fmean(column) for column in list(zip(*table, strict=True))[1:])]
-    )
-    print(tabulate(table, ["", *SCORES], floatfmt=".1f"))
+    split = load_split("mini")
+    header = ["", *(f"AUC {s}" for s in SCORES), *(f"nominal {s}" for s in SCORES)]
+    for name, (_, samples) in DETECTORS.items():
+        table = []
+        for environment in select("environment", options.env, ENVIRONMENTS):
+            data = split.environment(environment)
+            detector = fitted(name, data, environment, options.fits)
+            table.append([environment, *evaluated(data, detector, samples)])
+        table.append(["mean", *np.mean([row[1:] for row in table], axis=0)])
+        print(name)
+        print(tabulate(table, header, floatfmt=("", *[".1f"] * 3, *[".3f"] * 3)), flush=True)
 
 
 if __name__ == "__main__":
