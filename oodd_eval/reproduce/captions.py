@@ -25,7 +25,10 @@ def opening(header: Header, records: Sequence[Record]) -> list[str]:
     if len(done) < header.units:
         state += " **Unfinished**: numbers and verdicts may change."
     made = sorted({_origin(r) for r in records})
-    seeds = f"Detector seeds: {tier.seeds_near} of each setup"
+    planned = (
+        "" if len(done) >= header.units else ", as planned; above each table those that were run"
+    )
+    seeds = f"Detector seeds{planned}: {tier.seeds_near} of each setup"
     if tier.seeds_far != tier.seeds_near:
         seeds += (
             f" at Δ = 1, and {tier.seeds_far} at Δ > 1 and for other sampling sizes than M = 8. "
