@@ -1,6 +1,7 @@
 """Fixtures that more than one test module uses."""
 
 import contextlib
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -11,6 +12,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from helpers_split import make_split
+
+# Begun in the background of a shell, a process ignores interrupts, and so would those it starts:
+# the tests of interrupted commands would wait in vain.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Box2D's extension module warns while it is set up and crashes when a warning is an error there.
 with warnings.catch_warnings(), contextlib.suppress(ImportError):

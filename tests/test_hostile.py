@@ -129,7 +129,7 @@ QUICK = {
         class Odd(Exception):
             def __str__(self): raise ValueError("no words")
         def score(self, x): raise self.Odd""",
-                   "error", "the worker ended with exit code 1 while scoring"),
+                   "error", r"Odd: \(its text cannot be had\) \(oodd_speechless.py:\d+\)"),
     "ugly": ("def score(self, x): raise ValueError('\\udcff \\x1b[2J [/red] [bold]')",
              "error", r"ValueError: \ufffd \ufffd\[2J \[/red\] \[bold\] \(oodd_ugly.py:\d+\)"),
     "wordy": ("def score(self, x): raise ValueError('no ' * 10**6)",
