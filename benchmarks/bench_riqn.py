@@ -8,8 +8,8 @@ a product of a vector and a matrix. The released code was timed once, on a machi
 `RELEASED` names; its rates are the yardstick that the project set itself, and not measured here.
 
 What bounds the speed: at horizon 1 the GRU's products over time, 64 x 192 for as many rows as there
-are trajectories; at larger horizons products of 1024 x 64 x 64, at 90 % of the peak, and between
-them passes over their results, which add up to most of the time.
+are trajectories; at larger horizons products of 1024 x 64 x 64, and between them passes over
+their results, which add up to most of the time.
 """
 
 import functools
