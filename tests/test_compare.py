@@ -22,6 +22,7 @@ from oodd_eval.compare.differences import MEANINGS, NothingInCommonError, compar
 from oodd_eval.compare.figures import (
     figures_of,
     read_figures,
+    read_records,
     reference_text,
     write_reference,
 )
@@ -300,7 +301,7 @@ def test_a_reference_file_has_a_line_per_cell_and_the_origin(tmp_path):
     plain = json.loads(text)
     assert plain["boards"][0]["split_digest"] == "ab" * 32
     assert plain["detectors"]["rf"]["plugin"] == "oodd-eval:rf"
-    assert text == reference_text([record("iid"), record("drift")])
+    assert text == reference_text([record("drift"), record("iid")])
 
 
 @given(st.floats(allow_infinity=False) | st.just(NAN))
@@ -595,12 +596,45 @@ def test_the_check_of_this_project_is_sound_shell():
     subprocess.run([bash, "-n", ROOT / ".ci/run"], check=True)
 
 
-def test_the_reference_of_this_project_is_of_the_split_that_ships_and_checked_in_whole():
+def test_the_reference_of_this_project_is_of_the_split_that_ships():
     reference = read_figures(ROOT / "leaderboard/reference/mini.json")
     ((conditions, cells),) = reference.boards.items()
     assert conditions.key == (load_split("mini").digest, PROTOCOL, None)
     assert all(figures.ok for figures in cells.values())
-    rf = {f"mini/{e}/{a}::rf[h=1,seed=0]" for e in ENVIRONMENTS for a in ANOMALIES}
-    assert rf <= cells.keys()
-    chosen = [expression(o.expression) for o in own_check() if o.command == "compare"]
-    assert all(any(wanted(cell) for wanted in chosen) for cell in cells)
+    whole = {
+        f"mini/{e}/{a}::{detector}[h=1,seed=0]"
+        for e in ENVIRONMENTS
+        for a in ANOMALIES
+        for detector in ("riqn", "npn", "rf")
+    }
+    assert whole == cells.keys()
+
+
+def test_the_reference_of_this_project_is_of_the_committed_records():
+    of_default = expression(" or ".join(f"::{d}[h=1,seed=0]" for d in ("riqn", "npn", "rf")))
+    records = read_records(ROOT / "leaderboard/results/paper-mini")
+    expected = reference_text([r for r in records if of_default(r.cell)])
+    assert (ROOT / "leaderboard/reference/mini.json").read_text() == expected
+
+
+def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
+    """One compared and not run is missing, which fails; one run and not compared is unchecked."""
+    reference = read_figures(ROOT / "leaderboard/reference/mini.json")
+    (cells,) = reference.boards.values()
+    ran = set()
+    for options in own_check():
+        if options.command == "run":
+            names = ENVIRONMENTS if options.env == "all" else options.env.split(",")
+            ran |= {
+                f"mini/{e}/{a}::{detector}[h=1,seed=0]"
+                for e in names
+                for a in ANOMALIES
+                for detector in options.detector.split(",")
+            }
+        else:
+            wanted = expression(options.expression)
+            compared = {cell for cell in cells if wanted(cell)}
+            assert compared
+            assert compared <= ran
+            ran -= compared
+    assert not ran

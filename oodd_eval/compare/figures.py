@@ -1,7 +1,8 @@
 """What is compared: figures per cell, read from results or from a reference file, and written.
 
 A reference file holds the metrics of every cell without intervals, one cell a line, so that it is
-small and a change of it can be read::
+small and a change of it can be read. Cells stand in the order of the benchmark, whatever the order
+in which they ran::
 
     {"kind": "oodd-eval reference", "schema": 1, "versions": {...}, "detectors": {...},
      "boards": [{"split": ..., "split_digest": ..., "protocol": ..., "limit": ...,
@@ -20,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import OutputError, ResultsError
 from oodd_eval.records import NAN, STATUSES, Record
 from oodd_eval.results import ResultsDirectory
@@ -162,7 +164,8 @@ def write_reference(records: Sequence[Record], path: Path | str) -> None:
 
 
 def reference_text(records: Sequence[Record]) -> str:
-    """Return the content of a reference file, the same for the same records."""
+    """Return the content of a reference file, the same for the same records in any order."""
+    records = sorted(records, key=_order)
     versions: dict[str, Any] = {}
     detectors: dict[str, Any] = {}
     for r in records:
@@ -181,6 +184,20 @@ def reference_text(records: Sequence[Record]) -> str:
         ["{", *lines, ' "detectors": {', ",\n".join(origins), " },",
          ' "boards": [', ",\n".join(boards), " ]", "}\n"]
     )  # fmt: skip
+
+
+def _order(record: Record) -> tuple[str, str, int, int, str]:
+    return (
+        record.split,
+        record.split_digest,
+        _position(record.environment, tuple(ENVIRONMENTS)),
+        _position(record.anomaly, tuple(ANOMALIES)),
+        record.cell,
+    )
+
+
+def _position(name: str, names: Sequence[str]) -> int:
+    return names.index(name) if name in names else len(names)
 
 
 def _board_text(conditions: Conditions, cells: Mapping[str, Figures]) -> str:
