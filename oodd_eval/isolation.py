@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final, Protocol
 
 from oodd_eval.channel import Channel, ChannelClosedError, ChannelGarbledError
@@ -101,18 +101,20 @@ def run_isolated(
     request: Request,
     train: Iterable[Trajectory],
     score: Iterable[Trajectory],
+    again: Iterable[Trajectory] = (),
     *,
     limits: Limits,
     stop: Stop,
 ) -> Outcome:
-    """Fit on `train` and score `score` in a worker process.
+    """Fit on `train`, score `score` and then `again` in a worker process.
 
     Parameters
     ----------
     request
         The detector and how to make it.
-    train, score
-        Trajectories, read lazily and in order.
+    train, score, again
+        Trajectories, read lazily and in order. `again` never shares a chunk with `score`, so that
+        its company changes no digit there.
     limits
         Enforced from outside: the whole process group of the worker is killed.
     stop
@@ -130,7 +132,7 @@ def run_isolated(
     for_worker = (to_worker, from_worker, lifeline)
     child = Child("oodd_eval.worker", for_worker)
     outcome = Outcome()
-    sender = _Sender(from_harness, request, train, score)
+    sender = _Sender(from_harness, request, train, chain(_chunks(score), _chunks(again)))
     watch = _Watch(child, to_harness, limits, stop)
     died = silent = False
     try:
@@ -216,22 +218,24 @@ class _Sender:
         descriptor: int,
         request: Request,
         train: Iterable[Trajectory],
-        score: Iterable[Trajectory],
+        chunks: Iterable[list[Trajectory]],
     ) -> None:
         self.error: BaseException | None = None
         self._descriptor = descriptor
-        self._thread = threading.Thread(target=self._run, args=(request, train, score), daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(request, train, chunks), daemon=True
+        )
         self._thread.start()
 
     def _run(
-        self, request: Request, train: Iterable[Trajectory], score: Iterable[Trajectory]
+        self, request: Request, train: Iterable[Trajectory], chunks: Iterable[list[Trajectory]]
     ) -> None:
         channel = Channel(None, self._descriptor)
         try:
             channel.send(asdict(request))
             for trajectory in train:
                 channel.send_trajectory(trajectory)
-            for chunk in _chunks(score):
+            for chunk in chunks:
                 channel.send({"score": len(chunk)})
                 for trajectory in chunk:
                     channel.send_trajectory(trajectory)

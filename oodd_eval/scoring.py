@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from oodd_eval.causality import Probe, check_prefix, probes
 from oodd_eval.detector import Scores, check_scores
 from oodd_eval.errors import ContractError
 from oodd_eval.fitted import FittedStore
@@ -73,9 +74,8 @@ class UnitJob:
             return Scored("unavailable", reason)
         if not fresh and (kept := self.stored(results)):
             return kept
-        # A worker knows its seed, but not the digest: it cannot draw the same order.
-        plan, unit = self.plan, self.unit
-        order = shuffled(counts, f"{plan.split_digest}|{unit.environment}|{unit.seed}")
+        # A worker knows its seed, but not the digest: it cannot draw the same.
+        order, again = shuffled(counts, self._key), self._probes()
 
         def isolated(*, load: str = "", save: str = "") -> Outcome:
             train = 0 if load else limited(len(self.data.train), self.plan.limit)
@@ -92,6 +92,7 @@ class UnitJob:
                 ),
                 islice(self.data.train, train),
                 (sets[part][i] for part, i in order),
+                (sets[p.part][p.index][: p.rows] for p in again),
                 limits=limits,
                 stop=stop,
             )
@@ -101,20 +102,21 @@ class UnitJob:
             outcome = _with_store(isolated, results.fitted, key, stop, fresh=fresh)
         else:
             outcome = isolated()
-        return self._checked(outcome, order, sets, counts)
+        return self._checked(outcome, order, again, sets, counts)
 
     def stored(self, results: ResultsDirectory | None) -> Scored | None:
         """Return the scores that an earlier run has kept, if they are there and fit."""
         if results is None:
             return None
-        lengths = lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
-        kept = results.scores(unit_key(self.plan, self.unit, self.offer).text, lengths)
+        key = unit_key(self.plan, self.unit, self.offer).text
+        kept = results.scores(key, self._lengths())
         return Scored(file=kept, resumed=True) if kept else None
 
     def _checked(
         self,
         outcome: Outcome,
         order: list[tuple[str, int]],
+        again: list[Probe],
         sets: Mapping[str, TrajectorySet],
         counts: Mapping[str, int],
     ) -> Scored:
@@ -123,15 +125,19 @@ class UnitJob:
             return Scored(outcome.status, outcome.reason, log=outcome.log)
         parts: dict[str, list[Scores]] = {p: [np.empty(0)] * n for p, n in counts.items()}
         try:
-            for (part, i), scores in zip(order, outcome.scores, strict=True):
-                parts[part][i] = self._check(scores, outcome.warm_up, part, i, sets[part][i])
+            returned, warm_up = outcome.scores, outcome.warm_up
+            for (part, i), scores in zip(order, returned[: len(order)], strict=True):
+                parts[part][i] = self._check(scores, warm_up, part, i, sets[part][i])
+            for probe, scores in zip(again, returned[len(order) :], strict=True):
+                self._check_prefix(scores, warm_up, probe, sets, parts)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
         cost = {
             "seconds_fit": outcome.seconds_fit,
             "seconds_score": outcome.seconds_score,
             "peak_rss_mb": outcome.peak_rss_mb,
-            "steps_scored": sum(len(scores) for part in parts.values() for scores in part),
+            "steps_scored": sum(len(scores) for part in parts.values() for scores in part)
+            + sum(probe.rows for probe in again),
         }
         known = {name: value for name, value in cost.items() if value is not None}
         return Scored(file=ScoreFile(parts, known))
@@ -147,6 +153,29 @@ class UnitJob:
             detector=self.unit.detector,
             where=f"{self.unit.environment}/{part}[{i}]",
         )
+
+    def _check_prefix(
+        self,
+        scores: object,
+        warm_up: object,
+        probe: Probe,
+        sets: Mapping[str, TrajectorySet],
+        parts: Mapping[str, list[Scores]],
+    ) -> None:
+        part, i = probe.part, probe.index
+        found = self._check(scores, warm_up, part, i, sets[part][i][: probe.rows])
+        where = f"{self.unit.environment}/{part}[{i}]"
+        check_prefix(found, parts[part][i], detector=self.unit.detector, where=where)
+
+    @property
+    def _key(self) -> str:
+        return f"{self.plan.split_digest}|{self.unit.environment}|{self.unit.seed}"
+
+    def _probes(self) -> list[Probe]:
+        return probes(self._lengths(), self._key)
+
+    def _lengths(self) -> dict[str, list[int]]:
+        return lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
 
     def _in_process(self, sets: Mapping[str, TrajectorySet], counts: Mapping[str, int]) -> Scored:
         """Fit and score here: what the detector raises passes through."""
@@ -164,6 +193,11 @@ class UnitJob:
                 self._check(scores, getattr(detector, "warm_up", 0), part, i, chunk[i])
                 for i, scores in enumerate(score_chunk(detector, chunk))
             ]
+        again = self._probes()
+        prefixes = [sets[p.part][p.index][: p.rows] for p in again]
+        scored = score_chunk(detector, prefixes) if prefixes else []
+        for probe, scores in zip(again, scored, strict=True):
+            self._check_prefix(scores, getattr(detector, "warm_up", 0), probe, sets, parts)
         return Scored(file=ScoreFile(parts, {}))
 
 

@@ -10,6 +10,7 @@ import pytest
 from helpers_plugins import install
 
 from oodd_eval import evaluate, load_split
+from oodd_eval.causality import PROBES
 from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
 from oodd_eval.evaluation import rescore
 from oodd_eval.hookspecs import hookimpl
@@ -28,7 +29,7 @@ class WrongLength(Good):
 
 class LateNan(Good):
     def score(self, x):
-        s = super().score(x); s[30] = np.nan; return s
+        s = super().score(x); s[30:31] = np.nan; return s
 
 class Infinite(Good):
     def score(self, x):
@@ -397,7 +398,8 @@ def test_a_worker_is_told_no_names(tiny_split, tmp_path):
     request = Request("trivial", "clock", {}, 0, 1, len(data.train))
     anomalous = data.anomalous("iid")
     with (tmp_path / "sent").open("wb") as file:
-        sender = _Sender(os.dup(file.fileno()), request, data.train, [*anomalous, *data.twins])
+        chunks = [list(anomalous), list(data.twins)]
+        sender = _Sender(os.dup(file.fileno()), request, data.train, chunks)
         sender.join()
     sent = (tmp_path / "sent").read_bytes()
     assert sender.error is None
@@ -426,8 +428,11 @@ def test_trajectories_to_score_come_shuffled_together(tiny_split, monkeypatch, t
     size = len(firsts[0])
     content = seen.read_bytes()
     order = [content[i : i + size] for i in range(0, len(content), size)]
-    assert sorted(order) == sorted(firsts)
-    assert order != firsts
+    assert sorted(order[: len(firsts)]) == sorted(firsts)
+    assert order[: len(firsts)] != firsts
+    again = order[len(firsts) :]
+    assert len(set(again)) == len(again) == PROBES
+    assert set(again) <= set(firsts)
     with_names.close()
 
 

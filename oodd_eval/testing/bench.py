@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oodd_eval.detector import Detector, DetectorSpec, Scores
 from oodd_eval.errors import ContractError
@@ -242,38 +241,6 @@ def as_scores(returned: object, trajectory: Trajectory) -> Scores:
         return returned.astype(np.float64)
     except (TypeError, ValueError):
         raise CheckSkipped("needs scores that are numbers: see check 'dtype'") from None
-
-
-TOLERANCE = 1e-5
-"""Relative difference that stands for the same score where computations differ in shape.
-
-The summation order of a product of matrices depends on their shapes, and so, in single precision,
-do the last digits. Where the same computation is done twice, scores have to be equal bit for bit.
-"""
-
-
-def difference(
-    found: NDArray[np.float64], expected: NDArray[np.float64], tolerance: float = 0.0
-) -> str:
-    """Say where two score sequences of one length differ first; empty when they do not.
-
-    Parameters
-    ----------
-    found, expected : float64 arrays of shape (n,)
-    tolerance
-        Allowed difference, relative to the larger of the score itself and the mean magnitude of
-        all expected scores: a score that passes through zero has no relative precision.
-    """
-    usual = np.abs(expected[np.isfinite(expected)])
-    scale = np.maximum(np.abs(expected), usual.mean() if usual.size else 0.0)
-    with np.errstate(invalid="ignore"):
-        same = (found == expected) | (np.isnan(found) & np.isnan(expected))
-        if tolerance:
-            same |= np.abs(found - expected) <= tolerance * scale
-    if same.all():
-        return ""
-    t = int(np.flatnonzero(~same)[0])
-    return f"at t = {t} it is {found[t]:.10g} instead of {expected[t]:.10g}"
 
 
 def listed(directory: Path) -> list[Path]:

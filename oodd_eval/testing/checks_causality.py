@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from oodd_eval.causality import TOLERANCE, difference
 from oodd_eval.detector import Scores, StreamingDetector
 from oodd_eval.testing.bench import (
-    TOLERANCE,
     Bench,
     CheckFailedError,
     CheckSkipped,
-    difference,
     doing,
     scores_of,
 )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
+from oodd_eval.causality import difference
 from oodd_eval.testing.bench import (
     Bench,
     CheckFailedError,
     CheckSkipped,
-    difference,
     scores_of,
 )
 from oodd_eval.testing.kit import check

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from oodd_eval.causality import TOLERANCE, difference
 from oodd_eval.testing.bench import (
-    TOLERANCE,
     Bench,
     CheckFailedError,
     CheckSkipped,
     as_scores,
-    difference,
     doing,
     scores_of,
 )

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from oodd_eval.causality import difference
 from oodd_eval.detector import Detector, StorableDetector
 from oodd_eval.testing.bench import (
     Bench,
     CheckFailedError,
     CheckSkipped,
-    difference,
     doing,
     listed,
     scores_of,
