@@ -56,6 +56,10 @@ class Trajectory:
         object.__setattr__(self, "observations", o)
         object.__setattr__(self, "actions", a)
 
+    def __repr__(self) -> str:
+        """Return the sizes: the numbers of an episode would fill screens."""
+        return f"Trajectory(T={self.transitions}, D={self.observation_dim}, A={self.action_dim})"
+
     def __len__(self) -> int:
         """Return the number of observations, T + 1: the length of a score sequence."""
         return len(self.observations)

@@ -14,6 +14,7 @@ from helpers_split import make_split
 
 from oodd_eval import cli
 from oodd_eval.commands import listing
+from oodd_eval.compare.tolerance import KNOWN
 from oodd_eval.options import choices
 from oodd_eval.results import ResultsDirectory
 
@@ -345,6 +346,19 @@ def test_show_wide_prints_all_metrics_and_the_pooled_ones(run):
     assert "clock: pooled AUC (%) by anomaly" in run(
         "show", "oodd-results", "--detector", "clock", "--metric", "auc_pooled"
     )[1]  # fmt: skip
+
+
+def test_show_prints_calibrated_alarms_by_anomaly(run):
+    run(*CLOCK)
+    shown = ("show", "oodd-results", "--detector", "clock", "--metric")
+    for metric in KNOWN:
+        code, out, err = run(*shown, metric)
+        assert re.search(r"^clock: .* by anomaly$", out, re.MULTILINE), err
+        assert code == 0
+    assert "clock: Missed at 0.1 % by anomaly" in run(*shown, "missed_at_01pct")[1]
+    code, out, err = run(*shown, "missed_at_2pct")
+    assert code == 4
+    assert "did you mean 'missed_at_1pct'" in out + err
 
 
 def test_show_with_intervals(run):

@@ -205,3 +205,8 @@ def test_unknown_names_are_refused_before_anything_runs():
         record("cartpole", "gravitty", 1, policy=None)
     with pytest.raises(UnknownNameError, match="cartpole"):
         record("cartpol", None, 1, policy=None)
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(SimulationError, match=r"seed is -1, expected a whole number from 0"):
+        record_nominal("cartpole", -1, policy=Reflex("cartpole"))

@@ -85,3 +85,7 @@ def test_pad_refuses_nothing_and_unequal_widths():
         pad([])
     with pytest.raises(TrajectoryError, match=r"different widths .*\[1, 2\]"):
         pad([np.ones((1, 1), np.float32), np.ones((1, 2), np.float32)])
+
+
+def test_a_trajectory_prints_its_sizes():
+    assert repr(Trajectory(np.zeros((301, 4)), np.zeros((300, 2)))) == "Trajectory(T=300, D=4, A=2)"

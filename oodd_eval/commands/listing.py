@@ -64,9 +64,14 @@ def _splits() -> Iterable[tuple[str, ...]]:
 
 
 def _metrics() -> Iterable[tuple[str, ...]]:
+    from oodd_eval.alarms import CALIBRATED, TARGETS  # noqa: PLC0415  likewise
     from oodd_eval.metrics import METRICS, POOLED  # noqa: PLC0415  likewise
 
     yield from (METRICS | POOLED).items()
+    for suffix, target in TARGETS.items():
+        names = ", ".join(CALIBRATED)
+        yield f"..._{suffix}", f"{names}: alarms at a calibrated false-alarm rate of {target:.1%}"
+        yield f"threshold_{suffix}", "the CUSUM threshold of that rate"
 
 
 _KINDS: Final[dict[str, Callable[[], Iterable[tuple[str, ...]]]]] = {

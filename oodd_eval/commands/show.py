@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 
+from oodd_eval.compare.tolerance import KNOWN
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.evaluation import rescore
-from oodd_eval.metrics import METRICS, POOLED
 from oodd_eval.records import Record
 from oodd_eval.report import markdown, tables
 from oodd_eval.report.board import boards
@@ -18,8 +18,8 @@ from oodd_eval.splits import load_split
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval show``; 1 when one of the cells failed."""
-    if options.metric not in METRICS | POOLED:
-        raise UnknownNameError("metric", options.metric, METRICS | POOLED)
+    if options.metric not in KNOWN:
+        raise UnknownNameError("metric", options.metric, KNOWN)
     results = ResultsDirectory(options.directory)
     records = results.records()
     if not options.stored:

@@ -60,7 +60,8 @@ def _add_show(commands: Commands[Parser]) -> None:
     add("--stored", action="store_true", help="print stored metrics without recomputing them")
     add("--intervals", action="store_true", help="print 95 %% intervals")
     add("--detector", metavar="NAME", help="print the table by anomaly of one detector")
-    add("--metric", default="auc_matched", help="metric of that table (default: auc_matched)")
+    add("--metric", default="auc_matched",
+        help="metric of that table (default: auc_matched; see oodd-eval list metrics)")  # fmt: skip
     add("--wide", action="store_true",
         help="print all metrics, pooled AUC, average precision and FPR95 among them")  # fmt: skip
     add("--markdown", action="store_true", help="print Markdown, everything in it")

@@ -28,6 +28,7 @@ TITLES: Final = {
     "auc_pooled": "pooled AUC",
     "average_precision": "AP",
     "fpr95": "FPR95",
+    "threshold": "Threshold",
 }
 
 UNDEFINED: Final = "\N{EN DASH}"
@@ -188,7 +189,7 @@ def by_anomaly(
         for environment in board.environments
     ]  # fmt: skip
     unit = " (%)" if metric in PERCENT else ""
-    title = f"{entry.label}: {TITLES[metric]}{unit} by anomaly"
+    title = f"{entry.label}: {_title(metric)}{unit} by anomaly"
     return Table(title, ["Environment", *(ANOMALIES[a].id for a in board.anomalies)], rows)
 
 

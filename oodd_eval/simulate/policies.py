@@ -196,5 +196,7 @@ def freeze_policy(
         np.savez_compressed(out, allow_pickle=False, **packed)
     partial.replace(directory / f"{environment}.npz")
     text = json.dumps({"environment": environment, **facts, "digest": digest}, indent=1)
-    (directory / f"{environment}.json").write_text(text + "\n", encoding="utf-8")
+    partial = directory / f"{environment}.json.partial"
+    partial.write_text(text + "\n", encoding="utf-8")
+    partial.replace(directory / f"{environment}.json")
     return digest

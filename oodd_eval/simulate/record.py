@@ -122,7 +122,9 @@ def record(
 def record_nominal(
     environment: str, seed: int, *, policy: Policy, episode_cap: int | None = None
 ) -> Episode:
-    """Record the nominal episode of a seed."""
+    """Record the nominal episode of a seed, a whole number from 0."""
+    if seed < 0:
+        raise SimulationError(f"seed is {seed}, expected a whole number from 0")
     rows, actions, rewards, over = _run(environment, seed, policy, episode_cap)
     return Episode(_trajectory(environment, rows, actions), rewards, over, seed)
 
