@@ -70,7 +70,7 @@ def _metrics() -> Iterable[tuple[str, ...]]:
     yield from (METRICS | POOLED).items()
     for suffix, target in TARGETS.items():
         names = ", ".join(CALIBRATED)
-        yield f"..._{suffix}", f"{names}: alarms at a calibrated false-alarm rate of {target:.1%}"
+        yield f"..._{suffix}", f"{names}: alarms at a calibrated false-alarm rate of {100 * target:g} %"
         yield f"threshold_{suffix}", "the CUSUM threshold of that rate"
 
 
