@@ -2,6 +2,7 @@
 
 import csv
 import re
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -27,3 +28,28 @@ def test_the_table_is_the_boards(column, split):
     assert [r[0] for r in rows] == ["mewma", "npn", "rf", "riqn", "persistence"]
     for row in rows:
         assert float(row[column]) == pytest.approx(expected[row[0]], abs=0.051), row[0]
+
+
+def claims():
+    with (ROOT / "leaderboard/reproduction/reduced/claims.csv").open() as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_verdicts_are_those_of_the_reproduction():
+    verdicts = {(r["text"], r["kind"]): r["verdict"] for r in claims()}
+    rows = re.findall(r"^\| ([^|]+) \| (\w+) \| ([^|]+) \|$", PAGE, re.MULTILINE)
+    found = [(text, paper, fair) for text, paper, fair in rows if (text, "paper") in verdicts]
+    assert len(found) == 15
+    for text, paper, fair in found:
+        assert (paper, fair) == (
+            verdicts[text, "paper"],
+            verdicts.get((text, "fair"), "\N{EN DASH}"),
+        ), text
+
+
+def test_verdicts_are_counted_rightly():
+    counted = Counter(r["verdict"] for r in claims() if r["kind"] == "paper")
+    text = " ".join(PAGE.split())
+    assert f"Of {sum(counted.values())} claims" in text
+    for verdict, many in counted.items():
+        assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
