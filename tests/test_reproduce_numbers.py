@@ -273,6 +273,15 @@ def test_caption_names_data_seeds_and_a_reduced_tier(tmp_path):
     assert "(**reduced**: split standard has 50 test seeds)" in own
 
 
+def test_page_tells_how_long_networks_were_trained():
+    records = everywhere("riqn", [0.8, 0.6])
+    assert "trained for" not in "\n".join(captions.opening(header(), records))
+    for number, record in enumerate(records):
+        record.parameters["updates"] = 600 if number else 2400
+    text = "\n".join(captions.opening(header(), records))
+    assert "- Networks were trained for at most 600 or 2400 updates. " in text
+
+
 def test_page_tells_of_failures_with_their_reasons(tmp_path):
     records = everywhere("riqn", [0.8, 0.6])
     records[0] = make_record("riqn", "ant", "iid", status="timeout", reason="not done after 5 s")

@@ -11,10 +11,16 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "results.md").read_text()
 
 
-def board(split):
-    (file,) = (ROOT / "leaderboard" / "tables").glob(f"{split}-*-ranking.csv")
+def table(split, name):
+    (file,) = (ROOT / "leaderboard" / "tables").glob(f"{split}-*-{name}.csv")
     with file.open() as lines:
-        rows = [r for r in csv.DictReader(lines) if (r["horizon"], r["overrides"]) == ("1", "{}")]
+        return list(csv.DictReader(lines))
+
+
+def board(split, overrides="{}"):
+    rows = [
+        r for r in table(split, "ranking") if (r["horizon"], r["overrides"]) == ("1", overrides)
+    ]
     return {r["detector"]: 100 * float(r["auc_matched"]) for r in rows}
 
 
@@ -28,6 +34,27 @@ def test_the_table_is_the_boards(column, split):
     assert [r[0] for r in rows] == ["mewma", "npn", "rf", "riqn", "persistence"]
     for row in rows:
         assert float(row[column]) == pytest.approx(expected[row[0]], abs=0.051), row[0]
+
+
+def test_what_longer_training_gives_is_the_boards():
+    rows = re.findall(
+        r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \[([\d.]+), ([\d.]+)\] \|$",
+        PAGE,
+        re.MULTILINE,
+    )
+    assert [row[0] for row in rows] == ["npn", "riqn"]
+    shorter, longer = board("mini"), board("mini", '{"updates": 2400}')
+    for name, before, after, *against in rows:
+        assert float(before) == pytest.approx(shorter[name], abs=0.051)
+        assert float(after) == pytest.approx(longer[name], abs=0.051)
+        (pair,) = (
+            r
+            for r in table("mini", "comparisons")
+            if (r["first"], r["second"]) == (f"{name}[updates=2400]", "rf")
+        )
+        expected = [100 * float(pair[f"difference{end}"]) for end in ("", "_low", "_high")]
+        assert [float(n) for n in against] == pytest.approx(expected, abs=0.051)
+        assert pair["better"] == "true"
 
 
 def claims():

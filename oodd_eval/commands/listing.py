@@ -69,8 +69,8 @@ def _metrics() -> Iterable[tuple[str, ...]]:
 
     yield from (METRICS | POOLED).items()
     for suffix, target in TARGETS.items():
-        names = ", ".join(CALIBRATED)
-        yield f"..._{suffix}", f"{names}: alarms at a calibrated false-alarm rate of {100 * target:g} %"
+        at = f"alarms at a calibrated false-alarm rate of {100 * target:g} %"
+        yield f"..._{suffix}", f"{', '.join(CALIBRATED)}: {at}"
         yield f"threshold_{suffix}", "the CUSUM threshold of that rate"
 
 

@@ -40,6 +40,11 @@ def opening(header: Header, records: Sequence[Record]) -> list[str]:
     command += f" --split {header.split}" if header.split != tier.split else ""
     places = {str(r.parameters["device"]) for r in records if "device" in r.parameters}
     made += [f"networks on {place}" for place in sorted(places)]
+    updates = sorted({int(r.parameters["updates"]) for r in records if "updates" in r.parameters})
+    trained = (
+        f"Networks were trained for at most {' or '.join(map(str, updates))} updates. More of it "
+        "helps some models more than others: verdicts on models are about this much training."
+    )
     reading = (
         "Values are ours with a 95 % bootstrap interval over test seeds and detector seeds, the "
         "paper's digits below. These were computed on the authors' own data, policies and "
@@ -53,7 +58,8 @@ def opening(header: Header, records: Sequence[Record]) -> list[str]:
         "does not count."
     )
     run = (f"Tier **{tier.name}**. {_data(header)}.", seeds, state, f"Run by `{command}`.")
-    lines = (*run, *(f"Made with {text}." for text in made), reading, aucs)
+    made = [f"Made with {text}." for text in made]
+    lines = (*run, *made, *([trained] if updates else []), reading, aucs)
     source = (
         "*Out-of-Distribution Dynamics Detection: RL-Relevant Benchmarks and Results.* Every "
         "number is computed from stored records of cells (Table 2 from `returns.json`); "
