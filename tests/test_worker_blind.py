@@ -18,8 +18,9 @@ from helpers_spy import SPY, Findings, vectors
 
 from oodd_eval import evaluate, isolation, load_split, processes
 from oodd_eval.benchmark import ANOMALIES
+from oodd_eval.causality import PROBES, probes
 from oodd_eval.metrics import auc
-from oodd_eval.scoring import parts_of, shuffled
+from oodd_eval.scoring import lengths_of, parts_of, shuffled
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
 
@@ -98,7 +99,9 @@ def findings(secrets, tmp_path_factory):
 
 
 def test_a_worker_holds_no_secret_anywhere(findings, secrets):
-    assert findings.whens == ["made", "fit", "save", "score", "made", "load", "score"]
+    assert findings.whens == [
+        "made", "fit", "save", "score", "score", "made", "load", "score", "score",
+    ]  # fmt: skip
     assert secrets.seen_in(findings) == {}
     # The spy is no fool: it sees what it was told, in all places where it looked.
     told = findings.places_of(
@@ -175,7 +178,12 @@ def arrived_from(findings, split, environment):
     parts = parts_of(split.environment(environment), tuple(ANOMALIES))
     known = {digest(x): (part, i) for part, xs in parts.items() for i, x in enumerate(xs)}
     assert len(known) == sum(len(xs) for xs in parts.values())
-    return [known[found] for found, *_ in findings.arrived("score")]
+    return [known[found] for found, *_ in whole(findings)]
+
+
+def whole(findings):
+    """Return what arrived to be scored first: all but the prefixes that come at the end."""
+    return findings.arrived("score")[:-PROBES]
 
 
 def digest(x):
@@ -226,11 +234,19 @@ def test_trajectories_arrive_whole_and_in_one_form(mini):
     split = load_split("mini")
     order = arrived_from(mini, split, "cartpole")
     sets = parts_of(split.environment("cartpole"), tuple(ANOMALIES))
-    lengths = [length for _, length, _ in mini.arrived("score")]
+    lengths = [length for _, length, _ in whole(mini)]
     assert lengths == [int(sets[part].lengths[i]) + 1 for part, i in order]
     assert len(set(lengths)) > 10
     forms = {str(form) for when in ("fit", "score") for *_, form in mini.arrived(when)}
     assert len(forms) == 1, forms
+
+
+def test_at_the_end_come_prefixes_of_some_of_them(mini):
+    split = load_split("mini")
+    sets = parts_of(split.environment("cartpole"), tuple(ANOMALIES))
+    chosen = probes(lengths_of(sets, None), f"{split.digest}|cartpole|0")
+    expected = [digest(sets[p.part][p.index][: p.rows]) for p in chosen]
+    assert [found for found, *_ in mini.arrived("score")[-PROBES:]] == expected
 
 
 def test_training_trajectories_arrive_in_the_order_of_the_split(mini):
