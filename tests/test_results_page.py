@@ -37,24 +37,38 @@ def test_the_table_is_the_boards(column, split):
 
 
 def test_what_longer_training_gives_is_the_boards():
+    number = r"(-?[\d.]+)"
     rows = re.findall(
-        r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \[([\d.]+), ([\d.]+)\] \|$",
+        rf"^\| `(\w+)` \| (\w+) \| {number} \| {number} \| {number} \[{number}, {number}\] \|$",
         PAGE,
         re.MULTILINE,
     )
-    assert [row[0] for row in rows] == ["npn", "riqn"]
-    shorter, longer = board("mini"), board("mini", '{"updates": 2400}')
-    for name, before, after, *against in rows:
-        assert float(before) == pytest.approx(shorter[name], abs=0.051)
-        assert float(after) == pytest.approx(longer[name], abs=0.051)
+    assert [row[:2] for row in rows] == [("riqn", "mini"), ("riqn", "reduced"), ("npn", "mini")]
+    for name, split, *numbers in rows:
         (pair,) = (
             r
-            for r in table("mini", "comparisons")
+            for r in table(split, "comparisons")
             if (r["first"], r["second"]) == (f"{name}[updates=2400]", "rf")
         )
-        expected = [100 * float(pair[f"difference{end}"]) for end in ("", "_low", "_high")]
-        assert [float(n) for n in against] == pytest.approx(expected, abs=0.051)
-        assert pair["better"] == "true"
+        expected = [
+            board(split)[name],
+            board(split, '{"updates": 2400}')[name],
+            *(100 * float(pair[f"difference{end}"]) for end in ("", "_low", "_high")),
+        ]
+        assert [float(n) for n in numbers] == pytest.approx(expected, abs=0.051), (name, split)
+
+
+def test_papers_auc_of_riqn_and_rf_on_reduced():
+    rows = {
+        (r["detector"], r["overrides"]): 100 * float(r["auc"])
+        for r in table("reduced", "ranking")
+        if r["horizon"] == "1"
+    }
+    pairs = re.findall(r"\(([\d.]+)\s+against\s+([\d.]+)\b", PAGE)
+    shorter, longer = rows["riqn", "{}"], rows["riqn", '{"updates": 2400}']
+    expected = [(rows["rf", "{}"], shorter), (longer, rows["rf", "{}"])]
+    for found, numbers in zip(pairs, expected, strict=True):
+        assert [float(n) for n in found] == pytest.approx(numbers, abs=0.051)
 
 
 def claims():
