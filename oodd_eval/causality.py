@@ -59,9 +59,8 @@ def probes(lengths: Mapping[str, Sequence[int]], key: str) -> list[Probe]:
     key
         The same key gives the same probes anywhere.
     """
-    long = [
-        (part, i, n) for part, counts in lengths.items() for i, n in enumerate(counts) if n >= 8
-    ]
+    every = ((part, i, n) for part, counts in lengths.items() for i, n in enumerate(counts))
+    long = [(part, i, n) for part, i, n in every if n >= MIN_ROWS]
     seed = int.from_bytes(hashlib.sha256(f"probes|{key}".encode()).digest())
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(long))[:PROBES]
