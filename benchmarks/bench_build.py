@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from oodd_eval.benchmark import ENVIRONMENTS
-from oodd_eval.simulate.build import Chunk, record_chunk
-from oodd_eval.simulate.environments import make
-from oodd_eval.simulate.policies import load_policy
-from oodd_eval.simulate.quiet import quiet_streams
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.simulate.build import Chunk, record_chunk
+from oodd_eval.data.simulate.environments import make
+from oodd_eval.data.simulate.policies import load_policy
+from oodd_eval.data.simulate.quiet import quiet_streams
 
 FIRST_SEED = 990 * 10**6
 SHARE = 0.75

@@ -14,7 +14,7 @@ from oodd_riqn import riqn
 from tabulate import tabulate
 
 from oodd_eval import load_split
-from oodd_eval.benchmark import ANOMALIES
+from oodd_eval.data.facts import ANOMALIES
 
 UPDATES = 30
 

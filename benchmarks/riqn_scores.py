@@ -27,9 +27,9 @@ from oodd_torch.training import arrange
 from tabulate import tabulate
 
 from oodd_eval import load_split
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.metrics import auc_contributions
-from oodd_eval.selection import select
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.metrics.auc import auc_contributions
+from oodd_eval.names import select
 
 SCORES = ("E|o - X|", "CRPS", "median")
 DETECTORS = {"riqn": (riqn, 8), "npn": (npn, 1)}

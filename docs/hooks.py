@@ -15,8 +15,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from oodd_eval.cli import build_parser
-from oodd_eval.options import choices
+from oodd_eval.cli.main import build_parser
+from oodd_eval.cli.options import choices
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"

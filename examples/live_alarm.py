@@ -19,11 +19,11 @@ import gymnasium
 import numpy as np
 
 from oodd_eval import load_split
-from oodd_eval.alarms import Monitor, calibrate
-from oodd_eval.cusum import Standardization
-from oodd_eval.metrics import AlarmRule
-from oodd_eval.plugins import discover
-from oodd_eval.simulate.policies import load_policy
+from oodd_eval.data.simulate.policies import load_policy
+from oodd_eval.metrics.alarms import Monitor, calibrate
+from oodd_eval.metrics.auc import AlarmRule
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.plugins.discovery import discover
 
 HEAVIER = {"masspole": 0.4, "length": 1.0}
 """What changes at the onset; nominally 0.1 kg and 0.5 m (half of the pole)."""

@@ -13,11 +13,11 @@ from oodd_eval._version import __version__
 
 if TYPE_CHECKING:
     from oodd_eval.api import evaluate
-    from oodd_eval.detector import Detector, DetectorSpec
-    from oodd_eval.hookspecs import hookimpl
-    from oodd_eval.splits import load_split
-    from oodd_eval.testing import check_detector
-    from oodd_eval.trajectory import Trajectory
+    from oodd_eval.data.split import load_split
+    from oodd_eval.data.trajectory import Trajectory
+    from oodd_eval.plugins.conformance import check_detector
+    from oodd_eval.plugins.contract import Detector, DetectorSpec
+    from oodd_eval.plugins.hooks import hookimpl
 
 __all__ = [
     "Detector",
@@ -31,13 +31,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Detector": "detector",
-    "DetectorSpec": "detector",
-    "Trajectory": "trajectory",
-    "check_detector": "testing",
+    "Detector": "plugins.contract",
+    "DetectorSpec": "plugins.contract",
+    "Trajectory": "data.trajectory",
+    "check_detector": "plugins.conformance",
     "evaluate": "api",
-    "hookimpl": "hookspecs",
-    "load_split": "splits",
+    "hookimpl": "plugins.hooks",
+    "load_split": "data.split",
 }
 
 

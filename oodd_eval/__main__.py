@@ -2,6 +2,6 @@
 
 import sys
 
-from oodd_eval.cli import main
+from oodd_eval.cli.main import main
 
 sys.exit(main())

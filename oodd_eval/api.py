@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from oodd_eval.benchmark import ANOMALIES
-from oodd_eval.detector import Detector, DetectorSpec
-from oodd_eval.isolation import Limits
-from oodd_eval.plan import make_plan
-from oodd_eval.plugins import Offer, discover
-from oodd_eval.records import Record
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import Settings, run
-from oodd_eval.scoring import LOCAL
-from oodd_eval.selection import select
-from oodd_eval.splits import Split, load_split
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.split import Split, load_split
+from oodd_eval.names import select
+from oodd_eval.plugins.contract import Detector, DetectorSpec
+from oodd_eval.plugins.discovery import Offer, discover
+from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.record import Record
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import Settings, run
+from oodd_eval.scoring.unit import LOCAL
 
 
 def evaluate(

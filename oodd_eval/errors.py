@@ -60,7 +60,7 @@ class DigestError(SplitError):
 
 
 class ContractError(OoddError, ValueError):
-    """A detector that broke the contract of `oodd_eval.detector`."""
+    """A detector that broke the contract of `oodd_eval.plugins.contract`."""
 
 
 class NotFittedError(OoddError, RuntimeError):

@@ -9,19 +9,19 @@ from typing import Any
 
 import pytest
 
-from oodd_eval.benchmark import PROTOCOL
-from oodd_eval.compare.differences import Difference, compare
-from oodd_eval.compare.figures import Conditions, FigureSet, figures_of, read_figures
-from oodd_eval.compare.tolerance import KNOWN, parse_tolerances
+from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
-from oodd_eval.plan import Plan, make_plan
-from oodd_eval.plugins import Plugins, discover
-from oodd_eval.records import Record
-from oodd_eval.report.junit import message
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import Settings, run
-from oodd_eval.selection import select
-from oodd_eval.splits import Split, load_split
+from oodd_eval.names import select
+from oodd_eval.plugins.discovery import Plugins, discover
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.record import Record
+from oodd_eval.results.regression.differences import Difference, compare
+from oodd_eval.results.regression.figures import Conditions, FigureSet, figures_of, read_figures
+from oodd_eval.results.regression.junit import message
+from oodd_eval.results.regression.tolerance import KNOWN, parse_tolerances
+from oodd_eval.scoring.plan import Plan, make_plan
+from oodd_eval.scoring.runner import Settings, run
 
 
 class Regression(Exception):  # noqa: N818  a finding, not an error of the program

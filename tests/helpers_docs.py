@@ -111,7 +111,7 @@ def quick(command, rules=()):
 
 def parse(command):
     """Check the options of an ``oodd-eval`` command."""
-    from oodd_eval.cli import build_parser
+    from oodd_eval.cli.main import build_parser
 
     try:
         build_parser().parse_args(shlex.split(command, comments=True)[1:])
@@ -140,7 +140,7 @@ class Session:
         return self._process(words)
 
     def _in_process(self, arguments):
-        from oodd_eval.cli import main
+        from oodd_eval.cli.main import main
 
         try:
             return main(arguments)

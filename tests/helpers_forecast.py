@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from oodd_eval.prediction import GRID, quantile_levels
+from oodd_eval.plugins.forecasting import GRID, quantile_levels
 
 
 def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):

@@ -81,7 +81,10 @@ def workers_of(marker):
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             command = (entry / "cmdline").read_bytes()
-            if b"oodd_eval.worker" in command and marker in (entry / "environ").read_bytes():
+            if (
+                b"oodd_eval.plugins.isolation.worker" in command
+                and marker in (entry / "environ").read_bytes()
+            ):
                 found.append(int(entry.name))
         except OSError:
             continue  # it ended meanwhile, or is another user's

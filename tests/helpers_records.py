@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from oodd_eval.benchmark import ANOMALIES
-from oodd_eval.metrics import METRICS
-from oodd_eval.records import Metric, Record
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.metrics.auc import METRICS
+from oodd_eval.results.record import Metric, Record
 
 
 def make_record(

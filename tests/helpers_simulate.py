@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from oodd_eval.benchmark import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS
 
 SEEDS = {"acrobot": 1, "cartpole": 1, "lunarlander": 1, "ant": 2, "halfcheetah": 1, "hopper": 0,
          "walker2d": 4}  # fmt: skip

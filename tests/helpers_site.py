@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from helpers_records import make_record
 
-from oodd_eval.alarms import CALIBRATED
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.curves import Sweep, cell_curves, thresholds, write_curves
-from oodd_eval.cusum import Standardization
-from oodd_eval.intervals import bootstrap_weights, interval
-from oodd_eval.metrics import METRICS, POOLED, AlarmRule, Contribution
-from oodd_eval.records import Metric
-from oodd_eval.site.data import site_data
-from oodd_eval.submission.format import Entry, read_entries
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.leaderboard.entry import Entry, read_entries
+from oodd_eval.leaderboard.site.data import site_data
+from oodd_eval.metrics.alarms import CALIBRATED
+from oodd_eval.metrics.auc import METRICS, POOLED, AlarmRule, Contribution
+from oodd_eval.metrics.bootstrap import bootstrap_weights, interval
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.results.curves import Sweep, cell_curves, thresholds, write_curves
+from oodd_eval.results.record import Metric
 
 DIGEST = "ab" * 32
 

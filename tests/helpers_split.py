@@ -9,8 +9,8 @@ import dataclasses
 
 import numpy as np
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, SplitDefinition
-from oodd_eval.splits_format import (
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SplitDefinition
+from oodd_eval.data.layout import (
     SCHEMA,
     TWINS,
     environment_digest,

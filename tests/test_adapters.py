@@ -11,7 +11,7 @@ from sklearn.ensemble import IsolationForest
 from sklearn.neighbors import KernelDensity
 
 from oodd_eval import Trajectory, load_split
-from oodd_eval.cli import main
+from oodd_eval.cli.main import main
 from oodd_eval.errors import (
     ContractError,
     MissingExtraError,
@@ -19,10 +19,10 @@ from oodd_eval.errors import (
     UnknownNameError,
     UsageError,
 )
-from oodd_eval.plugins import discover, resolve_parameters
-from oodd_eval.prediction import FeatureScale
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.testing import check_detector
+from oodd_eval.plugins.conformance import check_detector
+from oodd_eval.plugins.discovery import discover, resolve_parameters
+from oodd_eval.plugins.forecasting import FeatureScale
+from oodd_eval.results.directory import ResultsDirectory
 
 THEIRS = '''
 """Forecasters and detectors of a user."""
@@ -361,7 +361,7 @@ def test_the_librarys_version_is_part_of_the_detectors(name, version):
 def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
     before = offer("forecast:their_models.Mean").version
     theirs.write_text(THEIRS + "\n# changed\n")
-    from oodd_eval.provenance import source_digest
+    from oodd_eval.results.provenance import source_digest
 
     source_digest.cache_clear()
     assert before.startswith("0.")

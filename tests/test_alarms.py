@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.alarms import (
+from oodd_eval.metrics.alarms import (
     MIN_STEPS,
     Monitor,
     calibrate,
     calibrated_contributions,
     false_alarm_rate,
 )
-from oodd_eval.cusum import Standardization, cusum
-from oodd_eval.metrics import AlarmRule
+from oodd_eval.metrics.auc import AlarmRule
+from oodd_eval.metrics.cusum import Standardization, cusum
 
 
 def rule(threshold=0.0, drift=0.0018):

@@ -60,7 +60,7 @@ def test_core_never_imports_a_detector():
 def test_listing_detectors_imports_nothing_heavy():
     code = (
         "import sys\n"
-        "from oodd_eval.cli import main\n"
+        "from oodd_eval.cli.main import main\n"
         "try: main(['list', 'detectors'])\n"
         "except SystemExit: pass\n"
         "bad = {'torch', 'sklearn', 'h5py', 'gymnasium', 'pybullet'} & set(sys.modules)\n"

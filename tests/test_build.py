@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
-from oodd_eval.benchmark import SplitDefinition
+from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.simulate import build
+from oodd_eval.data.simulate.build import Chunk, build_split
+from oodd_eval.data.simulate.policies import FROZEN, freeze_policy, load_policy
+from oodd_eval.data.simulate.record import TwinTooShortError, record_seed
+from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
-from oodd_eval.simulate import build
-from oodd_eval.simulate.build import Chunk, build_split
-from oodd_eval.simulate.policies import FROZEN, freeze_policy, load_policy
-from oodd_eval.simulate.record import TwinTooShortError, record_seed
-from oodd_eval.splits import load_split
 
 SMALL = SplitDefinition("small", 4, 2, 2, 60, 950)
 FEW = {"environments": ["cartpole"]}
@@ -98,8 +98,8 @@ def test_a_damaged_file_is_built_again(built, tmp_path):
 SCRIPT = """
 import sys
 from pathlib import Path
-from oodd_eval.benchmark import SplitDefinition
-from oodd_eval.simulate import build
+from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.simulate import build
 
 if __name__ == "__main__":
     build.CHUNK.update(train=1, calibration=1, test=1)

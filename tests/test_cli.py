@@ -12,11 +12,11 @@ import pytest
 from helpers_plugins import install
 from helpers_split import make_split
 
-from oodd_eval import cli
-from oodd_eval.commands import listing
-from oodd_eval.compare.tolerance import KNOWN
-from oodd_eval.options import choices
-from oodd_eval.results import ResultsDirectory
+from oodd_eval.cli import listing
+from oodd_eval.cli import main as cli
+from oodd_eval.cli.options import choices
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.regression.tolerance import KNOWN
 
 
 @pytest.fixture
@@ -406,7 +406,7 @@ def test_info_describes_a_split(run):
 def test_a_missing_extra_is_named_with_the_command(tmp_path, missing, arguments, extra):
     code = (
         f"import sys; sys.modules[{missing!r}] = None\n"
-        f"from oodd_eval.cli import main; sys.exit(main({arguments!r}))"
+        f"from oodd_eval.cli.main import main; sys.exit(main({arguments!r}))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,

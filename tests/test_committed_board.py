@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from oodd_eval.commands import leaderboard_build
-from oodd_eval.submission.format import read_entries
-from oodd_eval.submission.verify import verify
+from oodd_eval.leaderboard import build as leaderboard_build
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.verify.verify import verify
 
 BOARD = Path(__file__).parents[1] / "leaderboard"
 

@@ -16,21 +16,23 @@ from helpers_records import make_record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval import cli, load_split
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS, PROTOCOL
-from oodd_eval.compare.differences import MEANINGS, NothingInCommonError, compare
-from oodd_eval.compare.figures import (
+from oodd_eval import load_split
+from oodd_eval.cli import main as cli
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, PROTOCOL
+from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.names import expression
+from oodd_eval.results.record import Metric
+from oodd_eval.results.regression import junit
+from oodd_eval.results.regression import rendering as differences
+from oodd_eval.results.regression.differences import MEANINGS, NothingInCommonError, compare
+from oodd_eval.results.regression.figures import (
     figures_of,
     read_figures,
     read_records,
     reference_text,
     write_reference,
 )
-from oodd_eval.compare.tolerance import KNOWN, Tolerance, parse_tolerance, worse_side
-from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
-from oodd_eval.records import Metric
-from oodd_eval.report import differences, junit
-from oodd_eval.selection import expression
+from oodd_eval.results.regression.tolerance import KNOWN, Tolerance, parse_tolerance, worse_side
 
 NAN = math.nan
 ROOT = Path(__file__).parents[1]

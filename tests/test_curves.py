@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from oodd_eval import evaluate
-from oodd_eval.curves import (
+from oodd_eval.data.split import load_split
+from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, auc_contributions
+from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Standardization, cusum
+from oodd_eval.results.curve_file import check_curves
+from oodd_eval.results.curves import (
     FPR,
     Sweep,
     _rounded,
@@ -24,12 +29,7 @@ from oodd_eval.curves import (
     thresholds,
     write_curves,
 )
-from oodd_eval.curves_format import check_curves
-from oodd_eval.cusum import THRESHOLD, UNIT, Standardization, cusum
-from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.metrics import AlarmRule, alarm_contributions, auc, auc_contributions
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.splits import load_split
+from oodd_eval.results.directory import ResultsDirectory
 
 RULE = AlarmRule(Standardization(mean=0.0, std=1.0))
 FINE = np.linspace(0, 1, 20_001)

@@ -8,7 +8,7 @@ from detecta import detect_cusum
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.cusum import Standardization, cusum, detecta_alarms
+from oodd_eval.metrics.cusum import Standardization, cusum, detecta_alarms
 
 NAN = math.nan
 

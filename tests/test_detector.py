@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from oodd_eval.detector import check_scores
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError
-from oodd_eval.trajectory import Trajectory
+from oodd_eval.plugins.contract import check_scores
 
 EPISODE = Trajectory(np.zeros((6, 2)), np.zeros((5, 1)))
 

@@ -139,18 +139,18 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(pages, site):
 
 def test_reference_has_every_public_name(site):
     import oodd_eval
-    import oodd_eval.testing
+    import oodd_eval.plugins.conformance
 
     text = "".join(p.read_text() for p in (site / "reference").glob("*.html"))
     names = {*oodd_eval.__all__} - {"__version__", "hookimpl"}
     assert all(re.search(rf'id="oodd_eval\.\w*\.?{name}"', text) for name in names)
     for hook in ("detectors", "detector_from_spec", "run_started", "cell_finished", "run_finished"):
-        assert f'id="oodd_eval.hookspecs.oodd_{hook}"' in text
+        assert f'id="oodd_eval.plugins.hooks.oodd_{hook}"' in text
 
 
 def test_reference_shows_the_help_of_every_command(pages, site):
-    from oodd_eval.cli import build_parser
-    from oodd_eval.options import choices
+    from oodd_eval.cli.main import build_parser
+    from oodd_eval.cli.options import choices
 
     text = "".join(pages[site / "reference" / "commands.html"].text)
     assert "help of every command -->" not in text
@@ -209,9 +209,9 @@ def test_figures_of_the_protocol_are_all_shown_and_described():
 
 def test_numbers_of_the_protocol_are_those_of_its_episode():
     from oodd_eval import load_split
-    from oodd_eval.cusum import Standardization
-    from oodd_eval.metrics import AlarmRule, auc_onset, auc_same_times, first_delay
-    from oodd_eval.plugins import discover
+    from oodd_eval.metrics.auc import AlarmRule, auc_onset, auc_same_times, first_delay
+    from oodd_eval.metrics.cusum import Standardization
+    from oodd_eval.plugins.discovery import discover
 
     data = load_split("mini").environment("hopper")
     anomalous, off = data.anomalous("components"), data.anomalous("shutdown")

@@ -14,13 +14,13 @@ from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_
 
 from oodd_eval import load_split
 from oodd_eval.errors import ExecutorError, SplitError, UsageError
-from oodd_eval.executors import Orders, opener, remote
-from oodd_eval.executors.local import LocalExecutor
-from oodd_eval.isolation import Limits
-from oodd_eval.plan import make_plan
-from oodd_eval.plugins import discover
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.scoring import UnitJob
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.executors import Orders, opener, remote
+from oodd_eval.scoring.executors.local import LocalExecutor
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.unit import UnitJob
 
 VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
 NEVER = threading.Event()
@@ -235,8 +235,8 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_records(tiny_split, monkey
 @dask
 def test_an_address_where_nobody_answers_is_named(tiny_split, tmp_path):
     code = (
-        "import oodd_eval.executors.dask as d, sys; d.CONNECT_SECONDS = 0.2;"
-        "from oodd_eval.cli import main; sys.exit(main(sys.argv[1:]))"
+        "import oodd_eval.scoring.executors.dask as d, sys; d.CONNECT_SECONDS = 0.2;"
+        "from oodd_eval.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     arguments = ["run", "--detector", "clock", "--env", "hopper", "--split", str(tiny_split),
                  "--output", str(tmp_path), "--executor", "dask://127.0.0.1:9"]  # fmt: skip
@@ -250,7 +250,7 @@ def test_an_address_where_nobody_answers_is_named(tiny_split, tmp_path):
 def test_without_dask_the_extra_is_named(tiny_split, tmp_path):
     code = (
         "import sys; sys.modules['distributed'] = None;"
-        "from oodd_eval.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from oodd_eval.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     arguments = ["run", "--detector", "clock", "--env", "hopper", "--split", str(tiny_split),
                  "--output", str(tmp_path), "--executor", "dask://127.0.0.1:9"]  # fmt: skip

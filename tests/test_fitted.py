@@ -6,13 +6,13 @@ import threading
 import pytest
 from helpers_plugins import install
 
-from oodd_eval.fitted import FittedStore
-from oodd_eval.isolation import Limits
-from oodd_eval.plan import make_plan
-from oodd_eval.plugins import discover
-from oodd_eval.results import ResultsDirectory, fit_key
-from oodd_eval.runner import Settings, run
-from oodd_eval.splits import load_split
+from oodd_eval.data.split import load_split
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.results.directory import ResultsDirectory, fit_key
+from oodd_eval.results.fits import FittedStore
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import Settings, run
 
 PLUGIN = """
 import json, os

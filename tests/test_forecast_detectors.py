@@ -22,9 +22,9 @@ from oodd_torch.training import (
 from scipy.stats import ks_2samp
 
 from oodd_eval import Trajectory
-from oodd_eval.detector import check_scores
 from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
-from oodd_eval.prediction import GRID, FeatureScale, quantile_levels
+from oodd_eval.plugins.contract import check_scores
+from oodd_eval.plugins.forecasting import GRID, FeatureScale, quantile_levels
 
 FACTORIES = {"riqn": riqn, "riqn-ms": riqn_ms, "n-riqn": n_riqn, "npn": npn}
 SMALL = {"members": 2, "updates": 15, "chunk": 20}

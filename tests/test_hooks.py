@@ -6,14 +6,15 @@ from dataclasses import replace
 import pytest
 from helpers_plugins import install
 
-from oodd_eval import hookspecs, load_split
-from oodd_eval.cli import main
+from oodd_eval import load_split
+from oodd_eval.cli.main import main
 from oodd_eval.errors import PluginError, UsageError
-from oodd_eval.hookspecs import hookimpl
-from oodd_eval.plan import make_plan
-from oodd_eval.plugins import discover
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import Settings, run
+from oodd_eval.plugins import hooks as hookspecs
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.hooks import hookimpl
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import Settings, run
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("oodd_")]
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from helpers_plugins import install
 
-from oodd_eval.processes import LONGEST_REASON
-from oodd_eval.records import STATUSES
+from oodd_eval.plugins.isolation.processes import LONGEST_REASON
+from oodd_eval.results.record import STATUSES
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks into /proc")
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from oodd_eval.intervals import (
+from oodd_eval.metrics.auc import Contribution, mean_of
+from oodd_eval.metrics.bootstrap import (
     bootstrap_weights,
     difference_interval,
     interval,
@@ -13,7 +14,6 @@ from oodd_eval.intervals import (
     mean_value,
     resampled,
 )
-from oodd_eval.metrics import Contribution, mean_of
 
 NAN = math.nan
 

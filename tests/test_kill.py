@@ -14,10 +14,10 @@ import pytest
 from helpers_plugins import install
 from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
 
-from oodd_eval.fitted import FittedStore
-from oodd_eval.keeping import Keeper
-from oodd_eval.records import Record
-from oodd_eval.results import ResultsDirectory
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.fits import FittedStore
+from oodd_eval.results.keeping import Keeper
+from oodd_eval.results.record import Record
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
 
@@ -204,7 +204,7 @@ def test_records_written_in_any_order_end_in_the_order_of_the_plan(tmp_path):
 
 def test_writing_records_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
     clock, written = [0.0], []
-    monkeypatch.setattr("oodd_eval.keeping.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("oodd_eval.results.keeping.time.monotonic", lambda: clock[0])
 
     def merge(records):
         clock[0] += 1.0  # a writing takes a second

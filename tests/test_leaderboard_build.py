@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from helpers_records import example, make_record
 
-from oodd_eval.cli import main
-from oodd_eval.commands import leaderboard_build
+from oodd_eval.cli.main import main
+from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics import METRICS, POOLED
-from oodd_eval.records import Metric
-from oodd_eval.report import csv_tables, ranking_tables
-from oodd_eval.report.leaderboard import sections
-from oodd_eval.report.leaderboard_page import page
-from oodd_eval.report.standings import cost_of, ranked
-from oodd_eval.report.tables import UNDEFINED
-from oodd_eval.splits import published_digests
-from oodd_eval.submission.format import Entry, SubmittedEntry
+from oodd_eval.leaderboard import build as leaderboard_build
+from oodd_eval.leaderboard.entry import Entry, SubmittedEntry
+from oodd_eval.leaderboard.page import page
+from oodd_eval.leaderboard.sections import sections
+from oodd_eval.metrics.auc import METRICS, POOLED
+from oodd_eval.results.record import Metric
+from oodd_eval.results.tables import csv_tables, ranking_tables
+from oodd_eval.results.tables.standings import cost_of, ranked
+from oodd_eval.results.tables.tables import UNDEFINED
 
 GOLDEN = Path(__file__).parent / "golden"
 SEEDS = 12

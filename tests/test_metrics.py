@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score, roc_auc_score, roc_curve
 
-from oodd_eval.cusum import Standardization
-from oodd_eval.evaluation import Rules, cell_metrics
-from oodd_eval.metrics import (
+from oodd_eval.metrics.auc import (
     METRICS,
     POOLED,
     AlarmRule,
@@ -21,6 +19,8 @@ from oodd_eval.metrics import (
     cell_contributions,
     pooled_metrics,
 )
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.results.evaluate import Rules, cell_metrics
 
 NAN = math.nan
 # Alarm exactly where the score is above 1.

@@ -10,8 +10,8 @@ from oodd_mewma.chart import distance, smooth, whitening
 from oodd_mewma.forecast import Moments, product, regressors
 
 from oodd_eval import Trajectory
-from oodd_eval.detector import check_scores
 from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
+from oodd_eval.plugins.contract import check_scores
 
 A1 = np.array([[0.5, 0.2, 0.0], [-0.3, 0.6, 0.1], [0.0, 0.1, 0.4]])
 A2 = np.array([[-0.2, 0.0, 0.1], [0.0, -0.3, 0.0], [0.1, 0.0, 0.2]])

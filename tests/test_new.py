@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from helpers_plugins import install
 
-from oodd_eval.cli import main
+from oodd_eval.cli.main import main
 from oodd_eval.errors import OutputError, UsageError
-from oodd_eval.scaffold import FILES, LONGEST, Project, write_project
+from oodd_eval.plugins.template import FILES, LONGEST, Project, write_project
 
 LONG = ("abcde-" * 9)[: LONGEST - 1] + "z"
 
@@ -107,7 +107,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_every_template_is_used():
-    there = {p.name for p in (files("oodd_eval.scaffold") / "templates").iterdir()}
+    there = {p.name for p in (files("oodd_eval.plugins.template") / "templates").iterdir()}
     assert there == set(FILES.values())
 
 
@@ -139,7 +139,7 @@ def test_the_project_passes_its_own_linter(name, tmp_path):
 
 
 def test_commands_in_the_projects_readme_exist():
-    from oodd_eval.cli import build_parser
+    from oodd_eval.cli.main import build_parser
 
     text = Project("slow").render()["README.md"]
     commands = re.findall(r"(?:^|`)oodd-eval ([^\n`]+)", text, re.MULTILINE)

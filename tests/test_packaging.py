@@ -39,7 +39,7 @@ def run_installed(installed, tmp_path, *arguments):
     code = (
         f"import sys; sys.path.insert(0, {str(installed)!r}); import oodd_eval;"
         f"assert oodd_eval.__file__.startswith({str(installed)!r}), oodd_eval.__file__;"
-        "from oodd_eval.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from oodd_eval.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],

@@ -7,10 +7,10 @@ import sys
 import pytest
 from helpers_plugins import install
 
-from oodd_eval.detector import DetectorSpec
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
-from oodd_eval.plugins import Offer, discover, resolve_parameters
-from oodd_eval.trivial import Clock
+from oodd_eval.plugins.baselines import Clock
+from oodd_eval.plugins.contract import DetectorSpec
+from oodd_eval.plugins.discovery import Offer, discover, resolve_parameters
 
 OFFER = """
 @hookimpl
@@ -155,7 +155,7 @@ def test_a_parameter_of_another_kind_is_refused(value):
 @pytest.mark.parametrize("what", ["detectors", "envs", "metrics"])
 def test_listing_imports_nothing_heavy(what):
     code = (
-        "import sys\nfrom oodd_eval.cli import main\n"
+        "import sys\nfrom oodd_eval.cli.main import main\n"
         f"main(['list', {what!r}])\n"
         "sys.exit(repr({'torch', 'sklearn', 'h5py', 'gymnasium', 'pybullet'} & set(sys.modules)))"
     )
@@ -165,7 +165,7 @@ def test_listing_imports_nothing_heavy(what):
 
 def test_help_imports_not_even_numpy():
     code = (
-        "import sys\nfrom oodd_eval.cli import main\n"
+        "import sys\nfrom oodd_eval.cli.main import main\n"
         "main(['--help'])\nsys.exit('numpy' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from oodd_eval.data.simulate import policies
+from oodd_eval.data.simulate.policies import content_digest, freeze_policy, load_policy
 from oodd_eval.errors import PolicyError, UnknownNameError
-from oodd_eval.simulate import policies
-from oodd_eval.simulate.policies import content_digest, freeze_policy, load_policy
 
 
 def td3(observation_dim=15, action_dim=3, scale=1.0):

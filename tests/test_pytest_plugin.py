@@ -9,8 +9,8 @@ import pytest
 from helpers_plugins import install
 
 from oodd_eval import evaluate
-from oodd_eval.compare.figures import write_reference
 from oodd_eval.pytest_cells import Cells, Regression
+from oodd_eval.results.regression.figures import write_reference
 
 pytest_plugins = ["pytester"]
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.intervals import bootstrap_weights, difference_interval
-from oodd_eval.metrics import Contribution, mean_of
-from oodd_eval.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
+from oodd_eval.metrics.auc import Contribution, mean_of
+from oodd_eval.metrics.bootstrap import bootstrap_weights, difference_interval
+from oodd_eval.metrics.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
 
 CELLS = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid")]
 NAN = math.nan

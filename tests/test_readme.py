@@ -38,7 +38,7 @@ def test_extras_in_the_commands_exist():
 
 
 def test_main_command_selects_cells():
-    from oodd_eval.cli import main
+    from oodd_eval.cli.main import main
 
     arguments = commands()["main"].split("oodd-eval ", 1)[1].split()
     assert main([*arguments, "--collect-only", "-q"]) == 0

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.records import SCHEMA, STATUSES, Metric, Record
-from oodd_eval.results import ResultsDirectory, ScoreFile, UnitKey
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile, UnitKey
+from oodd_eval.results.record import SCHEMA, STATUSES, Metric, Record
 
 NAN = float("nan")
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
-from oodd_eval.benchmark import SPLITS, SplitDefinition
-from oodd_eval.simulate.build import build_split
-from oodd_eval.splits import load_split
+from oodd_eval.data.facts import SPLITS, SplitDefinition
+from oodd_eval.data.simulate.build import build_split
+from oodd_eval.data.split import load_split
 
 WHOLE = SplitDefinition("whole", 4, 3, 3, 80, 951)
 PART = replace(WHOLE, name="part", train=4, calibration=2, test=1)

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from oodd_eval.intervals import bootstrap_weights, mean_interval
-from oodd_eval.records import Metric
-from oodd_eval.report import markdown, tables
-from oodd_eval.report.board import Board, boards, contribution
-from oodd_eval.report.tables import Table
-from oodd_eval.report.terminal import TerminalReporter, summary
+from oodd_eval.cli.terminal import TerminalReporter, summary
+from oodd_eval.metrics.bootstrap import bootstrap_weights, mean_interval
+from oodd_eval.results.record import Metric
+from oodd_eval.results.tables import markdown, tables
+from oodd_eval.results.tables.board import Board, boards, contribution
+from oodd_eval.results.tables.tables import Table
 
 GOLDEN = Path(__file__).parent / "golden"
 

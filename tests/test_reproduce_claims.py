@@ -7,12 +7,12 @@ import zlib
 import pytest
 from helpers_records import make_record
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.reproduce import returns, verdicts
-from oodd_eval.reproduce.claims import Rule, judge
-from oodd_eval.reproduce.evidence import Estimate, Evidence
-from oodd_eval.reproduce.experiments import EXPERIMENTS, setups_of
-from oodd_eval.reproduce.paper_claims import CLAIMS, RETURNS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.paper import returns, verdicts
+from oodd_eval.paper.claims import Rule, judge
+from oodd_eval.paper.evidence import Estimate, Evidence
+from oodd_eval.paper.experiments import EXPERIMENTS, setups_of
+from oodd_eval.paper.paper_claims import CLAIMS, RETURNS
 
 ABOVE = Rule(low=0.0, small=0.005)
 BETWEEN = Rule(-0.02, 0.02)

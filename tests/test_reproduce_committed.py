@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from oodd_eval.cli import main
+from oodd_eval.cli.main import main
 
 BOARD = Path(__file__).parents[1] / "leaderboard"
 RESULTS = BOARD / "results"

@@ -12,16 +12,16 @@ import pytest
 from helpers_records import make_record
 
 import oodd_eval
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.intervals import bootstrap_weights
-from oodd_eval.report.tables import UNDEFINED
-from oodd_eval.reproduce import captions, costs, paper, returns
-from oodd_eval.reproduce.evidence import Estimate, Evidence, Term
-from oodd_eval.reproduce.experiments import ALL, EXPERIMENTS, GROUPED, RIQN, TIERS, Setup
-from oodd_eval.reproduce.figures import figures
-from oodd_eval.reproduce.header import Header
-from oodd_eval.reproduce.numbers import compute, csv_lines, layout, show
-from oodd_eval.reproduce.publish import publish
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.metrics.bootstrap import bootstrap_weights
+from oodd_eval.paper import captions, costs, paper, returns
+from oodd_eval.paper.evidence import Estimate, Evidence, Term
+from oodd_eval.paper.experiments import ALL, EXPERIMENTS, GROUPED, RIQN, TIERS, Setup
+from oodd_eval.paper.figures import figures
+from oodd_eval.paper.header import Header
+from oodd_eval.paper.numbers import compute, csv_lines, layout, show
+from oodd_eval.paper.publish import publish
+from oodd_eval.results.tables.tables import UNDEFINED
 
 BY_ID = {e.id: e for e in EXPERIMENTS}
 RF = Setup("rf")

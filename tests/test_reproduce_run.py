@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from helpers_reproduce import install_quick
 
-from oodd_eval import packed
-from oodd_eval.cli import main
-from oodd_eval.reproduce import publish
-from oodd_eval.reproduce.plots import Dots, Figure, Panel, draw, drawing_key
-from oodd_eval.results import ResultsDirectory
+from oodd_eval.cli.main import main
+from oodd_eval.paper import publish
+from oodd_eval.paper.plots import Dots, Figure, Panel, draw, drawing_key
+from oodd_eval.results import files as packed
+from oodd_eval.results.directory import ResultsDirectory
 
 ONLY = "delays"
 """Five units in each environment, riqn at three horizons."""

@@ -6,14 +6,12 @@ import pytest
 from helpers_records import make_record
 
 from oodd_eval import load_split
-from oodd_eval.benchmark import ENVIRONMENTS
-from oodd_eval.plan import Plan, Unit
-from oodd_eval.plugins import discover
-from oodd_eval.reproduce import carry
-from oodd_eval.reproduce.carry import Watch, carry_out
-from oodd_eval.reproduce.costs import Cost, correction, duration, estimate, scored_rows
-from oodd_eval.reproduce.experiments import EXPERIMENTS, RIQN, TIERS, Setup
-from oodd_eval.reproduce.schedule import (
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.paper import carry
+from oodd_eval.paper.carry import Watch, carry_out
+from oodd_eval.paper.costs import Cost, correction, duration, estimate, scored_rows
+from oodd_eval.paper.experiments import EXPERIMENTS, RIQN, TIERS, Setup
+from oodd_eval.paper.schedule import (
     Work,
     finished_keys,
     is_done,
@@ -21,7 +19,9 @@ from oodd_eval.reproduce.schedule import (
     next_batch,
     remaining_seconds,
 )
-from oodd_eval.runner import Run, Settings
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.scoring.plan import Plan, Unit
+from oodd_eval.scoring.runner import Run, Settings
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from oodd_eval import Trajectory
-from oodd_eval.detector import check_scores
 from oodd_eval.errors import FittedStateError, NotFittedError, TrajectoryError, UsageError
-from oodd_eval.prediction import FeatureScale
+from oodd_eval.plugins.contract import check_scores
+from oodd_eval.plugins.forecasting import FeatureScale
 
 pytest.importorskip("sklearn")
 from oodd_rf import make_rf, oodd_detectors

@@ -10,18 +10,18 @@ import pytest
 from helpers_plugins import install
 
 from oodd_eval import evaluate, load_split
-from oodd_eval.causality import PROBES
 from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
-from oodd_eval.evaluation import rescore
-from oodd_eval.hookspecs import hookimpl
-from oodd_eval.isolation import Limits, Request, _Sender
-from oodd_eval.plan import make_plan
-from oodd_eval.plugins import discover
-from oodd_eval.provenance import source_digest
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import Settings, run
-from oodd_eval.selection import expression, memory_bytes, seconds, select, whole_numbers
-from oodd_eval.trivial import Clock
+from oodd_eval.names import expression, memory_bytes, seconds, select, whole_numbers
+from oodd_eval.plugins.baselines import Clock
+from oodd_eval.plugins.causality import PROBES
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.hooks import hookimpl
+from oodd_eval.plugins.isolation.supervisor import Limits, Request, _Sender
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.provenance import source_digest
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import Settings, run
 
 HOSTILE = """
 class WrongLength(Good):

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.simulate.anomalies import VARYING_SENSORS, Draw, draw
+from oodd_eval.data.simulate.environments import make
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.simulate.anomalies import VARYING_SENSORS, Draw, draw
-from oodd_eval.simulate.environments import make
 
 # Table 1 of Danesh & Fern (2021), written out a second time: mean, s.d., factor, slope, wind.
 TABLE_1 = {

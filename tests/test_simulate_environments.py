@@ -8,12 +8,12 @@ from gymnasium.envs.box2d import lunar_lander
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from helpers_simulate import SEEDS, Reflex
 
-from oodd_eval.benchmark import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.simulate.anomalies import COMPONENTS, VARYING_SENSORS
+from oodd_eval.data.simulate.environments import _Acrobot, make
+from oodd_eval.data.simulate.record import record_nominal
+from oodd_eval.data.split import load_split
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.simulate.anomalies import COMPONENTS, VARYING_SENSORS
-from oodd_eval.simulate.environments import _Acrobot, make
-from oodd_eval.simulate.record import record_nominal
-from oodd_eval.splits import load_split
 
 NOMINAL = {
     ("acrobot", "gravity"): 9.8, ("acrobot", "link_length_1"): 1.0,

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from helpers_simulate import SEEDS, Reflex
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.simulate import record as recording
+from oodd_eval.data.simulate.anomalies import Draw
+from oodd_eval.data.simulate.record import TwinTooShortError, record, record_nominal, record_seed
 from oodd_eval.errors import SimulationError, UnknownNameError
-from oodd_eval.simulate import record as recording
-from oodd_eval.simulate.anomalies import Draw
-from oodd_eval.simulate.record import TwinTooShortError, record, record_nominal, record_seed
 
 CAP = 120
 
@@ -110,7 +110,7 @@ import sys
 sys.path.insert(0, sys.argv[1])
 from helpers_simulate import SEEDS, Reflex
 from test_simulate_record import CAP, digest
-from oodd_eval.simulate.record import record
+from oodd_eval.data.simulate.record import record
 for environment in ("hopper", "lunarlander", "acrobot"):  # another order than the table's
     for anomaly in ("wind-r2l", "gravity"):
         e = record(environment, anomaly, SEEDS[environment], policy=Reflex(environment),

@@ -11,18 +11,19 @@ from pathlib import Path
 import helpers_site
 import pytest
 
-from oodd_eval import __version__, site
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.curves import read_curves
+from oodd_eval import __version__
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.metrics import METRICS, POOLED
-from oodd_eval.records import Metric
-from oodd_eval.report.leaderboard import sections
-from oodd_eval.report.tables import number
-from oodd_eval.site.data import WITH_INTERVALS, site_data
-from oodd_eval.site.packing import gridded, packed
-from oodd_eval.site.selections import selection_intervals, selections
-from oodd_eval.submission.format import read_entries
+from oodd_eval.leaderboard import site
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.site.data import WITH_INTERVALS, site_data
+from oodd_eval.leaderboard.site.packing import gridded, packed
+from oodd_eval.leaderboard.site.selections import selection_intervals, selections
+from oodd_eval.metrics.auc import METRICS, POOLED
+from oodd_eval.results.curves import read_curves
+from oodd_eval.results.record import Metric
+from oodd_eval.results.tables.tables import number
 
 GOLDEN = Path(__file__).parent / "golden" / "site-index.html"
 COMMITTED = Path(__file__).parents[1] / "leaderboard" / "site" / site.PAGE
@@ -136,7 +137,7 @@ def test_all_static_files_are_short():
 
 
 def test_importing_the_harness_does_not_import_the_site():
-    code = "import sys, oodd_eval, oodd_eval.cli; sys.exit('oodd_eval.site' in sys.modules)"
+    code = "import sys, oodd_eval, oodd_eval.cli.main; sys.exit('oodd_eval.leaderboard.site' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

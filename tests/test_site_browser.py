@@ -6,12 +6,12 @@ import helpers_browser
 import helpers_site
 import pytest
 
-from oodd_eval import site
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.curves import read_curves
-from oodd_eval.report.leaderboard import sections
-from oodd_eval.report.tables import show_value
-from oodd_eval.submission.format import read_entries
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.leaderboard import site
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.sections import sections
+from oodd_eval.results.curves import read_curves
+from oodd_eval.results.tables.tables import show_value
 
 pytestmark = [
     pytest.mark.slow,

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from oodd_eval.benchmark import ANOMALIES, ENVIRONMENTS
-from oodd_eval.report.split_info import (
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.split import load_split
+from oodd_eval.results.tables.split_info import (
     collect_returns,
     describe,
     group_table,
@@ -13,7 +14,6 @@ from oodd_eval.report.split_info import (
     return_table,
     span,
 )
-from oodd_eval.splits import load_split
 
 
 @pytest.fixture

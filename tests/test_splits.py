@@ -12,11 +12,12 @@ from helpers_split import make_group, make_split
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval import splits, splits_format
-from oodd_eval.benchmark import ANOMALIES
+from oodd_eval.data import layout as splits_format
+from oodd_eval.data import split as splits
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.layout import TWINS, check_layout, content_digest, write_environment
+from oodd_eval.data.split import load_split
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
-from oodd_eval.splits import load_split
-from oodd_eval.splits_format import TWINS, check_layout, content_digest, write_environment
 
 
 @pytest.fixture

@@ -15,12 +15,8 @@ from helpers_plugins import install
 from helpers_processes import environment
 from helpers_split import make_group
 
-from oodd_eval.benchmark import ANOMALIES, SplitDefinition
-from oodd_eval.errors import TrajectoryError
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.runner import _as_they_finish
-from oodd_eval.splits import load_split
-from oodd_eval.splits_format import (
+from oodd_eval.data.facts import ANOMALIES, SplitDefinition
+from oodd_eval.data.layout import (
     SCHEMA,
     TWINS,
     Blocks,
@@ -29,8 +25,12 @@ from oodd_eval.splits_format import (
     write_environment,
     write_manifest,
 )
-from oodd_eval.spool import Spool
-from oodd_eval.trajectory import Trajectory
+from oodd_eval.data.split import load_split
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import TrajectoryError
+from oodd_eval.plugins.isolation.trajectory_file import Spool
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.runner import _as_they_finish
 
 MEGABYTE = 10**6
 ALLOWED = 32 * MEGABYTE
@@ -80,8 +80,8 @@ def write_split(directory, train):
 
 MEASURE = """
 import sys
-from oodd_eval.cli import main
-from oodd_eval.worker import peak_rss_mb
+from oodd_eval.cli.main import main
+from oodd_eval.plugins.isolation.worker import peak_rss_mb
 
 code = main(sys.argv[1:])
 print("peak", peak_rss_mb())
@@ -126,7 +126,7 @@ def test_a_split_ten_times_larger_than_memory_is_evaluated(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("rows", [1, 60, 150, 10**6])
 def test_iterating_reads_in_blocks_what_an_index_reads_alone(tiny_split, monkeypatch, rows):
-    monkeypatch.setattr("oodd_eval.splits._ROWS", rows)
+    monkeypatch.setattr("oodd_eval.data.split._ROWS", rows)
     data = load_split(tiny_split).environment("cartpole")
     with contextlib.closing(data):
         for part in (data.train, data.twins, data.anomalous("iid")):

@@ -11,9 +11,9 @@ import helpers_plugins
 import pytest
 from helpers_submission import Draft
 
-from oodd_eval import cli
-from oodd_eval.submission.format import read_entries
-from oodd_eval.submission.selecting import run_command
+from oodd_eval.cli import main as cli
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.selecting import run_command
 
 
 def submit(submissions, root, *options):
@@ -55,7 +55,7 @@ def test_the_command_of_an_entry_selects_its_cells(submissions, capsys):
 def test_the_command_names_parameters_and_splits_unlike_runs(submissions):
     from dataclasses import replace
 
-    from oodd_eval.results import ResultsDirectory
+    from oodd_eval.results.directory import ResultsDirectory
 
     records = ResultsDirectory(submissions.results).records()
     wide = [
@@ -266,7 +266,7 @@ def test_verifying_imports_no_plugin(submissions, tmp_path, monkeypatch):
 import sys
 from importlib.metadata import entry_points
 assert "evil" in entry_points(group="oodd_eval").names
-from oodd_eval import cli
+from oodd_eval.cli import main as cli
 arguments = ["leaderboard", "verify", {str(draft.path)!r}, "--split", {str(submissions.split)!r}]
 code = cli.main(arguments)
 loaded = {{name.partition(".")[0] for name in sys.modules}}

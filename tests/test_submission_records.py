@@ -453,7 +453,7 @@ def test_every_problem_is_found_and_not_only_the_first(submissions, tmp_path):
 
 
 def test_problems_beyond_the_limit_are_counted(submissions, tmp_path):
-    from oodd_eval.submission.findings import LIMIT
+    from oodd_eval.leaderboard.verify.findings import LIMIT
 
     draft = Draft(submissions.plain, tmp_path)
     for record in draft.records:

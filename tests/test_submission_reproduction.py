@@ -9,14 +9,15 @@ import pytest
 from helpers_split import make_split
 from helpers_submission import Draft, assert_refused
 
-from oodd_eval import cli, packed
 from oodd_eval.api import evaluate
-from oodd_eval.benchmark import ENVIRONMENTS
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.submission import rules
-from oodd_eval.submission.curves_check import with_curves
-from oodd_eval.submission.format import read_entries
-from oodd_eval.submission.selecting import run_command
+from oodd_eval.cli import main as cli
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.selecting import run_command
+from oodd_eval.leaderboard.verify import rules
+from oodd_eval.leaderboard.verify.curves_check import with_curves
+from oodd_eval.results import files as packed
+from oodd_eval.results.directory import ResultsDirectory
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def test_packing_gives_the_same_bytes_and_no_name_or_time():
 
 
 def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
-    from oodd_eval.submission import submit as submission
+    from oodd_eval.leaderboard import submit as submission
 
     monkeypatch.setattr(submission, "LARGE", 1000)
     assert submit(many, tmp_path, "--complete") == 0
@@ -279,7 +280,7 @@ def test_commands_that_are_too_long_end_with_a_whole_one(many):
 
 
 def test_results_of_a_damaged_reproduction_have_a_plain_command(many, tmp_path):
-    from oodd_eval.submission.selecting import made_with
+    from oodd_eval.leaderboard.selecting import made_with
 
     records = ResultsDirectory(many[1]).records()
     assert made_with(tmp_path, records) == run_command(records)

@@ -7,11 +7,11 @@ import pytest
 from helpers_split import make_split
 from helpers_submission import Draft, assert_refused
 
-from oodd_eval import cli
 from oodd_eval.api import evaluate
-from oodd_eval.records import Record
-from oodd_eval.results import ResultsDirectory
-from oodd_eval.submission.verify import verify_entry
+from oodd_eval.cli import main as cli
+from oodd_eval.leaderboard.verify.verify import verify_entry
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.record import Record
 
 
 @pytest.fixture(scope="module")

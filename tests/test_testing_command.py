@@ -7,8 +7,8 @@ import sys
 import pytest
 from helpers_plugins import install
 
-from oodd_eval import cli
-from oodd_eval.testing import detector_checks
+from oodd_eval.cli import main as cli
+from oodd_eval.plugins.conformance import detector_checks
 
 NAMES = [check.name for check in detector_checks()]
 
@@ -241,8 +241,8 @@ def test_other_ways_to_misuse_the_process_are_named(check, name, message):
 
 def test_help_imports_no_check():
     code = (
-        "import sys\nfrom oodd_eval.cli import main\nmain(['check', '--help'])\n"
-        "sys.exit(int('oodd_eval.testing' in sys.modules or 'numpy' in sys.modules))"
+        "import sys\nfrom oodd_eval.cli.main import main\nmain(['check', '--help'])\n"
+        "sys.exit(int('oodd_eval.plugins.conformance' in sys.modules or 'numpy' in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

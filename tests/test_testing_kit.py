@@ -12,8 +12,7 @@ from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
 
 from oodd_eval import check_detector
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins import discover
-from oodd_eval.testing import (
+from oodd_eval.plugins.conformance import (
     CheckFailedError,
     CheckSkipped,
     NonConformingError,
@@ -24,7 +23,8 @@ from oodd_eval.testing import (
     problem,
     run_checks,
 )
-from oodd_eval.testing.supervise import MOST_DEATHS
+from oodd_eval.plugins.conformance.supervise import MOST_DEATHS
+from oodd_eval.plugins.discovery import discover
 
 NAMES = [check.name for check in detector_checks()]
 

@@ -6,16 +6,17 @@ import sys
 import numpy as np
 import pytest
 
-from oodd_eval.benchmark import ENVIRONMENTS, SPLITS
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
+from oodd_eval.data.simulate import train
+from oodd_eval.data.simulate.policies import FROZEN, load_policy, provenance
+from oodd_eval.data.simulate.train.table import policy_table
 from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError
-from oodd_eval.simulate import train
-from oodd_eval.simulate.policies import FROZEN, load_policy, provenance
-from oodd_eval.simulate.train.table import policy_table
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 common, iqn, td3 = (
-    pytest.importorskip(f"oodd_eval.simulate.train.{name}") for name in ("common", "iqn", "td3")
+    pytest.importorskip(f"oodd_eval.data.simulate.train.{name}")
+    for name in ("common", "iqn", "td3")
 )
 
 QUICK = {
@@ -138,7 +139,7 @@ def test_too_few_steps_for_an_evaluation_say_so(tmp_path):
 def test_training_without_torch_names_the_extra(tmp_path, monkeypatch):
     for name in ("iqn", "td3"):
         monkeypatch.delattr(train, name)
-        monkeypatch.delitem(sys.modules, f"oodd_eval.simulate.train.{name}")
+        monkeypatch.delitem(sys.modules, f"oodd_eval.data.simulate.train.{name}")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingExtraError, match=r"oodd-eval\[train\]"):
         train.train_policy("cartpole", out=tmp_path, steps=40)

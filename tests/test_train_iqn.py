@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from oodd_eval.simulate.policies import IQNPolicy
+from oodd_eval.data.simulate.policies import IQNPolicy
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-iqn = pytest.importorskip("oodd_eval.simulate.train.iqn")
+iqn = pytest.importorskip("oodd_eval.data.simulate.train.iqn")
 
 
 def test_quantile_huber_by_hand():

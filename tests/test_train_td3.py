@@ -5,11 +5,11 @@ import copy
 import numpy as np
 import pytest
 
-from oodd_eval.simulate.policies import TD3Policy
+from oodd_eval.data.simulate.policies import TD3Policy
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-td3 = pytest.importorskip("oodd_eval.simulate.train.td3")
+td3 = pytest.importorskip("oodd_eval.data.simulate.train.td3")
 
 OBSERVATIONS, ACTIONS, BATCH = 4, 2, 6
 

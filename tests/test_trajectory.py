@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from oodd_eval.data.trajectory import Trajectory, pad
 from oodd_eval.errors import TrajectoryError
-from oodd_eval.trajectory import Trajectory, pad
 
 
 def episode(rows=5, sensors=2, actions=1):

@@ -21,7 +21,11 @@ import pytest
 from helpers_split import make_split
 
 from oodd_eval import load_split
-from oodd_eval.cli import main
+from oodd_eval.cli.main import main
+from oodd_eval.data import export as minari
+from oodd_eval.data.fetch import fetch
+from oodd_eval.data.layout import environment_digest, split_digest
+from oodd_eval.data.split import SHIPPED, split_directories
 from oodd_eval.errors import (
     DigestError,
     OutputError,
@@ -29,10 +33,6 @@ from oodd_eval.errors import (
     SplitNotFoundError,
     UsageError,
 )
-from oodd_eval.splits import SHIPPED, split_directories
-from oodd_eval.splits_format import environment_digest, split_digest
-from oodd_eval.transfer import minari
-from oodd_eval.transfer.fetch import fetch
 
 
 @pytest.fixture
@@ -473,7 +473,7 @@ def test_a_home_that_cannot_be_written_is_named(tiny_split, tmp_path, monkeypatc
 KILLED = """
 import os, sys
 from pathlib import Path
-from oodd_eval.transfer import fetch
+from oodd_eval.data import fetch
 
 at, real = int(sys.argv[2]), Path.{method}
 def counting(self, *arguments):

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from oodd_eval.detector import Detector
+from oodd_eval.data.split import load_split
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import NotFittedError
-from oodd_eval.intervals import bootstrap_weights, interval, mean_interval
-from oodd_eval.metrics import auc_contributions, auc_onset, auc_same_times
-from oodd_eval.splits import load_split
-from oodd_eval.trajectory import Trajectory
-from oodd_eval.trivial import Clock, Persistence, Random, oodd_detectors
+from oodd_eval.metrics.auc import auc_contributions, auc_onset, auc_same_times
+from oodd_eval.metrics.bootstrap import bootstrap_weights, interval, mean_interval
+from oodd_eval.plugins.baselines import Clock, Persistence, Random, oodd_detectors
+from oodd_eval.plugins.contract import Detector
 
 
 def episode(rows):

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from oodd_eval.executors.turns import Turns
-from oodd_eval.runner import _as_they_finish
+from oodd_eval.scoring.executors.turns import Turns
+from oodd_eval.scoring.runner import _as_they_finish
 
 
 def line(text):

@@ -16,11 +16,13 @@ from helpers_plugins import HEADER, install
 from helpers_split import make_split
 from helpers_spy import SPY, Findings, vectors
 
-from oodd_eval import evaluate, isolation, load_split, processes
-from oodd_eval.benchmark import ANOMALIES
-from oodd_eval.causality import PROBES, probes
-from oodd_eval.metrics import auc
-from oodd_eval.scoring import lengths_of, parts_of, shuffled
+from oodd_eval import evaluate, load_split
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.metrics.auc import auc
+from oodd_eval.plugins.causality import PROBES, probes
+from oodd_eval.plugins.isolation import processes
+from oodd_eval.plugins.isolation import supervisor as isolation
+from oodd_eval.scoring.unit import lengths_of, parts_of, shuffled
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
 
@@ -105,14 +107,14 @@ def test_a_worker_holds_no_secret_anywhere(findings, secrets):
     assert secrets.seen_in(findings) == {}
     # The spy is no fool: it sees what it was told, in all places where it looked.
     told = findings.places_of(
-        ["spy", "oodd_eval.worker", "SPY_OUTPUT=", "oodd-results", "/dev/null"],
+        ["spy", "oodd_eval.plugins.isolation.worker", "SPY_OUTPUT=", "oodd-results", "/dev/null"],
         [SEED],
         {"a trajectory": secrets.twin[:50].tobytes()},
     )
     assert told["frames"] >= {"spy", "oodd-results", SEED}
-    assert told["objects"] >= {"spy", "oodd_eval.worker", SEED}
+    assert told["objects"] >= {"spy", "oodd_eval.plugins.isolation.worker", SEED}
     assert told["memory"] >= {"spy", "a trajectory"}
-    assert told["arguments"] == {"oodd_eval.worker"}
+    assert told["arguments"] == {"oodd_eval.plugins.isolation.worker"}
     assert "SPY_OUTPUT=" in told["environment"]
     assert told["directory"] >= {"oodd-results"}
     assert "/dev/null" in told["descriptors"]
@@ -134,7 +136,7 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
     with (secrets.path / "cartpole.h5").open("rb") as split:
 
         def start(command, **settings):
-            if "oodd_eval.worker" in command:
+            if "oodd_eval.plugins.isolation.worker" in command:
                 command = [command[0], "-X", f"data={secrets.path}", *command[1:]]
                 settings["pass_fds"] += (split.fileno(),)
                 settings["env"]["SPLIT"] = str(secrets.path)

@@ -22,7 +22,7 @@ from oodd_adapters.windows import (
 )
 from oodd_eval import Trajectory
 from oodd_eval.errors import ContractError, NotFittedError, UsageError
-from oodd_eval.prediction import FeatureScale
+from oodd_eval.plugins.forecasting import FeatureScale
 
 PROBE: Final = 200
 """Rows on which a forecaster is tried."""

@@ -11,7 +11,7 @@ from typing import Any, Final
 from oodd_adapters.detectors import ForecastDetector, OutlierDetector, Settings
 from oodd_adapters.names import Signature, forecaster_class, pyod_class, sklearn_class
 from oodd_eval import Detector, DetectorSpec
-from oodd_eval.provenance import source_digest
+from oodd_eval.results.provenance import source_digest
 
 DEFAULTS: Final[Mapping[str, int]] = {"window": 4, "rows": 10_000}
 """Parameters of the adapters themselves. They hide parameters of the same name of a class."""

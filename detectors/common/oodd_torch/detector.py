@@ -14,7 +14,7 @@ from torch import Tensor
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, UsageError
-from oodd_eval.prediction import CONSTANT, FeatureScale, anomaly_scores
+from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale, anomaly_scores
 from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.settings import Settings

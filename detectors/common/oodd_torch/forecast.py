@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodd_eval.prediction import quantile_levels
+from oodd_eval.plugins.forecasting import quantile_levels
 from oodd_torch.network import Ensemble
 from oodd_torch.training import arrange, predict
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodd_eval.prediction import GRID
+from oodd_eval.plugins.forecasting import GRID
 
 
 @dataclass(frozen=True, slots=True)

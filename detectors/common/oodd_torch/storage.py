@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from oodd_eval.errors import FittedStateError
-from oodd_eval.prediction import FeatureScale
+from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_torch.network import Architecture, Ensemble
 
 WEIGHTS: Final = "weights.safetensors"

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodd_eval.prediction import GRID
+from oodd_eval.plugins.forecasting import GRID
 from oodd_torch.network import Ensemble
 
 BETAS: Final = (0.9, 0.999)

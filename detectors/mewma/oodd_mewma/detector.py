@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError, UsageError
-from oodd_eval.storage import load_state, save_state, take
+from oodd_eval.plugins.state import load_state, save_state, take
 from oodd_mewma.chart import Floats, Smoother, distance, smooth, whitening
 from oodd_mewma.forecast import Moments, first_forecast, product, regressors
 

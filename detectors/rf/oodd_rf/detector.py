@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import NotFittedError, UsageError
-from oodd_eval.prediction import FeatureScale
-from oodd_eval.storage import load_state, save_state, take
+from oodd_eval.plugins.forecasting import FeatureScale
+from oodd_eval.plugins.state import load_state, save_state, take
 from oodd_rf.forest import Forest
 from oodd_rf.windows import Floats, Indices, Rows
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import FittedStateError
-from oodd_eval.storage import take
+from oodd_eval.plugins.state import take
 from oodd_rf.windows import Floats
 
 if TYPE_CHECKING:

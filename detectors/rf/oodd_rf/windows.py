@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval import Trajectory
-from oodd_eval.prediction import FeatureScale
+from oodd_eval.plugins.forecasting import FeatureScale
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

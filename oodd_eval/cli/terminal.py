@@ -1,0 +1,202 @@
+"""The terminal reporter: a plug-in that prints what the runner does, and the tables at its end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
+from tabulate import tabulate
+
+from oodd_eval._version import __version__
+from oodd_eval.data.facts import GROUPS, PROTOCOL
+from oodd_eval.plugins.hooks import hookimpl
+from oodd_eval.results.record import STATUSES, Record
+from oodd_eval.results.tables import tables
+from oodd_eval.results.tables.board import Board, boards
+from oodd_eval.results.tables.tables import Table
+from oodd_eval.scoring.plan import Plan
+
+_COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Let the program see the error; rich would end the process with a failure's code."""
+        raise BrokenPipeError
+
+
+def make_console() -> Console:
+    """Return a console on standard output: coloured on a terminal, plain text in a pipe."""
+    return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True)
+
+
+class TerminalReporter:
+    """Print a header, a line per fit, tables, failures and a summary.
+
+    Parameters
+    ----------
+    console
+        Where to; see `make_console`.
+    verbosity
+        -1: the summary only. 0: a line per fit. 1: a line per cell, with intervals in the tables.
+    intervals
+        Whether the tables have 95 % intervals.
+    """
+
+    def __init__(self, console: Console, *, verbosity: int = 0, intervals: bool = False) -> None:
+        self.console, self.verbosity, self.intervals = console, verbosity, intervals
+        self._start = time.perf_counter()
+        self._open: dict[tuple[str, str], list[Record]] = {}
+        self._sizes: dict[tuple[str, str], int] = {}
+        self._resumed = 0
+        self._progress: Progress | None = None
+
+    @hookimpl
+    def oodd_run_started(self, plan: Plan) -> None:
+        """Say what is going to happen."""
+        self._start = time.perf_counter()
+        self._sizes = {(u.environment, u.label): len(u.anomalies) for u in plan.units}
+        if self.verbosity < 0:
+            return
+        names = dict.fromkeys(u.detector for u in plan.units)
+        limited = f", first {plan.limit} trajectories of each part" if plan.limit else ""
+        self._print(f"oodd-eval {__version__}, protocol {PROTOCOL}")
+        self._print(f"split {plan.split}, digest {plan.split_digest[:12]}{limited}")
+        self._print(f"detectors: {', '.join(names)}")
+        self._print(f"{len(plan.units)} fits, {len(plan.cells)} cells\n")
+        if self.console.is_terminal:
+            self._progress = Progress(
+                TextColumn("cells"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                console=self.console,
+                transient=True,
+            )
+            self._progress.add_task("cells", total=len(plan.cells))
+            self._progress.start()
+
+    @hookimpl
+    def oodd_cell_finished(self, record: Record, resumed: bool) -> None:
+        """Print a line when the last cell of a fit, or in verbose mode any cell, is finished."""
+        self._resumed += resumed
+        if self._progress:
+            self._progress.advance(self._progress.task_ids[0])
+        if self.verbosity < 0:
+            return
+        if self.verbosity > 0:
+            self._line(record, record.cell, [record], resumed=resumed)
+            return
+        unit = record.environment, record.cell.partition("::")[2]
+        finished = self._open.setdefault(unit, [])
+        finished.append(record)
+        if len(finished) == self._sizes[unit]:
+            self._line(record, "/".join(unit), finished, resumed=resumed)
+
+    @hookimpl
+    def oodd_run_finished(self, records: list[Record], interrupted: bool) -> None:
+        """Print the tables, the failures and the summary."""
+        if self._progress:
+            self._progress.stop()
+        if self.verbosity >= 0 and any(r.ok for r in records):
+            self._print("")
+            self.tables(records)
+        self.failures(records)
+        seconds = time.perf_counter() - self._start
+        earlier = f" ({self._resumed} from earlier runs)" if self._resumed else ""
+        end = ", interrupted" if interrupted else ""
+        self._print(f"{summary(records)}{earlier} in {seconds:.1f} s{end}")
+
+    def tables(self, records: Sequence[Record]) -> None:
+        """Print the tables of every board among some records."""
+        for board in boards(records):
+            self._board(board)
+
+    def failures(self, records: Sequence[Record]) -> None:
+        """Print why fits failed."""
+        for board in boards(records):
+            for record in board.failures():
+                name = f"{record.environment}/{record.cell.partition('::')[2]}"
+                self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
+
+    def table(self, table: Table) -> None:
+        """Print one table within the console's width: as it is, turned, or in parts."""
+        self._print(table.title, "bold")
+        for part in _fitting(table, self.console.width):
+            self._print(_set(part) + "\n")
+
+    def _board(self, board: Board) -> None:
+        self.table(tables.ranking(board, intervals=self.intervals))
+        for horizon in board.horizons:
+            for group in GROUPS:
+                if board.in_group(group):
+                    self.table(
+                        tables.anomaly_groups(board, horizon, [group], intervals=self.intervals)
+                    )
+        for sentence in tables.findings(board):
+            self._prose(sentence, "yellow")
+        for line in tables.notes(board):
+            self._prose(line, "dim")
+        self._print("")
+
+    def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
+        parts = [f"{last.status:<12} {name}"]
+        if last.ok:
+            values = [r.value("auc_matched") for r in cells]
+            defined = [v for v in values if v == v]  # noqa: PLR0124  NaN is unequal to itself
+            mean = sum(defined) / len(defined) if defined else float("nan")
+            parts.append(f"matched AUC {tables.number(mean, 'auc_matched')}")
+            spent = last.seconds_fit + last.seconds_score
+            if resumed:
+                parts.append("from an earlier run")
+            elif spent == spent:  # noqa: PLR0124
+                parts.append(f"{spent:.1f} s")
+        self._print("  ".join(parts), _COLOURS.get(last.status, "red"))
+
+    def _prose(self, text: str, style: str) -> None:
+        """Print a sentence, wrapped between words."""
+        self.console.print(Text(text, style), soft_wrap=False)
+
+    def _print(self, text: str, style: str = "") -> None:
+        self.console.print(Text(text, style))
+
+
+def summary(records: Sequence[Record]) -> str:
+    """Return how many cells came to which status, such as ``48 ok, 8 timeout``."""
+    counts = Counter(r.status for r in records)
+    return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts[s]) or "no cells"
+
+
+def _set(table: Table) -> str:
+    text: str = tabulate(
+        table.rows,
+        headers=table.header,
+        tablefmt="simple",
+        colalign=table.alignment if table.rows else None,
+        disable_numparse=True,
+    )
+    return text
+
+
+def _fitting(table: Table, width: int) -> list[Table]:
+    """Return the table, the table turned, or parts of its columns, whichever first fits."""
+    for whole in (table, table.transposed()):
+        if _width(whole) <= width:
+            return [whole]
+    labels = list(range(table.labels))
+    parts: list[list[int]] = []
+    for column in range(table.labels, len(table.header)):
+        if parts and _width(table.columns([*labels, *parts[-1], column])) <= width:
+            parts[-1].append(column)
+        else:
+            parts.append([column])
+    return [table.columns([*labels, *part]) for part in parts]
+
+
+def _width(table: Table) -> int:
+    return max(map(len, _set(table).splitlines()), default=0)

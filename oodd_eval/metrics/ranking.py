@@ -1,0 +1,361 @@
+"""Ranks, ties and win rates of the rows of one table.
+
+A row is better than another when the paired bootstrap over test seeds says so after Holm's
+correction over all ordered pairs of the table. Ranks count the rows that are better; rows that
+share a tie group cannot be told apart.
+
+Everything here is a function of arrays: per row and detector seed, the numerators and denominators
+of a metric in every cell. Higher is better.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, percentiles
+
+ALPHA: Final = 0.05
+"""Family-wise error rate of one table: of calling any row better that is not."""
+
+MIN_RESAMPLES: Final = 10_000
+"""Fewest resamples that ranks are made with."""
+
+RESAMPLES_PER_PAIR: Final = 50
+"""With R resamples no p-value is below 1 / (R + 1); R grows with the number of pairs, so that
+Holm's correction leaves room for significance in a table of any length."""
+
+OWN_SEEDS: Final = "detector seeds"
+"""Source of noise beside the environments' test seeds."""
+
+NOISE: Final = 1e-12
+"""Differences up to this are rounding: equal rows have to come out equal on every machine."""
+
+Floats = NDArray[np.float64]
+Cell = tuple[str, str]
+"""Environment and anomaly; cells of one environment share their resamples."""
+Row = Mapping[int, Mapping[Cell, Contribution]]
+"""One row's contributions by detector seed and cell."""
+Influences = dict[str, Floats]
+"""By source of noise: how much each test or detector seed shifts a mean, centred on 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One ordered pair of rows: how much better the first is than the second.
+
+    Attributes
+    ----------
+    first, second
+        Names of the rows.
+    difference, low, high
+        Mean of the first minus mean of the second over all cells, with the paired 95 % interval.
+    p, p_holm
+        One-sided p-value of "not better", and the same after Holm's correction.
+    """
+
+    first: str
+    second: str
+    difference: float
+    low: float
+    high: float
+    p: float
+    p_holm: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the first row is significantly better than the second."""
+        return self.p_holm <= ALPHA
+
+
+@dataclass(frozen=True, slots=True)
+class Ranking:
+    """Ranked rows of one table.
+
+    Attributes
+    ----------
+    ranks
+        By row: 1 + the number of rows that are significantly better.
+    groups
+        Tie groups, see `tie_groups`.
+    comparisons
+        All ordered pairs.
+    resamples
+        Number of bootstrap resamples R.
+    """
+
+    ranks: dict[str, int]
+    groups: list[tuple[str, ...]]
+    comparisons: list[Comparison]
+    resamples: int
+
+    def letters(self, row: str) -> str:
+        """Return the letters of the tie groups that a row shares with others, such as ``"ab"``.
+
+        Empty for a row that is told apart from all others.
+        """
+        shared = [group for group in self.groups if len(group) > 1]
+        return "".join(_letter(i) for i, group in enumerate(shared) if row in group)
+
+
+def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
+    """Rank the rows of one table.
+
+    Parameters
+    ----------
+    rows
+        By name. All have the same cells for each of their detector seeds, and the same test
+        trajectories in a cell.
+    resamples
+        Number of bootstrap resamples R; by default at least 10 000 and 50 per ordered pair.
+
+    Returns
+    -------
+    The same for any order of rows, seeds and cells.
+
+    Raises
+    ------
+    ResultsError
+        When rows differ in cells or in the number of test trajectories, or a cell has no value.
+
+    Notes
+    -----
+    With d the difference of two rows' means over cells and s its standard error, the one-sided
+    p-value of "not better" is ``(1 + k) / (R + 1)``, where k counts the resamples in which
+    ``(d* - d) / s*`` is at least ``d / s``: the studentized bootstrap (Davison & Hinkley 1997,
+    section 4.4). Counting the resamples with ``d* <= 0`` instead calls equal detectors different in
+    one table out of six when there is one environment with ten test seeds. No p-value is below
+    ``2 ** -N`` with N test seeds in all environments together: if neither row is better, each
+    seed's difference might as well have the other sign.
+
+    Test seeds are drawn jointly for all rows and all anomalies of an environment, so that
+    differences are paired. A row with several detector seeds has these drawn, too, independently of
+    other rows, because seed 0 of one detector has nothing in common with seed 0 of another; the two
+    sources of noise are added.
+    """
+    names = sorted(rows)
+    shape = _shape(rows)
+    pairs = list(itertools.combinations(names, 2))
+    count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * len(pairs))
+    draws = {e: bootstrap_weights(n, key=e, resamples=count) for e, n in shape.items()}
+    for name in names:
+        own = _source(OWN_SEEDS, name)
+        draws[own] = bootstrap_weights(len(rows[name]), key=own, resamples=count)
+    influences = {name: _influences(rows[name]) for name in names}
+    floor = 2.0 ** -sum(shape.values())
+    means = {name: _mean(rows[name]) for name in names}
+    found = []
+    for a, b in pairs:
+        effect = _difference(a, b, influences)
+        difference = means[a] - means[b]
+        shifts, exceeding, falling = _test(difference, effect, draws)
+        low, high = percentiles(difference + shifts)
+        for first, second, sign, k in ((a, b, 1, exceeding), (b, a, -1, falling)):
+            ends = (low, high) if sign > 0 else (-high, -low)
+            p = max((1 + k) / (count + 1), floor)
+            found.append(Comparison(first, second, sign * difference, *ends, p, math.nan))
+    corrected = holm(np.array([c.p for c in found]))
+    comparisons = [replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
+    better = {(c.first, c.second) for c in comparisons if c.better}
+    ranks = {name: 1 + sum((other, name) in better for other in names) for name in names}
+    order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
+    return Ranking(
+        {name: ranks[name] for name in order}, tie_groups(order, better), comparisons, count
+    )
+
+
+def holm(p: Floats) -> Floats:
+    """Return p-values after Holm's step-down correction for the number of them.
+
+    The i-th smallest of m p-values (i from 1) is multiplied by ``m - i + 1``; a corrected value is
+    at least as large as those of smaller p-values, and at most 1. Calling significant what is at
+    most alpha keeps the chance of any false call at alpha, whatever the dependence (Holm, 1979).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> holm(np.array([0.01, 0.04, 0.03, 0.005])).round(3).tolist()
+    [0.03, 0.06, 0.06, 0.02]
+    """
+    order = np.argsort(p, kind="stable")
+    factors = np.arange(p.size, 0, -1)
+    corrected = np.empty_like(p)
+    corrected[order] = np.minimum(np.maximum.accumulate(p[order] * factors), 1.0)
+    return corrected
+
+
+def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[tuple[str, ...]]:
+    """Return the largest sets of rows of which no two can be told apart.
+
+    Parameters
+    ----------
+    names
+        Rows, best first.
+    better
+        Pairs (better, worse) that are significant.
+
+    Returns
+    -------
+    Groups in the order of their members; every row is in at least one.
+
+    Notes
+    -----
+    "Cannot be told apart" is not transitive: the first may be better than the third while the
+    second is told apart from neither. Then there are two groups, with the second row in both.
+
+    Examples
+    --------
+    >>> tie_groups(["a", "b", "c"], [("a", "c")])
+    [('a', 'b'), ('b', 'c')]
+    """
+    groups = [frozenset(names)] if names else []
+    for pair in sorted(better):
+        split = [g for g in groups if not g.issuperset(pair)]
+        split += [g - {one} for g in groups if g.issuperset(pair) for one in pair]
+        groups = [g for g in set(split) if not any(g < other for other in split)]
+    position = {name: i for i, name in enumerate(names)}
+    return sorted(
+        (tuple(sorted(g, key=position.__getitem__)) for g in groups),
+        key=lambda group: [position[name] for name in group],
+    )
+
+
+def win_rates(values: Mapping[str, Mapping[Cell, float]]) -> dict[tuple[str, str], float]:
+    """Return the share of cells in which a row's value is higher than another's, for all pairs.
+
+    Parameters
+    ----------
+    values
+        By row and cell; NaN where undefined.
+
+    Returns
+    -------
+    By (row, other): over the cells that both have, equal values counting one half, so that a pair's
+    two rates sum to 1; NaN without common cells.
+
+    Examples
+    --------
+    >>> win_rates({"a": {("ant", "iid"): 0.9, ("ant", "drift"): 0.5},
+    ...            "b": {("ant", "iid"): 0.8, ("ant", "drift"): 0.5}})["a", "b"]
+    0.75
+    """
+    rates = {}
+    for row, other in itertools.permutations(values, 2):
+        common = [(values[row][c], values[other][c]) for c in values[row] if c in values[other]]
+        wins = [
+            0.5 if abs(x - y) <= NOISE else float(x > y)
+            for x, y in common
+            if not np.isnan([x, y]).any()
+        ]
+        rates[row, other] = sum(wins) / len(wins) if wins else float("nan")
+    return rates
+
+
+def _shape(rows: Mapping[str, Row]) -> dict[str, int]:
+    """Return test seeds by environment; refuse rows that cannot be compared."""
+    sizes: dict[str, int] = {}
+    expected = {cell for row in rows.values() for cells in row.values() for cell in cells}
+    for name, row in rows.items():
+        for seed, cells in row.items():
+            if cells.keys() != expected:
+                raise ResultsError(
+                    f"{name} has {len(cells)} cells with seed {seed}, expected {len(expected)}: "
+                    "only rows with all cells are ranked"
+                )
+            for cell, contribution in cells.items():
+                where = "/".join(cell)
+                n = len(contribution.numerator)
+                size = sizes.setdefault(cell[0], n)
+                if n != size:
+                    raise ResultsError(
+                        f"{name} has {n} test trajectories in {where}, expected {size}: rows of "
+                        "one table are of the same split and limit"
+                    )
+                if math.isnan(contribution.value):
+                    raise ResultsError(f"{name} has no value in {where}, so it has no rank")
+    return {environment: sizes[environment] for environment in sorted(sizes)}
+
+
+def _mean(row: Row) -> float:
+    # Sorted, so that the order of records does not decide how the sum is rounded.
+    return float(np.mean([row[s][c].value for s in sorted(row) for c in sorted(row[s])]))
+
+
+def _influences(row: Row) -> Influences:
+    """Return what every drawn thing adds to the row's mean, centred, by source of noise.
+
+    The mean of a resample is linearized: a trajectory of weight w adds w times its influence. For
+    the mean over trajectories that a matched AUC is, this is exact.
+    """
+    seeds, cells = sorted(row), sorted(row[min(row)])
+    found: Influences = {}
+    for environment, members in itertools.groupby(cells, key=lambda cell: cell[0]):
+        parts = [_influence(row[seed][cell]) for cell in members for seed in seeds]
+        found[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
+    if len(seeds) > 1:
+        means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
+        found[OWN_SEEDS] = means - means.mean()
+    return found
+
+
+def _influence(contribution: Contribution) -> Floats:
+    residuals = contribution.numerator - contribution.value * contribution.denominator
+    return residuals * len(residuals) / float(contribution.denominator.sum())
+
+
+def _difference(first: str, second: str, influences: Mapping[str, Influences]) -> Influences:
+    """Return the influences on the difference of two means."""
+    found: Influences = {}
+    for name, sign in ((first, 1.0), (second, -1.0)):
+        for source, influence in influences[name].items():
+            shared = _source(source, name)
+            found[shared] = found.get(shared, 0.0) + sign * influence
+    # Rounding alone must not look like a difference between seeds.
+    return {source: np.where(np.abs(z) > NOISE, z, 0.0) for source, z in found.items()}
+
+
+def _source(source: str, name: str) -> str:
+    """Return the name of a source of noise: a row's own seeds are nobody else's."""
+    return f"{source} of {name}" if source == OWN_SEEDS else source
+
+
+def _test(
+    difference: float, effect: Influences, draws: Mapping[str, Weights]
+) -> tuple[Floats, int, int]:
+    """Return shifts d* - d, and in how many resamples the studentized one reaches d's, each way."""
+    variance = sum(_variance(z.var(), z.size) for z in effect.values())
+    resamples = len(next(iter(draws.values())))
+    shifts, variances = np.zeros(resamples), np.zeros(resamples)
+    for source, z in effect.items():
+        mean = np.einsum("rn,n->r", draws[source], z) / z.size
+        square = np.einsum("rn,n->r", draws[source], z * z) / z.size
+        shifts += mean
+        variances += _variance(np.maximum(square - mean * mean, 0.0), z.size)
+    if abs(difference) <= NOISE:
+        return shifts, resamples, resamples
+    with np.errstate(invalid="ignore", divide="ignore"):
+        observed = np.divide(difference, np.sqrt(variance))
+        # Where all seeds agree to the last digit, no shift over no spread is no shift.
+        studentized = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
+    exceeding = int(np.count_nonzero(studentized >= observed))
+    falling = int(np.count_nonzero(studentized <= observed))
+    return shifts, exceeding, falling
+
+
+def _variance(spread: Any, n: int) -> Any:
+    """Return the variance of a mean of n from their variance (ddof 0); one says nothing of it."""
+    return spread / (n - 1) if n > 1 else spread + math.inf
+
+
+def _letter(index: int) -> str:
+    """Return a, b, ..., z, a1, b1, ... for 0, 1, ..., 25, 26, 27, ..."""
+    turn, letter = divmod(index, 26)
+    return chr(ord("a") + letter) + (str(turn) if turn else "")
