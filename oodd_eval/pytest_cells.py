@@ -116,7 +116,7 @@ class Cells:
         done = run(plan, self.split, self.plugins, Settings(), results)
         if done.interrupted:
             raise KeyboardInterrupt
-        self._records = {r.cell: r for r in done.records}
+        self._records = {str(r.cell): r for r in done.records}
         if self.reference is None:
             return
         reference = self.reference.selected(chosen.__contains__)

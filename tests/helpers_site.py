@@ -59,7 +59,7 @@ def make_curves(record, seed, twins_seed=0):
     sweep = Sweep.over(twins, rule, thresholds(twins, rule))
     return {
         "cell": record.cell, "detector": record.detector, "horizon": record.horizon,
-        "seed": record.seed, "overrides": record.provenance["overrides"],
+        "seed": record.seed, "overrides": record.overrides,
         "environment": record.environment, "anomaly": record.anomaly,
         **cell_curves(sweep, rule, anomalous, onsets),
     }  # fmt: skip

@@ -9,11 +9,11 @@ import numpy as np
 from helpers_split import make_split
 
 from oodd_eval.api import evaluate
+from oodd_eval.data.files import compress as pack
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify.verify import verify_entry
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import bootstrap_weights, interval
-from oodd_eval.results.files import pack
 
 
 @dataclass(frozen=True)

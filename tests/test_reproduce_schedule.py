@@ -113,7 +113,7 @@ def test_a_unit_is_done_when_all_its_anomalies_are_scored():
     ok = make_record(anomaly="iid")
     failed = make_record(anomaly="iid", status="error")
     for record in (other, ok, failed):
-        record.provenance["scores"] = "k"
+        record.scores = "k"
     assert not is_done(work, finished_keys([other]))
     assert not is_done(work, finished_keys([failed]))
     assert is_done(work, finished_keys([other, ok]))

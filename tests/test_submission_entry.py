@@ -5,8 +5,8 @@ import os
 import pytest
 from helpers_submission import Draft, assert_refused
 
+from oodd_eval.data.files import compress as pack
 from oodd_eval.data.split import published_digests
-from oodd_eval.results.files import pack
 
 MINI = published_digests()["mini"]
 

@@ -69,7 +69,7 @@ def _write(comparison: Comparison, options: argparse.Namespace) -> None:
 
 def _selected(records: Sequence[Record], text: str | None) -> list[Record]:
     wanted = expression(text) if text else None
-    return [r for r in records if wanted is None or wanted(r.cell)]
+    return [r for r in records if wanted is None or wanted(str(r.cell))]
 
 
 def _nothing(message: str) -> int:

@@ -90,9 +90,9 @@ class TerminalReporter:
         if self.verbosity < 0:
             return
         if self.verbosity > 0:
-            self._line(record, record.cell, [record], resumed=resumed)
+            self._line(record, str(record.cell), [record], resumed=resumed)
             return
-        unit = record.environment, record.cell.partition("::")[2]
+        unit = record.environment, record.label
         finished = self._open.setdefault(unit, [])
         finished.append(record)
         if len(finished) == self._sizes[unit]:
@@ -121,7 +121,7 @@ class TerminalReporter:
         """Print why fits failed."""
         for board in boards(records):
             for record in board.failures():
-                name = f"{record.environment}/{record.cell.partition('::')[2]}"
+                name = f"{record.environment}/{record.label}"
                 self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
 
     def table(self, table: Table) -> None:

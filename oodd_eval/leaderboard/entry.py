@@ -20,8 +20,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.errors import ResultsError
-from oodd_eval.results import files as packed
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
 
@@ -128,7 +128,7 @@ class SubmittedEntry:
     @property
     def curves(self) -> Path | None:
         """The file of curves; None when the entry has none."""
-        return packed.find(self.path / CURVES)
+        return stored_files.find_file(self.path / CURVES)
 
     @property
     def results(self) -> ResultsDirectory:

@@ -11,7 +11,7 @@ from oodd_eval.data.facts import GROUPS
 from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.leaderboard.sections import LeaderboardSection
 from oodd_eval.results.tables import ranking_tables, tables, tiers
-from oodd_eval.results.tables.board import Board, entry_of
+from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.markdown import escape, table
 from oodd_eval.results.tables.tables import Table
 
@@ -141,8 +141,8 @@ def _as_in_the_paper(board: Board) -> list[Table]:
 
     It has a column per row of the board, so that it is kept to rows with default parameters.
     """
-    plain = [entry for entry in board.entries if entry.overrides == "{}"]
-    records = [r for r in board.records if entry_of(r) in plain]
+    plain = [entry for entry in board.entries if not entry.overrides]
+    records = [r for r in board.records if r.setting in plain]
     if not records:
         return []
     own = Board(records)
@@ -152,7 +152,7 @@ def _as_in_the_paper(board: Board) -> list[Table]:
 
 def _failures(section: LeaderboardSection) -> Table | None:
     failed = section.ranks.board.failures()
-    rows = [[r.environment, r.cell.partition("::")[2], r.status, r.reason] for r in failed]
+    rows = [[r.environment, r.label, r.status, r.reason] for r in failed]
     header = ["environment", "detector", "state", "reason"]
     return Table("Failures", header, rows, labels=4) if rows else None
 

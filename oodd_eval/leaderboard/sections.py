@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import TRUST, SubmittedEntry
-from oodd_eval.leaderboard.verify.cells import PLACE
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Entry, boards, entry_of
+from oodd_eval.results.tables.board import boards
 from oodd_eval.results.tables.standings import RankedBoard, ranked
 
 _SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
@@ -34,10 +34,10 @@ class LeaderboardSection:
 
     ranks: RankedBoard
     entries: list[SubmittedEntry]
-    sources: dict[Entry, list[SubmittedEntry]]
+    sources: dict[Setting, list[SubmittedEntry]]
 
     @property
-    def trust(self) -> dict[Entry, str]:
+    def trust(self) -> dict[Setting, str]:
         """Trust level by row: the lowest of its entries."""
         return {
             row: min((e.meta.trust for e in entries), key=TRUST.index)
@@ -75,7 +75,7 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     cells: dict[tuple[object, ...], SubmittedEntry] = {}
     records: list[Record] = []
     for entry in by_id:
-        for record in map(_anywhere, entry.records):
+        for record in entry.records:
             _refuse_twice(record, entry, cells)
             owner[id(record)] = entry
             records.append(record)
@@ -83,10 +83,10 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     for board in boards(records):
         _refuse_mixtures(board.records, owner)
         own = {owner[id(r)].meta.id: owner[id(r)] for r in board.records}
-        rows: dict[Entry, dict[str, SubmittedEntry]] = {}
+        rows: dict[Setting, dict[str, SubmittedEntry]] = {}
         for record in board.records:
             source = owner[id(record)]
-            rows.setdefault(entry_of(record), {})[source.meta.id] = source
+            rows.setdefault(record.setting, {})[source.meta.id] = source
         sources = {row: [of[i] for i in sorted(of)] for row, of in rows.items()}
         found.append(
             LeaderboardSection(ranked(board.records), [own[i] for i in sorted(own)], sources)
@@ -103,28 +103,12 @@ def _place(section: LeaderboardSection) -> tuple[int, str, int, int, str]:
     return known, name, limit, -board.protocol, board.digest
 
 
-def _anywhere(record: Record) -> Record:
-    """Return a record without the parameter that says where it was computed.
-
-    Seeds that ran on a processor and on an accelerator belong to one row.
-    """
-    if PLACE not in record.parameters:
-        return record
-    overrides = record.provenance.get("overrides", {})
-    return replace(
-        record,
-        parameters={k: v for k, v in record.parameters.items() if k != PLACE},
-        provenance=record.provenance
-        | {"overrides": {k: v for k, v in overrides.items() if k != PLACE}},
-    )
-
-
 def _refuse_twice(
     record: Record, entry: SubmittedEntry, cells: dict[tuple[object, ...], SubmittedEntry]
 ) -> None:
-    conditions = record.split_digest, record.protocol, record.provenance.get("limit")
+    conditions = record.split_digest, record.protocol, record.limit
     place = record.environment, record.anomaly, record.seed
-    key = (entry_of(record), *place, *conditions)
+    key = (record.setting, *place, *conditions)
     if (other := cells.get(key)) is not None:
         raise ResultsError(
             f"entries {other.meta.id!r} and {entry.meta.id!r} both hold {record.cell} of split "
@@ -135,14 +119,14 @@ def _refuse_twice(
 
 
 def _source(record: Record) -> str:
-    return str(record.provenance.get("plugin_source", ""))[:12]
+    return record.plugin_source[:12]
 
 
 def _refuse_mixtures(records: Sequence[Record], owner: Mapping[int, SubmittedEntry]) -> None:
     """Refuse rows whose records are not of one plug-in, version, source and parameters."""
-    first: dict[Entry, Record] = {}
+    first: dict[Setting, Record] = {}
     for record in records:
-        row = entry_of(record)
+        row = record.setting
         one = first.setdefault(row, record)
         for what, its, other in (
             ("plug-in", one.plugin, record.plugin),

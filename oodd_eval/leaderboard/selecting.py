@@ -52,7 +52,7 @@ def selected(
         raise UsageError("these results have no records: expected those of a finished run")
     names = select("detector of these results", detectors, sorted({r.detector for r in records}))
     wanted = expression(cells) if cells else lambda _: True
-    chosen = [r for r in records if r.detector in names and wanted(r.cell)]
+    chosen = [r for r in records if r.detector in names and wanted(str(r.cell))]
     if not chosen:
         raise UsageError(f"-k {cells!r} selects none of the {len(records)} records")
     left_out: list[str] = []
@@ -74,7 +74,7 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     labels: dict[Unit, str] = {}
     for r in records:
         cells[setting_of(r)].add((r.environment, r.anomaly))
-        labels[setting_of(r)] = r.cell.partition("::")[2]
+        labels[setting_of(r)] = r.label
     every = set().union(*cells.values())
     whole = {setting for setting, own in cells.items() if own == every}
     if not whole:
@@ -123,7 +123,7 @@ def run_command(records: Sequence[Record]) -> str:
     """
     runs: dict[tuple[str, ...], set[str]] = defaultdict(set)
     for r in records:
-        overrides = json.dumps(r.provenance.get("overrides", {}), sort_keys=True)
+        overrides = json.dumps(r.overrides, sort_keys=True)
         runs[r.detector, overrides, str(r.horizon), str(r.seed)].add(r.environment)
     found = {(*key, _environments(names)) for key, names in runs.items()}
     merged: set[Run] = {tuple((part,) for part in run) for run in found}

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OutputError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, Entry, read_entries
@@ -26,7 +27,6 @@ from oodd_eval.leaderboard.verify.cells import joined
 from oodd_eval.leaderboard.verify.curves_check import Extent, with_curves
 from oodd_eval.leaderboard.verify.findings import Findings
 from oodd_eval.leaderboard.verify.verify import Seen, Verdict, check_clashes, verify_entry
-from oodd_eval.results import files as packed
 from oodd_eval.results.curves import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
@@ -138,13 +138,13 @@ def submit(
     with _written(place) as directory:
         text = "".join(record.to_json() + "\n" for record in records)
         (directory / RECORDS).write_text(text, encoding="utf-8")
-        packed.shrink(directory / RECORDS)
+        stored_files.compress_large(directory / RECORDS)
         opened = _split(records[0], split)
         drawn = with_curves(records, curves)
         if opened is not None and drawn:
             _require_scores(drawn, source, "submit with --curves none, or")
             write_curves(make_curves(drawn, source, opened), directory / CURVES)
-            packed.shrink(directory / CURVES)
+            stored_files.compress_large(directory / CURVES)
         if scores:
             _copy_scores([record for record in records if record.ok], source, directory)
         entry = replace(entry, files=_facts(directory))
@@ -166,10 +166,10 @@ def _require_one_split(records: Sequence[Record]) -> None:
             f"these results are of {len(splits)} splits: {listed}; an entry is of one, so run "
             "each into a results directory of its own"
         )
-    if limited := [r for r in records if r.provenance.get("limit") is not None]:
+    if limited := [r for r in records if r.limit is not None]:
         raise UsageError(
             f"{len(limited)} records, such as {limited[0].cell}, used --limit "
-            f"{limited[0].provenance['limit']}: an entry uses all trajectories, so run without "
+            f"{limited[0].limit}: an entry uses all trajectories, so run without "
             "it, into another results directory"
         )
     if local := [r for r in records if rules.plugin_name(r.plugin)]:
@@ -224,9 +224,7 @@ def _entry(records: Sequence[Record], statement: Statement, command: str) -> Ent
 
 
 def _plugins(records: Iterable[Record]) -> list[dict[str, str]]:
-    sources = {
-        (r.plugin, r.detector_version, str(r.provenance.get("plugin_source", ""))) for r in records
-    }
+    sources = {(r.plugin, r.detector_version, r.plugin_source) for r in records}
     return [
         {
             "distribution": plugin.partition(":")[0],
@@ -290,7 +288,7 @@ def _require_scores(
 ) -> list[Path]:
     """Return the score files of records, each once; refuse when one is not there."""
     files = []
-    for key in sorted({str(r.provenance.get("scores", "")) for r in records}):
+    for key in sorted({r.scores for r in records}):
         file = source.path / SCORES / f"{key}.h5"
         if rules.score_key(key) or not file.is_file():
             raise UsageError(

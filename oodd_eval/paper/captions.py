@@ -96,8 +96,8 @@ def of_returns(header: Header) -> str:
 def failures(records: Sequence[Record]) -> list[str]:
     """Return the section on units that failed; nothing where none did."""
     failed = {
-        (row_of(r).label, r.environment, r.seed): [
-            row_of(r).label, r.environment, str(r.seed), r.status, r.reason
+        (str(row_of(r)), r.environment, r.seed): [
+            str(row_of(r)), r.environment, str(r.seed), r.status, r.reason
         ]
         for r in records
         if not r.ok

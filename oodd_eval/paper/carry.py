@@ -80,7 +80,7 @@ class Watch:
     @hookimpl
     def oodd_cell_finished(self, record: Record, resumed: bool) -> None:
         """Tell of a unit when its last cell is there."""
-        key = record.environment, record.cell.partition("::")[2]
+        key = record.environment, record.label
         cells = self.finished.setdefault(key, [])
         cells.append(record)
         work = self._works.get(key)

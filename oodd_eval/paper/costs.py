@@ -82,7 +82,7 @@ def correction(finished: Iterable[Record], rows: Mapping[str, int]) -> float:
     for r in finished:
         if math.isnan(r.seconds_fit) or math.isnan(r.seconds_score):
             continue
-        overrides = dict(r.provenance.get("overrides", {}))
+        overrides = dict(r.overrides)
         unit = Unit(r.detector, r.horizon, r.seed, r.environment, r.parameters, overrides, ())
         cost = estimate(unit, rows.get(r.environment, 0))
         measured += r.seconds_fit + r.seconds_score + START

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from oodd_eval.metrics.bootstrap import RESAMPLES, bootstrap_weights, percentiles, resampled
 from oodd_eval.paper.experiments import Setup, row_of
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import Entry, contribution
+from oodd_eval.results.tables.board import contribution
 
 _weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
 
@@ -78,7 +79,7 @@ class Evidence:
     """
 
     def __init__(self, records: Iterable[Record]) -> None:
-        self._cells: dict[tuple[Entry, str], dict[str, dict[int, Record]]] = {}
+        self._cells: dict[tuple[Setting, str], dict[str, dict[int, Record]]] = {}
         for record in records:
             row = self._cells.setdefault((row_of(record), record.environment), {})
             row.setdefault(record.anomaly, {})[record.seed] = record

@@ -7,14 +7,13 @@ setups out beside one another; experiments share setups, and each is run once.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Entry, entry_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,23 +25,19 @@ class Setup:
     parameters: tuple[tuple[str, Any], ...] = ()
 
     @property
-    def entry(self) -> Entry:
+    def entry(self) -> Setting:
         """The row of a board that its records belong to."""
         return _entry(self.detector, self.horizon, self.parameters)
 
 
 @functools.cache
-def _entry(detector: str, horizon: int, parameters: tuple[tuple[str, Any], ...]) -> Entry:
-    return Entry(detector, horizon, json.dumps(dict(parameters), sort_keys=True))
+def _entry(detector: str, horizon: int, parameters: tuple[tuple[str, Any], ...]) -> Setting:
+    return Setting.of(detector, horizon, dict(parameters))
 
 
-def row_of(record: Record) -> Entry:
-    """Return the row that a record belongs to: where its networks computed makes no other one."""
-    overrides = dict(record.provenance.get("overrides", {}))
-    overrides.pop("device", None)
-    if overrides == record.provenance.get("overrides", {}):
-        return entry_of(record)
-    return Entry(record.detector, record.horizon, json.dumps(overrides, sort_keys=True))
+def row_of(record: Record) -> Setting:
+    """Return the row that a record belongs to."""
+    return record.setting
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.errors import ResultsError
 from oodd_eval.paper.experiments import EXPERIMENTS, row_of, setups_of
 from oodd_eval.paper.header import Header
 from oodd_eval.paper.schedule import own_records
-from oodd_eval.results import files as packed
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Entry
 
 
 def gather(header: Header, places: Iterable[Path]) -> list[Record]:
@@ -30,7 +30,7 @@ def gather(header: Header, places: Iterable[Path]) -> list[Record]:
     ResultsError
         When there are no records, one cannot be read, or two directories have the same cell.
     """
-    origin: dict[tuple[Entry, str, str, int], Path] = {}
+    origin: dict[tuple[Setting, str, str, int], Path] = {}
     found = []
     for directory in sorted({d for place in places for d in _directories(place)}):
         records = ResultsDirectory(directory).records()
@@ -47,10 +47,10 @@ def gather(header: Header, places: Iterable[Path]) -> list[Record]:
 
 
 def _directories(place: Path) -> list[Path]:
-    if packed.find(place / RECORDS):
+    if stored_files.find_file(place / RECORDS):
         return [place]
     # Large entries of the leaderboard keep their records packed.
-    names = RECORDS, RECORDS + packed.ENDING
+    names = RECORDS, RECORDS + stored_files.GZIP
     below = [file.parent for name in names for file in place.rglob(name)]
     if not below:
         raise ResultsError(f"no results in {str(place)!r}: expected {RECORDS} in it or below it")

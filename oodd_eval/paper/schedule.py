@@ -19,8 +19,8 @@ from oodd_eval.paper.experiments import (
 )
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import fit_key, unit_key
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Entry
 from oodd_eval.scoring.plan import Plan, Unit, make_plan
 
 STAGES: Final = (
@@ -138,11 +138,11 @@ def own_records(
     records: Iterable[Record], digest: str, tier: Tier, setups: Sequence[Setup]
 ) -> list[Record]:
     """Return the records that belong to a reproduction: its whole data, its setups, its seeds."""
-    seeds: dict[Entry, range] = {setup.entry: tier.seeds(setup) for setup in setups}
+    seeds: dict[Setting, range] = {setup.entry: tier.seeds(setup) for setup in setups}
     return [
         r
         for r in records
-        if (r.split_digest, r.protocol, r.provenance.get("limit")) == (digest, PROTOCOL, None)
+        if (r.split_digest, r.protocol, r.limit) == (digest, PROTOCOL, None)
         and r.seed in seeds.get(row_of(r), ())
     ]
 
@@ -152,7 +152,7 @@ def finished_keys(records: Iterable[Record]) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for r in records:
         if r.ok:
-            found.setdefault(str(r.provenance.get("scores", "")), set()).add(r.anomaly)
+            found.setdefault(r.scores, set()).add(r.anomaly)
     return found
 
 

@@ -19,9 +19,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.results import files as packed
 
 SCHEMA: Final = 1
 """Version of the layout; a reader refuses others."""
@@ -73,7 +73,7 @@ def read_curves(path: Path | str) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        plain = json.loads(packed.read_text(path))
+        plain = json.loads(stored_files.read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
     return check_curves(plain, path.name)

@@ -313,7 +313,7 @@ def make_curves(
                 stack.callback(data[record.environment].close)
             environment = data[record.environment]
             scores = stored_scores(record, results, environment).parts
-            key = str(record.provenance["scores"])
+            key = record.scores
             if key not in fitted:
                 rule = AlarmRule(Standardization.fit(scores[CALIBRATION]))
                 at = thresholds(scores[TWINS], rule)
@@ -323,11 +323,11 @@ def make_curves(
             onsets = environment.anomalous(record.anomaly).onsets[: len(anomalous)].tolist()
             units.append(
                 {
-                    "cell": record.cell,
+                    "cell": str(record.cell),
                     "detector": record.detector,
                     "horizon": record.horizon,
                     "seed": record.seed,
-                    "overrides": record.provenance.get("overrides", {}),
+                    "overrides": record.overrides,
                     "environment": record.environment,
                     "anomaly": record.anomaly,
                     **cell_curves(sweep, rule, anomalous, onsets),

@@ -27,11 +27,11 @@ from typing import Any
 import h5py
 import numpy as np
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.errors import OutputError, ResultsError
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.plugins.discovery import Offer
-from oodd_eval.results import files as packed
 from oodd_eval.results.fits import FittedStore
 from oodd_eval.results.provenance import source_digest
 from oodd_eval.results.record import Record
@@ -164,9 +164,9 @@ class ResultsDirectory:
         ResultsError
             When there are none, or one cannot be read.
         """
-        file = packed.find(self.path / RECORDS) or self.path / RECORDS
+        file = stored_files.find_file(self.path / RECORDS) or self.path / RECORDS
         try:
-            lines = packed.read_text(file).splitlines()
+            lines = stored_files.read_text(file).splitlines()
         except FileNotFoundError:
             raise ResultsError(
                 f"no results in {str(self.path)!r}: expected a file {RECORDS}, written by "

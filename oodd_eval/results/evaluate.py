@@ -112,6 +112,9 @@ def make_records(
     data: EnvironmentData,
     scored: Scored,
     provenance: Mapping[str, Any],
+    *,
+    plugin_source: str = "",
+    scores: str = "",
 ) -> list[Record]:
     """Return the records of a unit's cells, in the order of its anomalies, whatever became of it.
 
@@ -119,11 +122,10 @@ def make_records(
     """
     cost = scored.file.cost
     blank = Record(
-        cell="",
         detector=unit.detector,
         detector_version=offer.version,
         plugin=f"{offer.distribution}:{offer.plugin}",
-        parameters=dict(unit.parameters),
+        parameters={k: v for k, v in unit.parameters.items() if k != "device"},
         environment=unit.environment,
         anomaly="",
         group="",
@@ -131,9 +133,16 @@ def make_records(
         seed=unit.seed,
         split=plan.split,
         split_digest=plan.split_digest,
-        status=scored.status,
+        status=scored.status,  # type: ignore[arg-type]
         reason=scored.reason,
         protocol=PROTOCOL,
+        plugin_source=plugin_source,
+        overrides={k: v for k, v in unit.overrides.items() if k != "device"},
+        inputs=offer.spec.inputs,
+        limit=plan.limit,
+        scores=scores,
+        # A whole number, also when it was read back from a file of floats.
+        steps_scored=int(cost["steps_scored"]) if "steps_scored" in cost else None,
         counts={
             "train": limited(len(data.train), plan.limit),
             "calibration": limited(len(data.calibration), plan.limit),
@@ -142,20 +151,10 @@ def make_records(
         seconds_fit=cost.get("seconds_fit", NAN),
         seconds_score=cost.get("seconds_score", NAN),
         peak_rss_mb=cost.get("peak_rss_mb", NAN),
-        provenance={
-            **provenance,
-            "limit": plan.limit,
-            "overrides": dict(unit.overrides),
-            "inputs": offer.spec.inputs,
-            # Observations that seconds_score is for, so that detectors compare by time per step.
-            # A whole number, also when it was read back from a file of floats.
-            "steps_scored": int(cost["steps_scored"]) if "steps_scored" in cost else None,
-        },
+        provenance=dict(provenance)
+        | ({"device": unit.parameters["device"]} if "device" in unit.parameters else {}),
     )
-    records = [
-        replace(blank, cell=plan.cell(unit, a), anomaly=a, group=ANOMALIES[a].group)
-        for a in unit.anomalies
-    ]
+    records = [replace(blank, anomaly=a, group=ANOMALIES[a].group) for a in unit.anomalies]
     if scored.status != "ok":
         return records
     try:
@@ -207,7 +206,7 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
                 data[record.environment] = split.environment(record.environment)
             environment = data[record.environment]
             scores = stored_scores(record, results, environment)
-            key = str(record.provenance["scores"])
+            key = record.scores
             if key not in rules:
                 rules[key] = Rules.fit(scores.parts[CALIBRATION])
             rescored.append(_with_metrics(record, environment, scores, rules[key]))
@@ -225,9 +224,9 @@ def stored_scores(record: Record, results: ResultsDirectory, data: EnvironmentDa
     ResultsError
         When there are none that fit the split.
     """
-    key = str(record.provenance.get("scores", ""))
+    key = record.scores
     sets = parts_of(data, (record.anomaly,))
-    scores = results.scores(key, lengths_of(sets, record.provenance.get("limit"))) if key else None
+    scores = results.scores(key, lengths_of(sets, record.limit)) if key else None
     if scores is None:
         raise ResultsError(
             f"{record.cell}: no scores that fit the split in {str(results.path)!r}, expected "

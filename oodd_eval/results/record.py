@@ -1,4 +1,4 @@
-"""One evaluated cell: what it was, what came of it, and how that was computed.
+"""One evaluated cell: its identity, what came of it, and how that was computed.
 
 A record is plain data. `Record.to_json` and `Record.from_json` are inverse to each other, with NaN
 written as null, so that results can be stored, compared and published as lines of JSON.
@@ -6,31 +6,53 @@ written as null, so that results can be stored, compared and published as lines 
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
 from oodd_eval.errors import ResultsError
+from oodd_eval.results.identity import Cell, Setting
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 """Version of the layout of a record; a reader refuses others."""
 
-STATUSES: Final = ("ok", "error", "timeout", "oom", "invalid", "incompatible", "unavailable")
-"""What may become of a cell. All but the first are failures and carry a reason."""
+Status = Literal["ok", "error", "timeout", "oom", "invalid", "incompatible", "unavailable"]
+"""States of a cell. All but the first are failures and carry a reason."""
+
+STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 
 NAN: Final = float("nan")
+
+
+class _NullIsNan:
+    """Tells pydantic to read null as NaN; it is imported only when records are read."""
+
+    @staticmethod
+    def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:  # noqa: PLW3201
+        from pydantic_core import core_schema  # noqa: PLC0415
+
+        number = core_schema.float_schema(strict=True)
+        return core_schema.no_info_before_validator_function(
+            lambda value: NAN if value is None else value, number
+        )
+
+
+Number = Annotated[float, _NullIsNan]
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
     """A value with its 95 % interval over n trajectories; NaN where undefined."""
 
-    value: float
-    low: float = NAN
-    high: float = NAN
+    value: Number
+    low: Number = NAN
+    high: Number = NAN
     n: int = 0
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +61,16 @@ class Record:
 
     Attributes
     ----------
-    cell
-        The cell's id, such as ``mini/hopper/iid::riqn[h=1,seed=0]``.
-    detector, detector_version, plugin
-        Name of the detector, version of the distribution it is from, and ``distribution:plug-in``.
-    parameters
-        All parameters of the detector, defaults included.
-    environment, anomaly, group, horizon, seed, split, split_digest
-        What was evaluated.
+    detector, detector_version, plugin, plugin_source
+        Name of the detector, version of the distribution it is from, ``distribution:plug-in``, and
+        the digest of the plug-in's code.
+    parameters, overrides
+        All parameters that decide scores, defaults included; those that are not at their default.
+    inputs
+        ``"observations"`` or ``"observations+actions"``.
+    environment, anomaly, strength, group, horizon, seed, split, split_digest, limit
+        The evaluation. `strength` is empty where an anomaly has only one; `limit` is the number of
+        trajectories of each part that were used, None for all.
     status, reason
         ``"ok"``, or the way in which the detector failed and one line about it.
     metrics
@@ -55,15 +79,17 @@ class Record:
         Numbers of trajectories used, by part.
     per_trajectory
         For each metric that is a ratio of sums, its numerators and denominators in test order.
-    seconds_fit, seconds_score, peak_rss_mb
-        Cost of the fit this cell is from (shared by all anomalies); NaN where unknown.
+    scores
+        Key of the file with the scores.
+    seconds_fit, seconds_score, steps_scored, peak_rss_mb
+        Cost of the fit this cell is from (shared by all anomalies); `seconds_score` is for
+        `steps_scored` observations. NaN or None where unknown.
     provenance
-        Versions, machine, time, and the key of the score file.
-    schema, protocol
-        Versions of this layout and of splits, metrics and defaults.
+        Versions, machine, device and time: nothing that decides identity.
+    protocol, schema
+        Versions of splits, metrics and defaults, and of this layout.
     """
 
-    cell: str
     detector: str
     detector_version: str
     plugin: str
@@ -75,17 +101,26 @@ class Record:
     seed: int
     split: str
     split_digest: str
-    status: str
+    status: Status
     protocol: int
+    plugin_source: str = ""
+    overrides: dict[str, Any] = field(default_factory=dict)
+    inputs: str = ""
+    strength: str = ""
+    limit: int | None = None
     reason: str = ""
     metrics: dict[str, Metric] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     per_trajectory: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
-    seconds_fit: float = NAN
-    seconds_score: float = NAN
-    peak_rss_mb: float = NAN
+    scores: str = ""
+    seconds_fit: Number = NAN
+    seconds_score: Number = NAN
+    steps_scored: int | None = None
+    peak_rss_mb: Number = NAN
     provenance: dict[str, Any] = field(default_factory=dict)
     schema: int = SCHEMA
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 
     @property
     def ok(self) -> bool:
@@ -93,10 +128,27 @@ class Record:
         return self.status == "ok"
 
     @property
+    def setting(self) -> Setting:
+        """The row of a board that the record belongs to."""
+        return Setting.of(self.detector, self.horizon, self.overrides)
+
+    @property
+    def cell(self) -> Cell:
+        """The evaluation; its text is what users see."""
+        return Cell(
+            self.split, self.environment, self.anomaly, self.setting, self.seed, self.strength
+        )
+
+    @property
+    def label(self) -> str:
+        """Setting and seed, such as ``riqn[h=1,seed=0]``."""
+        return self.setting.label(self.seed)
+
+    @property
     def identity(self) -> tuple[str, ...]:
-        """What makes two records results of the same cell, the later replacing the earlier."""
-        settings = [self.protocol, self.parameters, self.provenance.get("limit")]
-        return self.cell, self.split_digest, json.dumps(settings, sort_keys=True)
+        """Equal for two results of the same cell, of which the later replaces the earlier."""
+        conditions = [self.protocol, self.parameters, self.limit]
+        return str(self.cell), self.split_digest, json.dumps(conditions, sort_keys=True)
 
     def value(self, metric: str) -> float:
         """Return a metric's value; NaN where the cell has none."""
@@ -127,64 +179,43 @@ class Record:
         ResultsError
             When it is not a record of this schema.
         """
+        from pydantic import ValidationError  # noqa: PLC0415  only where records are read
+
         try:
-            plain = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise ResultsError(f"{where} is not JSON: {error}") from None
-        if not isinstance(plain, dict):
-            raise ResultsError(f"{where} is {type(plain).__name__}, expected a JSON object")
-        if plain.get("schema") != SCHEMA:
-            raise ResultsError(
-                f"{where} has schema {plain.get('schema')!r}, expected {SCHEMA}: it was written by "
-                "another version of oodd-eval"
-            )
-        names = {f.name for f in fields(cls)}
-        if plain.keys() != names:
-            raise ResultsError(
-                f"{where} has other fields than a record: missing "
-                f"{sorted(names - plain.keys())}, unknown {sorted(plain.keys() - names)}"
-            )
-        for name, kind in _KINDS.items():
-            # bool is an int to isinstance, and never meant here.
-            if not isinstance(plain[name], kind) or isinstance(plain[name], bool):
-                raise ResultsError(f"{where}: {name} is {plain[name]!r:.60}, expected {kind}")
-        if plain["status"] not in STATUSES:
-            raise ResultsError(
-                f"{where}: status is {plain['status']!r}, expected one of {', '.join(STATUSES)}"
-            )
-        try:
-            plain["metrics"] = {k: _metric(m) for k, m in plain["metrics"].items()}
-            plain["per_trajectory"] = {
-                k: (_floats(pair[0]), _floats(pair[1]))
-                for k, pair in plain["per_trajectory"].items()
-            }
-        except (TypeError, KeyError, IndexError, ValueError) as error:
-            raise ResultsError(f"{where}: metrics cannot be read: {error!r}") from None
-        for name in ("seconds_fit", "seconds_score", "peak_rss_mb"):
-            plain[name] = _float(plain[name])
-        return cls(**plain)
+            record: Record = _reader().validate_json(line)
+        except ValidationError as error:
+            raise ResultsError(f"{where} {_problem(line, error)}") from None
+        if record.schema != SCHEMA:
+            raise ResultsError(f"{where} {_other_schema(record.schema)}")
+        return record
 
 
-_KINDS: Final[Mapping[str, type]] = {
-    **dict.fromkeys(("cell", "detector", "detector_version", "plugin", "environment"), str),
-    **dict.fromkeys(("anomaly", "group", "split", "split_digest", "status", "reason"), str),
-    **dict.fromkeys(("horizon", "seed", "protocol"), int),
-    **dict.fromkeys(("parameters", "metrics", "counts", "per_trajectory", "provenance"), dict),
-}
+@functools.cache
+def _reader() -> Any:
+    from pydantic import TypeAdapter  # noqa: PLC0415  only where records are read
+
+    return TypeAdapter(Record)
 
 
-def _metric(plain: Mapping[str, Any]) -> Metric:
-    return Metric(
-        _float(plain["value"]), _float(plain["low"]), _float(plain["high"]), int(plain["n"])
+def _problem(line: str, error: Any) -> str:
+    """Describe the first problem of a line that is no record, after `where`."""
+    try:
+        plain = json.loads(line)
+    except (ValueError, RecursionError):
+        plain = None
+    if isinstance(plain, dict) and plain.get("schema") != SCHEMA:
+        return _other_schema(plain.get("schema"))
+    first = error.errors(include_url=False, include_context=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    found = "" if first["type"] in {"missing", "json_invalid"} else f", got {first['input']!r:.60}"
+    return f"is no record: {place + ': ' if place else ''}{first['msg']}{found}"
+
+
+def _other_schema(found: object) -> str:
+    return (
+        f"has schema {found!r:.20}, expected {SCHEMA}: it was written by another version of "
+        "oodd-eval; run again, or install that version to read it"
     )
-
-
-def _floats(values: Sequence[Any]) -> list[float]:
-    return [_float(v) for v in values]
-
-
-def _float(value: Any) -> float:
-    return NAN if value is None else float(value)
 
 
 def _without_nan(value: Any) -> Any:

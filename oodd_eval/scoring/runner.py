@@ -148,9 +148,7 @@ def _carry_out(
             if job.offer.plugin != LOCAL:
                 key = unit_key(plan, job.unit, job.offer)
                 source = {"plugin_source": key.source, "scores": key.text}
-            records = make_records(
-                plan, job.unit, job.offer, job.data, scored, {**origin, **source}
-            )
+            records = make_records(plan, job.unit, job.offer, job.data, scored, origin, **source)
             keeper.add(index, records)
             for record in records:
                 plugins.notify("oodd_cell_finished", record=record, resumed=scored.resumed)

@@ -157,14 +157,14 @@ def _row(
     if own:
         curves.append(packed(own))
     return {
-        "id": f"{section.name}/{row.label}",
-        "label": row.label,
+        "id": f"{section.name}/{str(row)}",
+        "label": str(row),
         "detector": row.detector,
         "version": records[0].detector_version,
         "plugin": records[0].plugin,
         "horizon": row.horizon,
         "parameters": records[0].parameters,
-        "overrides": json.loads(row.overrides),
+        "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
         "trivial": standing.trivial,
         "inputs": standing.inputs,
@@ -235,7 +235,7 @@ def _with_intervals(names: Sequence[str]) -> list[str]:
 
 def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
     """Curves of a row's cells by ``environment/anomaly``, of the first seed that has them."""
-    cells = {r.cell for r in records}
+    cells = {str(r.cell) for r in records}
     found: Json = {}
     for unit in units:
         if unit["cell"] in cells:

@@ -79,7 +79,7 @@ def _check_plugins(entry: Entry, records: Records, findings: Findings) -> None:
         findings.refuse(ENTRY, "plugins", "names a plug-in twice")
     used: dict[str, tuple[str, str, str]] = {}
     for where, record in records.items():
-        source = (record.plugin, record.detector_version, record.provenance["plugin_source"])
+        source = (record.plugin, record.detector_version, record.plugin_source)
         first = used.setdefault(record.detector, source)
         fields = ("plugin", "detector_version", "provenance.plugin_source")
         for field, value, expected in zip(fields, source, first, strict=True):
@@ -127,7 +127,7 @@ def _check_complete(records: Records, findings: Findings) -> None:
     for where, record in records.items():
         key = (*setting_of(record), record.environment, record.anomaly)
         first = seen.setdefault(key, where)
-        second = names.setdefault(record.cell, where)
+        second = names.setdefault(str(record.cell), where)
         if first != where or second != where:
             other = first if first != where else second
             findings.refuse(where, "cell", f"is there twice: it is that of {other} too")
@@ -169,7 +169,7 @@ def _check_parameters(records: Records, findings: Findings) -> None:
             )  # fmt: skip
             continue
         for name, value in record.parameters.items():
-            if name in record.provenance["overrides"]:
+            if name in record.overrides:
                 continue
             default = defaults.setdefault((record.detector, name), value)
             if value != default:
@@ -203,7 +203,7 @@ def _check_shared(records: Records, findings: Findings) -> None:
     keys: dict[str, tuple[Any, ...]] = {}
     for where, record in records.items():
         unit = (*setting_of(record), record.environment)
-        key = record.provenance["scores"]
+        key = record.scores
         if keys.setdefault(key, unit) != unit:
             findings.refuse(
                 where, "provenance.scores", f"is {key!r}, which another fit's records name too"
@@ -211,7 +211,7 @@ def _check_shared(records: Records, findings: Findings) -> None:
         if not record.ok:
             continue
         other_where, other = first.setdefault(unit, (where, record))
-        if key != other.provenance["scores"]:
+        if key != other.scores:
             findings.refuse(
                 where, "provenance.scores", f"is {key!r}, but another in {other_where}, which is "
                 "of the same fit",

@@ -62,7 +62,7 @@ def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
         simplest: dict[str, tuple[int, Row]] = {}
         for record in records:
             if (row := row_of(record)) in seeds:
-                own = len(record.provenance.get("overrides", {})), row
+                own = len(record.overrides), row
                 simplest[record.detector] = min(simplest.get(record.detector, own), own)
         chosen = {row for _, row in simplest.values()}
         seeds = {row: seed for row, seed in seeds.items() if row in chosen}
@@ -101,7 +101,7 @@ def read_curves(
 def _check_units(
     units: Sequence[Mapping[str, Any]], name: str, records: Records, findings: Findings
 ) -> None:
-    known = {record.cell: record for record in records.values() if record.ok}
+    known = {str(record.cell): record for record in records.values() if record.ok}
     drawn: set[Unit] = set()
     for i, unit in enumerate(units):
         record = known.pop(unit["cell"], None)
@@ -139,5 +139,5 @@ def _identity(record: Record) -> dict[str, Any]:
     names = ("detector", "horizon", "seed", "environment", "anomaly")
     return {
         **{name: getattr(record, name) for name in names},
-        "overrides": record.provenance["overrides"],
+        "overrides": record.overrides,
     }

@@ -14,20 +14,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES
 from oodd_eval.leaderboard.verify.findings import Findings, shown
-from oodd_eval.results import files as packed
 from oodd_eval.results.directory import RECORDS
 
 MB: Final = 10**6
-MOST_PLAIN: Final = {RECORDS: packed.MOST, CURVES: 16 * MB}
+MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}
 """Largest sizes of files that may be packed, unpacked."""
 
 MOST_BYTES: Final = {
     ENTRY: MB // 4,
     **MOST_PLAIN,
-    **{name + packed.ENDING: 8 * MB for name in MOST_PLAIN},
+    **{name + stored_files.GZIP: 8 * MB for name in MOST_PLAIN},
 }
 """Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""
 
@@ -58,19 +58,19 @@ def list_files(entry: Path, findings: Findings) -> dict[str, int]:
         )
         return {}
     for name in MOST_PLAIN:
-        if name in listed and name + packed.ENDING in listed:
+        if name in listed and name + stored_files.GZIP in listed:
             findings.refuse(
-                name + packed.ENDING, "", f"is there beside {name}: expected one of the two"
+                name + stored_files.GZIP, "", f"is there beside {name}: expected one of the two"
             )
     for name in (ENTRY, RECORDS):
-        if not {name, name + packed.ENDING} & listed.keys():
+        if not {name, name + stored_files.GZIP} & listed.keys():
             findings.refuse(name, "", "is missing")
     return found
 
 
 def name_in(files: Mapping[str, int], name: str) -> str:
     """Return the name under which a file is there, plain or packed; empty if it is not."""
-    return next((n for n in (name, name + packed.ENDING) if n in files), "")
+    return next((n for n in (name, name + stored_files.GZIP) if n in files), "")
 
 
 def read_whole(entry: Path, name: str) -> str:
@@ -82,8 +82,8 @@ def read_whole(entry: Path, name: str) -> str:
         When it is too large, no plain file, not packed as it should be, or not UTF-8.
     """
     content = read_bytes(entry / name, MOST_BYTES[name])
-    if name.endswith(packed.ENDING):
-        content = packed.unpack(content, MOST_PLAIN[name.removesuffix(packed.ENDING)])
+    if name.endswith(stored_files.GZIP):
+        content = stored_files.decompress(content, MOST_PLAIN[name.removesuffix(stored_files.GZIP)])
     try:
         return content.decode()
     except UnicodeDecodeError as error:

@@ -107,9 +107,7 @@ def _pairs(records: Records, fresh: Sequence[Record], findings: Findings) -> tup
     Results on the entry's own split count alone where there are any.
     """
     first = next(iter(records.values()))
-    usable = [
-        r for r in fresh if r.protocol == first.protocol and r.provenance.get("limit") is None
-    ]
+    usable = [r for r in fresh if r.protocol == first.protocol and r.limit is None]
     own = [r for r in usable if r.split_digest == first.split_digest]
     digests = {r.split_digest: r.split for r in own or usable}
     if len(digests) != 1:
@@ -189,8 +187,7 @@ def _compare_field(field: str, pairs: Iterable[Pair], findings: Findings) -> Non
     """Refuse the first record that has another value of a field in the run again."""
     for where, record, again in pairs:
         mine, other = (
-            r.provenance.get("plugin_source") if "." in field else getattr(r, field)
-            for r in (record, again)
+            r.plugin_source if "." in field else getattr(r, field) for r in (record, again)
         )
         if mine != other:
             findings.refuse(
@@ -202,5 +199,5 @@ def _compare_field(field: str, pairs: Iterable[Pair], findings: Findings) -> Non
 def _label(record: Record) -> str:
     """Return a row's name: that of its cells without the seed."""
     settings = [f"h={record.horizon}"]
-    settings += [f"{k}={v}" for k, v in record.provenance["overrides"].items()]
+    settings += [f"{k}={v}" for k, v in record.overrides.items()]
     return f"{record.detector}[{','.join(settings)}]"

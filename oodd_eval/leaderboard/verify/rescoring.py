@@ -57,7 +57,7 @@ def _fitting(
         parts = (CALIBRATION, TWINS, f"test/{record.anomaly}")
         if not all(part in rows for part in parts):
             continue  # Complained of already.
-        key = str(record.provenance["scores"])
+        key = record.scores
         if results.scores(key, {part: rows[part] for part in parts}) is None:
             findings.refuse(
                 f"{SCORES}/{key}.h5", parts[-1],
@@ -103,7 +103,7 @@ def check_recomputed_curves(
     drawn = {unit["cell"] for unit in curves["units"]}
     try:
         fresh = make_curves(
-            [r for r in records if r.cell in drawn], ResultsDirectory(directory), split
+            [r for r in records if str(r.cell) in drawn], ResultsDirectory(directory), split
         )  # fmt: skip
     except ResultsError as error:
         findings.refuse(CURVES, "", f"cannot be computed again: {error}")

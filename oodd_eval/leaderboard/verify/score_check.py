@@ -48,7 +48,7 @@ def check_scores(
     wanted: dict[str, dict[str, Record]] = {}
     for where, record in records.items():
         if record.ok:
-            name = f"{SCORES}/{record.provenance['scores']}.h5"
+            name = f"{SCORES}/{record.scores}.h5"
             wanted.setdefault(name, {})[where] = record
     for name in sorted(present - wanted.keys()):
         findings.refuse(name, "", "belongs to no record: no provenance.scores names it")

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from oodd_eval.data import files as stored_files
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, TRUST, Entry
 from oodd_eval.leaderboard.verify.cells import PLACE, Records, check_cells
@@ -28,7 +29,6 @@ from oodd_eval.leaderboard.verify.rerun import Rerun, compare_rerun
 from oodd_eval.leaderboard.verify.rescoring import check_recomputed_curves, check_rescored
 from oodd_eval.leaderboard.verify.score_check import check_scores
 from oodd_eval.leaderboard.verify.trajectories import check_against_split, find_split, read_facts
-from oodd_eval.results import files as packed
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
@@ -213,7 +213,7 @@ def verify(
         if progress is not None:
             progress(verdict)
 
-    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + packed.ENDING)):
+    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + stored_files.GZIP)):
         add(verify_entry(path, split=split, rerun=rerun))
         return verdicts
     if rerun:
@@ -234,7 +234,7 @@ def verify(
 
 def _cell_key(record: Record) -> str:
     """Return what only one entry may have: a cell of a split, wherever it was computed."""
-    overrides = {k: v for k, v in record.provenance.get("overrides", {}).items() if k != PLACE}
+    overrides = {k: v for k, v in record.overrides.items() if k != PLACE}
     parts = [
         record.detector, record.horizon, record.seed, overrides, record.environment,
         record.anomaly, record.split_digest, record.protocol,

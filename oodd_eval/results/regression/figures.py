@@ -106,9 +106,9 @@ def figures_of(records: Iterable[Record], where: str = "records") -> FigureSet:
     """Arrange records for comparison; of several of one cell, the last one counts."""
     boards: dict[Conditions, dict[str, Figures]] = {}
     for r in records:
-        conditions = Conditions(r.split, r.split_digest, r.protocol, r.provenance.get("limit"))
+        conditions = Conditions(r.split, r.split_digest, r.protocol, r.limit)
         metrics = {name: metric.value for name, metric in r.metrics.items()}
-        boards.setdefault(conditions, {})[r.cell] = Figures(r.status, r.reason, metrics)
+        boards.setdefault(conditions, {})[str(r.cell)] = Figures(r.status, r.reason, metrics)
     return FigureSet(where, boards)
 
 
@@ -174,7 +174,7 @@ def reference_text(records: Sequence[Record]) -> str:
         detectors[r.detector] = {
             "plugin": r.plugin,
             "version": r.detector_version,
-            "source": r.provenance.get("plugin_source"),
+            "source": r.plugin_source,
         }
     head = {"kind": KIND, "schema": SCHEMA, "versions": versions}
     lines = [f" {json.dumps(k)}: {json.dumps(v)}," for k, v in head.items()]
@@ -192,7 +192,7 @@ def _order(record: Record) -> tuple[str, str, int, int, str]:
         record.split_digest,
         _position(record.environment, tuple(ENVIRONMENTS)),
         _position(record.anomaly, tuple(ANOMALIES)),
-        record.cell,
+        str(record.cell),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,25 +12,10 @@ import numpy as np
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import bootstrap_weights, mean_value, percentiles, resampled_mean
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 
 _weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One row of a board: a detector with its horizon and settings, over all its seeds."""
-
-    detector: str
-    horizon: int
-    overrides: str
-
-    @property
-    def label(self) -> str:
-        """Name, and whatever is not a default."""
-        settings = [f"h={self.horizon}"] if self.horizon != 1 else []
-        settings += [f"{k}={v}" for k, v in json.loads(self.overrides).items()]
-        return f"{self.detector}[{','.join(settings)}]" if settings else self.detector
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +55,10 @@ class Board:
         self.records = list(records)
         first = self.records[0]
         self.split, self.digest = first.split, first.split_digest
-        self.protocol, self.limit = first.protocol, first.provenance.get("limit")
-        self._cells: dict[tuple[Entry, str, str], list[Record]] = {}
+        self.protocol, self.limit = first.protocol, first.limit
+        self._cells: dict[tuple[Setting, str, str], list[Record]] = {}
         for record in self.records:
-            key = entry_of(record), record.environment, record.anomaly
+            key = record.setting, record.environment, record.anomaly
             self._cells.setdefault(key, []).append(record)
         self.entries = list(dict.fromkeys(entry for entry, _, _ in self._cells))
         found = {environment for _, environment, _ in self._cells}
@@ -95,14 +79,14 @@ class Board:
         """Return the numbers of test trajectories per cell that occur."""
         return sorted({r.counts["test"] for r in self.records if "test" in r.counts})
 
-    def is_trivial(self, entry: Entry) -> bool:
+    def is_trivial(self, entry: Setting) -> bool:
         """Whether an entry is one of the harness's own trivial rows."""
         plugins = (r.plugin for (e, _, _), cell in self._cells.items() if e == entry for r in cell)
         return next(plugins, "").endswith(":trivial")
 
     def mean(
         self,
-        entry: Entry,
+        entry: Setting,
         environments: Sequence[str],
         anomalies: Sequence[str],
         metric: str,
@@ -126,7 +110,7 @@ class Board:
         low, high = _interval(with_metric, metric) if intervals else (NAN, NAN)
         return Value(value, low, high, cells=len(records), partial=partial)
 
-    def compare(self, first: Entry, second: Entry, metric: str) -> tuple[float, float, int]:
+    def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
         common = [
             (self._cells[first, e, a], self._cells[second, e, a])
@@ -148,7 +132,7 @@ class Board:
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
         failed = [r for r in self.records if not r.ok]
-        units = {(r.cell.partition("::")[2], r.environment, r.status): r for r in reversed(failed)}
+        units = {(r.label, r.environment, r.status): r for r in reversed(failed)}
         return list(reversed(units.values()))
 
 
@@ -156,15 +140,9 @@ def boards(records: Sequence[Record]) -> list[Board]:
     """Sort records into boards: no table mixes split digests, protocols or limits."""
     groups: dict[tuple[str, int, object], list[Record]] = {}
     for record in records:
-        key = record.split_digest, record.protocol, record.provenance.get("limit")
+        key = record.split_digest, record.protocol, record.limit
         groups.setdefault(key, []).append(record)
     return [Board(group) for group in groups.values()]
-
-
-def entry_of(record: Record) -> Entry:
-    """Return the row that a record belongs to."""
-    overrides = record.provenance.get("overrides", {})
-    return Entry(record.detector, record.horizon, json.dumps(overrides, sort_keys=True))
 
 
 def contribution(record: Record, metric: str) -> Contribution:

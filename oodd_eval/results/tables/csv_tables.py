@@ -8,11 +8,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from oodd_eval.data.facts import GROUPS
-from oodd_eval.results.tables.board import Entry, Value
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.tables.board import Value
 from oodd_eval.results.tables.standings import METRIC, RankedBoard
 
 
-def ranking(ranks: RankedBoard, trust: Mapping[Entry, str]) -> str:
+def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     """Return one line per row: place, cost, and every metric over all cells with its interval.
 
     Parameters
@@ -44,7 +45,7 @@ def ranking(ranks: RankedBoard, trust: Mapping[Entry, str]) -> str:
                 one.state,
                 entry.detector,
                 str(entry.horizon),
-                entry.overrides,
+                entry.overrides_json,
                 str(one.trivial).lower(),
                 str(one.seeds),
                 one.inputs,
@@ -69,7 +70,7 @@ def cells(ranks: RankedBoard) -> str:
                 [
                     one.entry.detector,
                     str(one.entry.horizon),
-                    one.entry.overrides,
+                    one.entry.overrides_json,
                     str(r.seed),
                     r.environment,
                     r.group,

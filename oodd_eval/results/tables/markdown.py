@@ -55,7 +55,7 @@ def _board(board: Board, *, intervals: bool) -> str:
         parts.append(table(alarms))
     parts += [table(tables.by_anomaly(board, e, intervals=intervals)) for e in board.entries]
     if failures := board.failures():
-        rows = [[r.environment, r.cell.partition("::")[2], r.status, r.reason] for r in failures]
+        rows = [[r.environment, r.label, r.status, r.reason] for r in failures]
         header = ["environment", "detector", "state", "reason"]
         parts.append(table(Table("Failures", header, rows, labels=4)))
     parts += [f"- {escape(line)}" for line in tables.notes(board)]

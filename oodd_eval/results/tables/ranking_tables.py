@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from typing import Final
 
 from oodd_eval.data.facts import GROUPS
 from oodd_eval.metrics.auc import POOLED
-from oodd_eval.results.tables.board import Board, Entry
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.standings import METRIC, RankedBoard, Standing
 from oodd_eval.results.tables.tables import TITLES, UNDEFINED, Table, show_value
 
@@ -29,7 +29,7 @@ ALARMS: Final = {
 false-alarm rate that was achieved."""
 
 
-def ranking(ranks: RankedBoard, trust: Mapping[Entry, str]) -> Table:
+def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     """Return ranks by matched AUC, with what a reader needs to judge them.
 
     Parameters
@@ -110,7 +110,7 @@ def wins(ranks: RankedBoard) -> Table | None:
 
 def notes(ranks: RankedBoard) -> list[str]:
     """Return what has to stand below a ranking."""
-    lines = [f"Not ranked: {one.entry.label}, {one.state}." for one in ranks.standings if one.state]
+    lines = [f"Not ranked: {str(one.entry)}, {one.state}." for one in ranks.standings if one.state]
     seeds = ranks.board.test_seeds()
     if seeds and seeds[0] < FEW and len(ranks.ranking.ranks) > 1:
         lines.append(
@@ -139,7 +139,7 @@ def detector(one: Standing) -> str:
 
 def settings(one: Standing) -> str:
     """Return horizon, what is not a default, and the number of detector seeds where several."""
-    overrides = [f"{k}={v}" for k, v in json.loads(one.entry.overrides).items()]
+    overrides = [f"{k}={v}" for k, v in one.entry.overrides.items()]
     several = [f"{one.seeds} seeds"] if one.seeds > 1 else []
     return ", ".join([f"Δ={one.entry.horizon}", *overrides, *several])
 

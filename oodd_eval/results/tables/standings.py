@@ -11,8 +11,9 @@ from typing import Final
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.ranking import Cell, Ranking, Row, rank, win_rates
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import Board, Entry, contribution, entry_of
+from oodd_eval.results.tables.board import Board, contribution
 
 METRIC: Final = "auc_matched"
 """The metric that ranks."""
@@ -63,7 +64,7 @@ class Standing:
         Of its fits.
     """
 
-    entry: Entry
+    entry: Setting
     records: list[Record]
     trivial: bool
     rank: int | None
@@ -116,10 +117,10 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
     ResultsError
         When complete rows differ in their numbers of test trajectories, or two rows have one name.
     """
-    by_row: dict[Entry, list[Record]] = {}
+    by_row: dict[Setting, list[Record]] = {}
     for record in sorted(records, key=_order):
-        by_row.setdefault(entry_of(record), []).append(record)
-    labels = Counter(entry.label for entry in by_row)
+        by_row.setdefault(record.setting, []).append(record)
+    labels = Counter(str(entry) for entry in by_row)
     if twice := [label for label, n in labels.items() if n > 1]:
         raise ResultsError(
             f"two rows of a board are both called {twice[0]!r}, expected names and settings that "
@@ -127,21 +128,21 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
         )
     cells = {(r.environment, r.anomaly) for r in records}
     states = {entry: _state(own, len(cells)) for entry, own in by_row.items()}
-    rows = {e.label: _row(own) for e, own in by_row.items() if not states[e]}
+    rows = {str(e): _row(own) for e, own in by_row.items() if not states[e]}
     ranking = rank(rows)
     rates = win_rates({label: _means(rows[label]) for label in ranking.ranks})
     place = {label: i for i, label in enumerate(ranking.ranks)}
-    order = sorted(by_row, key=lambda e: (place.get(e.label, len(place)), _text(e)))
+    order = sorted(by_row, key=lambda e: (place.get(str(e), len(place)), _text(e)))
     board = Board([record for entry in order for record in by_row[entry]])
     standings = [
         Standing(
             entry=entry,
             records=by_row[entry],
             trivial=board.is_trivial(entry),
-            rank=ranking.ranks.get(entry.label),
-            ties=ranking.letters(entry.label),
+            rank=ranking.ranks.get(str(entry)),
+            ties=ranking.letters(str(entry)),
             state=states[entry],
-            wins=mean(rate for (one, _), rate in rates.items() if one == entry.label),
+            wins=mean(rate for (one, _), rate in rates.items() if one == str(entry)),
             inputs=_inputs(by_row[entry]),
             cost=cost_of(by_row[entry]),
         )
@@ -153,7 +154,7 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
 def cost_of(records: Iterable[Record]) -> Cost:
     """Return what the fits behind some records cost; records of one fit share its cost."""
     fits = list({(r.environment, r.seed): r for r in records if r.ok}.values())
-    timed = [(r.seconds_score, r.provenance.get("steps_scored")) for r in fits]
+    timed = [(r.seconds_score, r.steps_scored) for r in fits]
     steps = [(s, n) for s, n in timed if isinstance(n, int) and n > 0 and not math.isnan(s)]
     seconds = math.fsum(s for s, _ in steps)
     peaks = [r.peak_rss_mb for r in fits if not math.isnan(r.peak_rss_mb)]
@@ -200,13 +201,13 @@ def _value(record: Record) -> float:
 
 
 def _inputs(records: Iterable[Record]) -> str:
-    named = dict.fromkeys(r.provenance.get("inputs") for r in records)
+    named = dict.fromkeys(r.inputs for r in records)
     return next((name for name in named if isinstance(name, str)), "")
 
 
 def _order(record: Record) -> tuple[tuple[str, int, str], int, str, str]:
-    return _text(entry_of(record)), record.seed, record.environment, record.anomaly
+    return _text(record.setting), record.seed, record.environment, record.anomaly
 
 
-def _text(entry: Entry) -> tuple[str, int, str]:
-    return entry.detector, entry.horizon, entry.overrides
+def _text(entry: Setting) -> tuple[str, int, str]:
+    return entry.detector, entry.horizon, entry.overrides_json

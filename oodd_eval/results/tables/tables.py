@@ -9,7 +9,8 @@ from typing import Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
 from oodd_eval.metrics.auc import METRICS, POOLED
-from oodd_eval.results.tables.board import Board, Entry, Value
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.tables.board import Board, Value
 
 PERCENT: Final = frozenset({"auc", "auc_null", "auc_matched", "auc_placebo", *POOLED})
 """Metrics that are printed in percent, AUCs as the paper does."""
@@ -94,10 +95,10 @@ def ranking(board: Board, *, intervals: bool = False) -> Table:
     metric = "auc_matched"
     everywhere = board.environments, board.anomalies
 
-    def mean(entry: Entry, environments: Sequence[str], anomalies: Sequence[str]) -> Value:
+    def mean(entry: Setting, environments: Sequence[str], anomalies: Sequence[str]) -> Value:
         return board.mean(entry, environments, anomalies, metric, intervals=intervals)
 
-    def order(entry: Entry) -> float:
+    def order(entry: Setting) -> float:
         value = mean(entry, *everywhere).value
         return math.inf if math.isnan(value) else -value
 
@@ -105,7 +106,7 @@ def ranking(board: Board, *, intervals: bool = False) -> Table:
     header = ["detector", "mean", *groups, *board.environments]
     rows = [
         [
-            entry.label,
+            str(entry),
             show_value(mean(entry, *everywhere), metric),
             *(show_value(mean(entry, board.environments, board.in_group(g)), metric)
               for g in groups),
@@ -128,7 +129,7 @@ def anomaly_groups(
     groups = [g for g in groups if board.in_group(g)]
     header = ["Environment", "Result"]
     for group in groups:
-        short = [e.label.replace(f"h={horizon},", "").replace(f"[h={horizon}]", "")
+        short = [str(e).replace(f"h={horizon},", "").replace(f"[h={horizon}]", "")
                  for e in entries]  # fmt: skip
         header += [f"{group}: {label}" if len(groups) > 1 else label for label in [*short, "AVG"]]
     rows = []
@@ -177,7 +178,7 @@ def calibrated(board: Board, *, intervals: bool = False) -> Table | None:
 
 
 def by_anomaly(
-    board: Board, entry: Entry, metric: str = "auc_matched", *, intervals: bool = False
+    board: Board, entry: Setting, metric: str = "auc_matched", *, intervals: bool = False
 ) -> Table:
     """Return one detector's metric by environment and anomaly."""
     rows = [
@@ -189,7 +190,7 @@ def by_anomaly(
         for environment in board.environments
     ]  # fmt: skip
     unit = " (%)" if metric in PERCENT else ""
-    title = f"{entry.label}: {_title(metric)}{unit} by anomaly"
+    title = f"{str(entry)}: {_title(metric)}{unit} by anomaly"
     return Table(title, ["Environment", *(ANOMALIES[a].id for a in board.anomalies)], rows)
 
 
@@ -211,7 +212,7 @@ def findings(board: Board) -> list[str]:
                 theirs, own, cells = board.compare(simple, entry, metric)
                 if theirs > own:
                     sentences.append(
-                        f"{simple.label} beats {entry.label} in mean {TITLES[metric]}: "
+                        f"{str(simple)} beats {str(entry)} in mean {TITLES[metric]}: "
                         f"{number(theirs, metric)} against {number(own, metric)} over {cells} "
                         f"cell{'s' if cells != 1 else ''}."
                     )
@@ -240,7 +241,7 @@ def notes(board: Board) -> list[str]:
 def _by_metric(board: Board, names: Sequence[str], title: str, *, intervals: bool) -> Table:
     everywhere = board.environments, board.anomalies
     rows = [
-        [entry.label]
+        [str(entry)]
         + [show_value(board.mean(entry, *everywhere, n, intervals=intervals), n) for n in names]
         for entry in board.entries
     ]

@@ -1,0 +1,176 @@
+"""Files that are whole or absent: atomic replacement, a lock per directory, gzip within bounds.
+
+Every room writes through this module, so that a killed process never leaves half a file under its
+final name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import os
+import re
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from oodd_eval.errors import OutputError, ResultsError
+
+GZIP: Final = ".gz"
+"""Ending of compressed files."""
+
+COMPRESSED_FROM: Final = 10**6
+"""Bytes beyond which `compress_large` compresses; smaller files stay readable in a pull request."""
+
+MAX_BYTES: Final = 64 * 10**6
+"""Most bytes that a compressed file may decompress to, unless the caller says otherwise."""
+
+_TEMPORARY: Final = re.compile(r"\..+\.(\d+)")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; move it there when the block ends without an error.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{str(path)!r} cannot be written: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file in one step, see `replacing`."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text with line feeds in one step, see `replacing`."""
+    write_bytes(path, text.encode())
+
+
+def remove_abandoned(directory: Path) -> None:
+    """Remove temporary files of `replacing` whose process has ended."""
+    for file in directory.glob(".*"):
+        found = _TEMPORARY.fullmatch(file.name)
+        if found and not process_exists(int(found[1])):
+            file.unlink(missing_ok=True)
+
+
+def process_exists(pid: int) -> bool:
+    """Tell whether a process with this id runs, whoever owns it."""
+    with contextlib.suppress(PermissionError):
+        try:
+            os.kill(pid, 0)
+        except (ProcessLookupError, OverflowError):
+            return False
+    return True
+
+
+@contextlib.contextmanager
+def lock(directory: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Hold an exclusive lock on a directory while the block runs.
+
+    Parameters
+    ----------
+    directory
+        An existing directory; nothing is written into it.
+    wait
+        Whether to wait for another holder. If not, the block runs without the lock.
+
+    Yields
+    ------
+    bool
+        Whether the lock is held. A file system without locks counts as held: two writers at a
+        time are not supported there.
+    """
+    import fcntl  # noqa: PLC0415  POSIX only
+
+    descriptor = os.open(directory, os.O_RDONLY)
+    held = True
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            held = False
+        except OSError:
+            held = True
+        yield held
+    finally:
+        os.close(descriptor)
+
+
+def compress(content: bytes) -> bytes:
+    """Compress with gzip: the same bytes for the same content, without name and time."""
+    return gzip.compress(content, 9, mtime=0)
+
+
+def decompress(content: bytes, most: int = MAX_BYTES) -> bytes:
+    """Undo `compress`, never holding more than `most` bytes.
+
+    Raises
+    ------
+    ResultsError
+        When the content is damaged, cut off, followed by something else, or larger than `most`.
+
+    Examples
+    --------
+    >>> decompress(compress(b"one record"))
+    b'one record'
+    """
+    decompressor = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+    try:
+        plain = decompressor.decompress(content, most + 1)
+    except zlib.error as error:
+        raise ResultsError(f"is damaged or not compressed by gzip: {error}") from None
+    if len(plain) > most:
+        raise ResultsError(f"decompresses to more than {most} bytes")
+    if not decompressor.eof:
+        raise ResultsError("is compressed by gzip, but cut off")
+    if decompressor.unused_data:
+        raise ResultsError("has something behind its compressed content")
+    return plain
+
+
+def compress_large(path: Path) -> Path:
+    """Compress a large file into ``NAME.gz`` and return the path that the content has then."""
+    if path.stat().st_size <= COMPRESSED_FROM:
+        return path
+    target = path.with_name(path.name + GZIP)
+    write_bytes(target, compress(path.read_bytes()))
+    path.unlink()
+    return target
+
+
+def find_file(path: Path) -> Path | None:
+    """Return the file or its compressed form, whichever exists."""
+    return next((p for p in (path, path.with_name(path.name + GZIP)) if p.is_file()), None)
+
+
+def read_text(path: Path, most: int = MAX_BYTES) -> str:
+    """Read UTF-8 text, decompressed if the name ends in ``.gz``.
+
+    Raises
+    ------
+    OSError, UnicodeDecodeError
+        As for a plain file.
+    ResultsError
+        When the content cannot be decompressed.
+    """
+    if path.suffix != GZIP:
+        return path.read_text(encoding="utf-8")
+    try:
+        return decompress(path.read_bytes(), most).decode()
+    except ResultsError as error:
+        raise ResultsError(f"{str(path)!r} {error}") from None

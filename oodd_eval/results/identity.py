@@ -1,0 +1,181 @@
+"""The identity of results: which detector setting was evaluated, and on which cell.
+
+A `Setting` is a row of a board. A `Cell` is one evaluation: split x environment x anomaly x setting
+x seed. Both are written and read as text here and nowhere else. The device that computed a result
+is no part of its identity.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from oodd_eval.errors import UsageError
+
+# A text value that needs quotes: it would be read as JSON, or holds what separates values.
+_QUOTED = re.compile(r"[\[\]{},=\"\s]|^$")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A detector with its horizon and the parameters that are not at their default.
+
+    Parameters
+    ----------
+    detector
+        Name of the detector.
+    horizon
+        Prediction horizon in steps.
+    parameters
+        The parameters that differ from their default, sorted by name; values are JSON texts, so
+        that settings can be dictionary keys.
+
+    Examples
+    --------
+    >>> str(Setting.of("riqn", 5, {"updates": 2400}))
+    'riqn[h=5,updates=2400]'
+    >>> str(Setting("rf"))
+    'rf'
+    """
+
+    detector: str
+    horizon: int = 1
+    parameters: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(
+        cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
+    ) -> Setting:
+        """Make a setting from a mapping of the parameters that are not at their default."""
+        given = overrides or {}
+        texts = ((k, json.dumps(given[k], sort_keys=True, default=str)) for k in sorted(given))
+        return cls(detector, horizon, tuple(texts))
+
+    @property
+    def overrides_json(self) -> str:
+        """The parameters that are not at their default, as one JSON object."""
+        return json.dumps(self.overrides, sort_keys=True)
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """The parameters that are not at their default, by name."""
+        return {name: json.loads(text) for name, text in self.parameters}
+
+    def __str__(self) -> str:
+        """Return the detector's name with all that is not a default."""
+        horizon = {"h": self.horizon} if self.horizon != 1 else {}
+        return _bracketed(self.detector, horizon | self.overrides)
+
+    def label(self, seed: int) -> str:
+        """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
+        return _bracketed(self.detector, {"h": self.horizon, "seed": seed, **self.overrides})
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One evaluation.
+
+    Parameters
+    ----------
+    split, environment, anomaly
+        Names. A split that is not the published one carries the start of its digest: ``mini@0a1b``.
+    setting
+        The detector.
+    seed
+        Seed of the detector.
+    strength
+        Strength of the anomaly where the suite has several, else empty.
+
+    Examples
+    --------
+    >>> cell = Cell("mini", "hopper", "iid", Setting("riqn"), seed=0)
+    >>> str(cell)
+    'mini/hopper/iid::riqn[h=1,seed=0]'
+    >>> Cell.parse(str(cell)) == cell
+    True
+    """
+
+    split: str
+    environment: str
+    anomaly: str
+    setting: Setting
+    seed: int = 0
+    strength: str = ""
+
+    def __str__(self) -> str:
+        """Return the text that is printed and that ``-k`` matches."""
+        strength = f"@{self.strength}" if self.strength else ""
+        place = f"{self.split}/{self.environment}/{self.anomaly}{strength}"
+        return f"{place}::{self.label}"
+
+    @property
+    def label(self) -> str:
+        """Setting and seed, such as ``riqn[h=1,seed=0]``."""
+        return self.setting.label(self.seed)
+
+    def on(self, environment: str, anomaly: str) -> Cell:
+        """Return the same setting and seed on another environment and anomaly."""
+        return replace(self, environment=environment, anomaly=anomaly)
+
+    @classmethod
+    def parse(cls, text: str) -> Cell:
+        """Read what `str` writes.
+
+        Raises
+        ------
+        UsageError
+            When the text has another form.
+        """
+        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+)(?:@([^/:]+))?::([^\[]+)\[(.*)\]", text)
+        settings = _read_settings(match[6]) if match else None
+        if match is None or settings is None or not {"h", "seed"} <= settings.keys():
+            raise UsageError(
+                f"{text!r} is no cell: expected SPLIT/ENVIRONMENT/ANOMALY::DETECTOR[h=N,seed=N]"
+            )
+        split, environment, anomaly, strength, detector, _ = match.groups()
+        horizon, seed = settings.pop("h"), settings.pop("seed")
+        setting = Setting.of(detector, horizon, settings)
+        return cls(split, environment, anomaly, setting, seed, strength or "")
+
+
+def _bracketed(detector: str, settings: Mapping[str, Any]) -> str:
+    shown = ",".join(f"{name}={_shown(value)}" for name, value in settings.items())
+    return f"{detector}[{shown}]" if shown else detector
+
+
+def _shown(value: Any) -> str:
+    """Return a value as JSON, or a plain text without quotes where that reads back as the same."""
+    if isinstance(value, str) and not _QUOTED.search(value) and _read(value) == value:
+        return value
+    return json.dumps(value, default=str)
+
+
+def _read(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _read_settings(text: str) -> dict[str, Any] | None:
+    """Return names and values of a list ``a=1,b="x,y",c=[1,2]``; None when it is none."""
+    settings: dict[str, Any] = {}
+    decoder = json.JSONDecoder()
+    position = 0
+    while position < len(text):
+        name, equals, rest = text[position:].partition("=")
+        if not equals:
+            return None
+        plain, _, _ = rest.partition(",")
+        end = len(plain)
+        settings[name] = _read(plain)
+        if rest[:1] in '["{':
+            try:
+                settings[name], end = decoder.raw_decode(rest)
+            except json.JSONDecodeError:
+                return None
+        position += len(name) + 1 + end + 1
+    return settings
