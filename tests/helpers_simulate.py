@@ -30,3 +30,12 @@ class Reflex:
         joints = row[8 : 8 + 2 * self._joints].astype(np.float64)
         push = np.tanh(-joints[::2] - 0.1 * joints[1::2])
         return (_GAIN[self.environment] * push).astype(np.float32)
+
+
+def record(environment, anomaly, seed, *, policy, episode_cap=None):
+    """Record one episode: nominal, or with an anomaly from a random onset on."""
+    from oodd_eval.data.simulate.record import record_seed
+
+    names = [] if anomaly is None else [anomaly]
+    options = {"policy": policy, "episode_cap": episode_cap}
+    return record_seed(environment, seed, names, **options)[anomaly]

@@ -5,20 +5,15 @@ sensor anomalies add an offset to one sensor, dynamics anomalies make the noise 
 Nothing is simulated, so a split takes milliseconds.
 """
 
-import dataclasses
-
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.layout import (
-    SCHEMA,
-    TWINS,
-    environment_digest,
     pack_parameters,
-    split_digest,
     write_environment,
     write_manifest,
 )
+from oodd_eval.data.parts import TWINS
 
 
 def sensors(noise, actions, onset=None, anomaly=None):
@@ -90,25 +85,8 @@ def make_split(
         groups[TWINS] = make_group(environment, seeds["test"], length)
         for anomaly in ANOMALIES:
             groups[f"test/{anomaly}"] = make_group(environment, seeds["test"], length, anomaly)
-        facts = write_environment(directory / f"{environment}.h5", groups)
-        entries[environment] = {
-            "file": f"{environment}.h5",
-            "policy": "0" * 64,
-            "digest": environment_digest({g: f["sha256"] for g, f in facts.items()}),
-            "groups": facts,
-        }
-    recipe = dataclasses.asdict(definition)
-    digests = {e: entry["digest"] for e, entry in entries.items()}
-    write_manifest(
-        directory,
-        {
-            "schema": SCHEMA,
-            "name": name,
-            "definition": recipe,
-            "generator": 1,
-            "environments": entries,
-            "digest": split_digest(digests, recipe),
-            "versions": {},
-        },
-    )
+        entries[environment] = write_environment(
+            directory / f"{environment}.h5", groups.items(), "0" * 64
+        )
+    write_manifest(directory, definition, entries, generator=1, versions={})
     return directory

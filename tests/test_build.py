@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
+from oodd_training.freeze import freeze_policy
+
 from oodd_eval.data.facts import SplitDefinition
 from oodd_eval.data.simulate import build
 from oodd_eval.data.simulate.build import Chunk, build_split
-from oodd_eval.data.simulate.policies import FROZEN, freeze_policy, load_policy
+from oodd_eval.data.simulate.policies import FROZEN, load_policy
 from oodd_eval.data.simulate.record import TwinTooShortError, record_seed
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.simulate.anomalies import VARYING_SENSORS, Draw, draw
+from oodd_eval.data.simulate.anomalies import VALUES, Draw, draw
 from oodd_eval.data.simulate.environments import make
 from oodd_eval.errors import UnknownNameError
 
@@ -70,7 +70,7 @@ def test_sensors_are_a_fifth_of_all_from_the_list_each_in_its_turn(draws):
     for anomaly in ("iid", "shutdown", "calibration", "drift"):
         chosen = [d.parameters["sensors"] for d in found[anomaly]]
         assert {len(set(c)) for c in chosen} == {CHOSEN[environment]}
-        assert {s for c in chosen for s in c} == set(VARYING_SENSORS[environment])
+        assert {s for c in chosen for s in c} == set(VALUES["varying_sensors"][environment])
 
 
 def test_drawn_attributes_span_their_range_and_keep_2_percent_off_nominal(draws):

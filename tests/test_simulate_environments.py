@@ -9,7 +9,7 @@ from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from helpers_simulate import SEEDS, Reflex
 
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.anomalies import COMPONENTS, VARYING_SENSORS
+from oodd_eval.data.simulate.anomalies import VALUES
 from oodd_eval.data.simulate.environments import _Acrobot, make
 from oodd_eval.data.simulate.record import record_nominal
 from oodd_eval.data.split import load_split
@@ -68,7 +68,7 @@ def test_attributes_read_back_what_is_in_force_and_change_what_follows(environme
 
 
 def test_every_component_of_the_anomaly_table_has_a_nominal_value_here():
-    listed = {(e, a) for e, attributes in COMPONENTS.items() for a in attributes}
+    listed = {(e, a) for e, attributes in VALUES["components"].items() for a in attributes}
     assert {(e, a) for e, a in NOMINAL if a != "gravity"} == listed
 
 
@@ -265,12 +265,12 @@ def test_listed_sensors_are_those_that_vary_in_nominal_operation(environment):
     )
     # Bullet's angle to the target is constant up to rounding only.
     share = (np.abs(rows - np.median(rows, axis=0)) > 1e-6).mean(axis=0)
-    assert tuple(np.flatnonzero(share >= 0.01)) == VARYING_SENSORS[environment]
+    assert np.flatnonzero(share >= 0.01).tolist() == VALUES["varying_sensors"][environment]
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_sensor_lists_are_sorted_and_within_the_observation(environment):
-    listed = VARYING_SENSORS[environment]
+    listed = VALUES["varying_sensors"][environment]
     assert list(listed) == sorted(set(listed))
     assert set(listed) <= set(range(ENVIRONMENTS[environment].observation_dim))
 

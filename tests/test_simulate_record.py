@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_simulate import SEEDS, Reflex
+from helpers_simulate import SEEDS, Reflex, record
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.simulate import record as recording
 from oodd_eval.data.simulate.anomalies import Draw
-from oodd_eval.data.simulate.record import TwinTooShortError, record, record_nominal, record_seed
+from oodd_eval.data.simulate.record import TwinTooShortError, record_nominal, record_seed
 from oodd_eval.errors import SimulationError, UnknownNameError
 
 CAP = 120
@@ -108,9 +108,8 @@ def test_one_episode_alone_equals_the_one_recorded_among_others(episodes):
 CHILD = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from helpers_simulate import SEEDS, Reflex
+from helpers_simulate import SEEDS, Reflex, record
 from test_simulate_record import CAP, digest
-from oodd_eval.data.simulate.record import record
 for environment in ("hopper", "lunarlander", "acrobot"):  # another order than the table's
     for anomaly in ("wind-r2l", "gravity"):
         e = record(environment, anomaly, SEEDS[environment], policy=Reflex(environment),

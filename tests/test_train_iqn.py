@@ -2,12 +2,22 @@
 
 import numpy as np
 import pytest
+from oodd_training.replay import Replay
 
 from oodd_eval.data.simulate.policies import IQNPolicy
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-iqn = pytest.importorskip("oodd_eval.data.simulate.train.iqn")
+iqn = pytest.importorskip("oodd_training.iqn")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Several threads would wait for one another while other tests run."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def test_quantile_huber_by_hand():
@@ -63,16 +73,13 @@ class Counting:
 
 def transitions(monkeypatch, length, steps):
     monkeypatch.setattr(iqn, "make", lambda environment: Counting(length))
-    replay = iqn._Replay(1000, 4)
+    replay = Replay(1000, 2 * 4 + 3)
     p = {"n_step": 3, "discount": 0.5, "reward_scale": 1.0, "exploration_hold": 1}
     actor = iqn._Actor("cartpole", 0, replay, p)
     for t in range(steps):
         actor.step(t % 2)
-    return [
-        (int(replay.rows[i, 0]), int(replay.actions[i]), float(replay.rewards[i]),
-         int(replay.next_rows[i, 0]), float(replay.discounts[i]))
-        for i in range(replay.count)
-    ]  # fmt: skip
+    rows = replay.rows[: replay.count].tolist()
+    return [(row[0], row[8], row[9], row[4], row[10]) for row in rows]
 
 
 def test_n_step_transitions_of_an_episode_that_terminates(monkeypatch):
@@ -98,19 +105,19 @@ def test_transitions_do_not_reach_into_the_next_episode(monkeypatch):
 
 
 def test_the_replay_overwrites_the_oldest():
-    replay = iqn._Replay(3, 1)
+    replay = Replay(3, 2)
     for i in range(5):
-        replay.add(np.array([i], "f4"), 0, float(i), np.array([i], "f4"), 1.0)
-    assert sorted(replay.rewards.tolist()) == [2.0, 3.0, 4.0]
-    rewards = replay.sample(200, np.random.default_rng(0))[2]
-    assert set(rewards.tolist()) == {2.0, 3.0, 4.0}
+        replay.add(np.array([i], "f4"), [2.0])
+    assert sorted(replay.rows[:, 0].tolist()) == [2.0, 3.0, 4.0]
+    picked = replay.sample(200, np.random.default_rng(0))
+    assert set(picked[:, 0].tolist()) == {2.0, 3.0, 4.0}
 
 
 @pytest.mark.parametrize("hold", [1, 6])
 def test_random_actions_take_up_their_share_of_the_steps(monkeypatch, hold):
     monkeypatch.setattr(iqn, "make", lambda environment: Counting(10))
     p = {"n_step": 1, "discount": 1.0, "reward_scale": 1.0, "exploration_hold": hold}
-    actor = iqn._Actor("cartpole", 0, iqn._Replay(1, 4), p)
+    actor = iqn._Actor("cartpole", 0, Replay(1, 11), p)
     rng = np.random.default_rng(0)
     drawn = np.array([actor.explore(-1, 0.4, rng) for _ in range(20_000)])
     assert (drawn >= 0).mean() == pytest.approx(0.4, abs=0.03)
@@ -119,17 +126,21 @@ def test_random_actions_take_up_their_share_of_the_steps(monkeypatch, hold):
 def test_updates_learn_the_quantiles_of_a_return_and_the_value_behind_it():
     # Action 0 ends with a return of -1 or 1, action 1 leads to the same choice again at 0.5 of it.
     torch.manual_seed(5)
-    online, target = iqn.Network(1, 2, 32, 16), iqn.Network(1, 2, 32, 16)
-    optimiser = torch.optim.Adam(online.parameters(), lr=3e-3)
+    learner = iqn.IQN("cartpole")
+    learner.hyper_parameters["target_rate"] = 0.05
+    learner.online, learner.target = online, _ = (
+        iqn.Network(1, 2, 32, 16),
+        iqn.Network(1, 2, 32, 16),
+    )
+    learner.optimiser = torch.optim.Adam(online.parameters(), lr=3e-3)
     rng = np.random.default_rng(5)
-    p = iqn.HYPER_PARAMETERS | {"target_rate": 0.05}
     for _ in range(1000):
         actions = torch.from_numpy(rng.integers(0, 2, 64))
         coin = torch.from_numpy(rng.choice([-1.0, 3.0], 64).astype("f4"))
         ends = actions == 0
         rows = torch.ones(64, 1)
-        batch = rows, actions, coin * ends, rows, 0.5 * (~ends).float()
-        iqn._update(online, target, optimiser, batch, p)
+        columns = actions, coin * ends, 0.5 * (~ends).float()
+        learner.update(torch.cat([rows, rows, torch.stack(columns, 1)], 1))
     with torch.no_grad():
         levels = ((2 * torch.arange(32) + 1) / 64)[None]
         found = online(torch.ones(1, 1), levels)[0]

@@ -1,6 +1,7 @@
 """TD3: gradients and updates against second formulas written out in numpy."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,17 @@ from oodd_eval.data.simulate.policies import TD3Policy
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-td3 = pytest.importorskip("oodd_eval.data.simulate.train.td3")
+td3 = pytest.importorskip("oodd_training.td3")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Several threads would wait for one another while other tests run."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
 
 OBSERVATIONS, ACTIONS, BATCH = 4, 2, 6
 
@@ -17,8 +28,10 @@ OBSERVATIONS, ACTIONS, BATCH = 4, 2, 6
 @pytest.fixture
 def learner(monkeypatch):
     monkeypatch.setitem(td3.HYPER_PARAMETERS, "layers", [7, 5])
+    tiny = SimpleNamespace(observation_dim=OBSERVATIONS, action_dim=ACTIONS)
+    monkeypatch.setattr(td3, "ENVIRONMENTS", {"tiny": tiny})
     torch.manual_seed(3)
-    return td3.Learner(OBSERVATIONS, ACTIONS)
+    return td3.TD3("tiny")
 
 
 @pytest.fixture
@@ -142,7 +155,7 @@ def test_the_actor_and_the_policy_file_agree(learner):
 
 def test_a_state_restores_networks_and_optimisers(learner, batch):
     learner.update(batch, policy_too=True)
-    other = td3.Learner(OBSERVATIONS, ACTIONS)
+    other = td3.TD3("tiny")
     other.load(copy.deepcopy(learner.state()))
     for one in (learner, other):
         torch.manual_seed(4)

@@ -1,14 +1,17 @@
 """Facts of the benchmark: environments, anomalies, split definitions and protocol version.
 
-Names only, no simulator and no data: `list`, the runner, the reports and the recorder all read
-them here. Values of the paper are from Danesh & Fern (2021), Tables 1 and 2.
+The module needs neither simulators nor data. Values of the paper are from Danesh & Fern (2021).
 """
 
 from __future__ import annotations
 
+import functools
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 PROTOCOL: Final = 1
 """Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
@@ -18,24 +21,12 @@ Group = Literal["sensor", "dynamics"]
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentInfo:
-    """One environment of the benchmark.
+    """One environment of the benchmark; actions are discrete in the family ``"classic"``.
 
-    Attributes
-    ----------
-    id, title
-        The name on the command line and the paper's name.
-    simulator
-        Gymnasium id.
-    family
-        ``"classic"`` (discrete actions) or ``"bullet"`` (continuous actions).
-    observation_dim, action_dim
-        D and A; a discrete action is a one-hot row, so A is then the number of actions.
-    policy
-        Algorithm of the nominal policy.
-    paper_return
-        Mean nominal return in the paper's Table 2.
-    episode_cap
-        Longest episode, in transitions.
+    `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A discrete action is a
+    one-hot row, so `action_dim` is then their number. `policy` is the algorithm of the nominal
+    policy, `paper_return` its mean return in the paper's Table 2, `episode_cap` the longest
+    episode in transitions.
     """
 
     id: str
@@ -50,7 +41,7 @@ class EnvironmentInfo:
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are discrete."""
+        """True when actions are discrete."""
         return self.family == "classic"
 
 
@@ -66,7 +57,7 @@ class AnomalyInfo:
 
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
-    """The recipe of a split: parts in trajectories, episode cap in transitions, seed base.
+    """The recipe of a split: trajectories of each part, longest episode, seeds.
 
     `episode_cap` None means the simulator's own limit. Trajectory seeds are
     ``seed_base * 10**6 + offset of the part + index``.
@@ -80,69 +71,59 @@ class SplitDefinition:
     seed_base: int
 
 
-ENVIRONMENTS: Final = MappingProxyType(
-    {
-        e.id: e
-        for e in (
-            EnvironmentInfo("acrobot", "Acrobot", "Acrobot-v1", "classic", 6, 3, "IQN", -78.7, 500),
-            EnvironmentInfo(
-                "cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500
-            ),
-            EnvironmentInfo(
-                "lunarlander", "LunarLander", "LunarLander-v3", "classic", 8, 4, "IQN", 213.5, 1000
-            ),
-            EnvironmentInfo("ant", "Ant", "AntBulletEnv-v0", "bullet", 28, 8, "TD3", 3297.2, 1000),
-            EnvironmentInfo(
-                "halfcheetah", "HalfCheetah", "HalfCheetahBulletEnv-v0", "bullet",
-                26, 6, "TD3", 2820.9, 1000,
-            ),
-            EnvironmentInfo(
-                "hopper", "Hopper", "HopperBulletEnv-v0", "bullet", 15, 3, "TD3", 2678.0, 1000
-            ),
-            EnvironmentInfo(
-                "walker2d", "Walker2D", "Walker2DBulletEnv-v0", "bullet",
-                22, 6, "TD3", 2240.8, 1000,
-            ),
-        )
-    }
+_Row = TypeVar("_Row", EnvironmentInfo, AnomalyInfo, SplitDefinition)
+
+
+def _by_id(*rows: _Row) -> Mapping[str, _Row]:
+    return MappingProxyType({r.name if isinstance(r, SplitDefinition) else r.id: r for r in rows})
+
+
+ENVIRONMENTS: Final = _by_id(
+    EnvironmentInfo("acrobot", "Acrobot", "Acrobot-v1", "classic", 6, 3, "IQN", -78.7, 500),
+    EnvironmentInfo("cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500),
+    EnvironmentInfo("lunarlander", "LunarLander", "LunarLander-v3", "classic", 8, 4,
+                    "IQN", 213.5, 1000),
+    EnvironmentInfo("ant", "Ant", "AntBulletEnv-v0", "bullet", 28, 8, "TD3", 3297.2, 1000),
+    EnvironmentInfo("halfcheetah", "HalfCheetah", "HalfCheetahBulletEnv-v0", "bullet", 26, 6,
+                    "TD3", 2820.9, 1000),
+    EnvironmentInfo("hopper", "Hopper", "HopperBulletEnv-v0", "bullet", 15, 3, "TD3", 2678.0, 1000),
+    EnvironmentInfo("walker2d", "Walker2D", "Walker2DBulletEnv-v0", "bullet", 22, 6,
+                    "TD3", 2240.8, 1000),
 )  # fmt: skip
 """Environments by id, in the order of the paper's tables."""
 
-ANOMALIES: Final = MappingProxyType(
-    {
-        a.id: a
-        for a in (
-            AnomalyInfo("iid", "IID", "sensor", "chosen sensors += fresh Normal(mean, std)"),
-            AnomalyInfo("calibration", "Calibration Failure", "sensor", "chosen sensors *= factor"),
-            AnomalyInfo("drift", "Sensor Drift", "sensor", "chosen sensors += slope * step"),
-            AnomalyInfo("shutdown", "Sensor Shutdown", "sensor", "chosen sensors = 0"),
-            AnomalyInfo("wind-l2r", "L2R", "dynamics", "wind from left to right"),
-            AnomalyInfo("wind-r2l", "R2L", "dynamics", "wind from right to left"),
-            AnomalyInfo("gravity", "Gravity", "dynamics", "another magnitude of gravity"),
-            AnomalyInfo(
-                "components", "Agent's Components", "dynamics",
-                "other lengths, masses or motor powers",
-            ),
-        )
-    }
-)  # fmt: skip
+ANOMALIES: Final = _by_id(
+    AnomalyInfo("iid", "IID", "sensor", "chosen sensors += fresh Normal(mean, std)"),
+    AnomalyInfo("calibration", "Calibration Failure", "sensor", "chosen sensors *= factor"),
+    AnomalyInfo("drift", "Sensor Drift", "sensor", "chosen sensors += slope * step"),
+    AnomalyInfo("shutdown", "Sensor Shutdown", "sensor", "chosen sensors = 0"),
+    AnomalyInfo("wind-l2r", "L2R", "dynamics", "wind from left to right"),
+    AnomalyInfo("wind-r2l", "R2L", "dynamics", "wind from right to left"),
+    AnomalyInfo("gravity", "Gravity", "dynamics", "another magnitude of gravity"),
+    AnomalyInfo(
+        "components", "Agent's Components", "dynamics", "other lengths, masses or motor powers"
+    ),
+)
 """Anomaly types by id, in the order of the paper's Table 2."""
 
 GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
 
-SPLITS: Final = MappingProxyType(
-    {
-        s.name: s
-        for s in (
-            SplitDefinition("mini", 40, 20, 10, 300, 1),
-            SplitDefinition("standard", 500, 100, 50, None, 2),
-            # The first trajectories of standard: its seed base, the same episodes.
-            SplitDefinition("reduced", 500, 50, 20, None, 2),
-            SplitDefinition("paper", 10_000, 1_000, 1_000, None, 3),
-        )
-    }
+SPLITS: Final = _by_id(
+    SplitDefinition("mini", 40, 20, 10, 300, 1),
+    SplitDefinition("standard", 500, 100, 50, None, 2),
+    # The first trajectories of standard: its seed base, the same episodes.
+    SplitDefinition("reduced", 500, 50, 20, None, 2),
+    SplitDefinition("paper", 10_000, 1_000, 1_000, None, 3),
 )
 """The published splits by name."""
 
 PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
 """Seed offset of each part within the million seeds of a split's base."""
+
+
+@functools.cache
+def paper_tables() -> Mapping[str, Any]:
+    """Return the numbers of the paper's tables, with the names of this module."""
+    file = Path(__file__).with_name("paper_tables.json")
+    tables: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return tables

@@ -1,55 +1,54 @@
 """Fetch a split: bring its files here, verify everything, then put it in its place in one step.
 
-::
-
-    <home>/.fetch/<source>/     files on their way; a fetch that was stopped goes on from here
-    <home>/<name>/              the split, whole and verified
-
-What arrives is compared with the manifest (names, sizes, digests of content), and the manifest with
-the digest that the caller expects, if any.
+Files on their way are in ``<home>/.fetch/<source>/``, where a fetch that was stopped goes on. They
+are compared with the manifest, and the manifest with the digest that the caller expects, if any.
+Names inside an archive are only compared, never used as paths.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import functools
 import hashlib
-import os
+import http.client
 import shutil
+import stat
+import tarfile
+import urllib.error
+import urllib.request
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 from urllib.request import url2pathname
 
 import h5py
 
+from oodd_eval._version import __version__
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.layout import group_names, read_manifest
-from oodd_eval.data.sources import (
-    ARCHIVES,
-    MANIFEST,
-    ArchiveSource,
-    DirectorySource,
-    Source,
-    WebSource,
-    download,
-)
+from oodd_eval.data.files import lock
+from oodd_eval.data.layout import MANIFEST, read_manifest
+from oodd_eval.data.parts import PARTS
 from oodd_eval.data.split import SHIPPED, Split, data_home
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
 
-MOST_MANIFEST: Final = 10**7
+ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
 MOST_ARCHIVE: Final = 10**12
-_SPARE: Final = 2**20
-"""Bytes of a file beside its data, and again as much as these for every group."""
+MOST_MANIFEST: Final = 10**7
+_MIB: Final = 2**20
+_DAMAGED: Final = (EOFError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
 
 Progress = Callable[[str], None]
+Source = Callable[[str, Path, int], None]
+"""Writes a file of the split, by its plain name, to a path, refusing more than some bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """What came of a fetch: the split in its place, and whether it was there before."""
+    """A fetched split in its place; `already` is True if it was there before."""
 
     split: Split
     already: bool = False
@@ -60,51 +59,29 @@ def fetch(
     *,
     output: Path | None = None,
     digest: str | None = None,
-    progress: Progress = lambda _what: None,
+    progress: Progress = lambda _file: None,
 ) -> Fetched:
-    """Fetch a split and install it where splits are found.
+    """Fetch a split and install it in `output`, by default its name below `data_home`.
 
-    Parameters
-    ----------
-    place
-        A split's directory, an archive of one, or an address (http, https, file) of either.
-    output
-        Directory of the split; default its name below `oodd_eval.data.split.data_home`.
-    digest
-        The split's digest, if it is known; anything else is refused.
-    progress
-        Called with the name of each file when it is there and verified.
-
-    Raises
-    ------
-    SplitNotFoundError
-        When there is nothing at the place, or a file is missing there.
-    SplitError
-        When something is not as the manifest says.
-    DigestError
-        When content has another digest than the manifest says, or the manifest than `digest`.
-    UsageError
-        When another split is in the way.
-    OutputError
-        When the split cannot be written.
+    One with another digest than a given one is refused. `progress` is called with the name of each
+    file when it is verified. `SplitError` when something is missing or not as the manifest says,
+    `UsageError` when another split is in the way.
     """
     home = output.parent if output else data_home()
     staging = home / ".fetch" / hashlib.sha256(place.encode()).hexdigest()[:16]
     try:
-        with _alone(staging):
+        staging.mkdir(parents=True, exist_ok=True)
+        with lock(staging, wait=False) as held:
+            if not held:
+                raise OutputError(f"another process is fetching the same into {str(home)!r}; wait")
             try:
-                source = _source(place, staging)
-                try:
+                with _open_source(place, staging / "archive") as source:
                     found = _bring(source, staging, output, digest, progress)
-                except SplitError:
-                    # A whole archive with something wrong in it would be wrong again.
-                    (staging / "archive").unlink(missing_ok=True)
-                    raise
-                finally:
-                    source.close()
                 shutil.rmtree(staging, ignore_errors=True)
             finally:
-                _tidy(staging)
+                # Files beside the manifest are work that a later fetch goes on from.
+                if not any(p.is_file() and p.name != MANIFEST for p in staging.rglob("*")):
+                    shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
         if isinstance(error, SplitError | OutputError):
             raise
@@ -115,109 +92,81 @@ def fetch(
     return found
 
 
-def _tidy(staging: Path) -> None:
-    """Remove a staging directory unless it holds work that a later fetch goes on from."""
-    if not any(path.is_file() and path.name != MANIFEST for path in staging.rglob("*")):
-        shutil.rmtree(staging, ignore_errors=True)
-
-
 def _bring(
     source: Source, staging: Path, output: Path | None, digest: str | None, progress: Progress
 ) -> Fetched:
-    fresh = staging / "split"
+    fresh, incoming = staging / "split", staging / MANIFEST
     fresh.mkdir(exist_ok=True)
-    incoming = staging / MANIFEST
-    incoming.unlink(missing_ok=True)
-    source.fetch(MANIFEST, incoming, MOST_MANIFEST)
+    source(MANIFEST, incoming, MOST_MANIFEST)
     incoming.replace(fresh / MANIFEST)
-    manifest = read_manifest(fresh)
-    _check(manifest)
-    name = str(manifest["name"])
+    split, manifest = Split(fresh), read_manifest(fresh)
+    # Names in the manifest become names of files.
+    name, environments = manifest["name"], manifest["environments"]
+    if not name or not name.isprintable() or set(name) & set("/\\@: ") or name.startswith("."):
+        raise SplitError(f"the manifest names the split {name!r}, which is no name")
+    for environment, entry in environments.items():
+        if environment not in ENVIRONMENTS:
+            raise SplitError(f"the manifest has an unknown environment {environment!r}")
+        file, expected = entry["file"], f"{environment}.h5"
+        if file != expected:
+            raise SplitError(f"it names the file {file!r} for {environment}, expected {expected!r}")
     if digest and manifest["digest"] != digest:
-        raise DigestError(
-            f"split {name!r} there has the digest {manifest['digest']}, expected {digest}"
-        )
+        raise DigestError(f"split {name!r} there has the digest {split.digest}, expected {digest}")
     target = output or data_home() / name
-    if _is_there(name, target, str(manifest["digest"]), by_name=output is None):
-        return Fetched(Split(target if target.exists() else SHIPPED / name), already=True)
-    split = Split(fresh)
-    for environment, entry in manifest["environments"].items():
+    if there := _installed(name, target, split.digest, by_name=output is None):
+        return Fetched(there, already=True)
+    for environment, entry in environments.items():
         _bring_file(source, split, environment, entry, staging)
-        progress(str(entry["file"]))
-    files = {MANIFEST, *(str(e["file"]) for e in manifest["environments"].values())}
+        progress(entry["file"])
+    files = {MANIFEST, *(entry["file"] for entry in environments.values())}
     for stray in (path for path in fresh.iterdir() if path.name not in files):
         stray.unlink()
-    _replace(target, fresh, staging / "replaced")
+    if target.exists():  # a damaged copy
+        shutil.rmtree(staging / "replaced", ignore_errors=True)
+        target.rename(staging / "replaced")
+    fresh.rename(target)
     return Fetched(Split(target))
 
 
-def _check(manifest: dict[str, Any]) -> None:
-    """Raise `SplitError` unless names and numbers of a manifest can be trusted with a disk."""
-    name = manifest["name"]
-    if not isinstance(name, str) or not name.isprintable() or set(name) & set("/\\@: "):
-        raise SplitError(f"the manifest names the split {name!r}, which is no name")
-    if name.startswith(".") or not name:
-        raise SplitError(f"the manifest names the split {name!r}, which is no name")
-    for environment, entry in manifest["environments"].items():
-        if environment not in ENVIRONMENTS:
-            raise SplitError(f"the manifest has an unknown environment {environment!r}")
-        if entry.get("file") != f"{environment}.h5":
-            raise SplitError(
-                f"the manifest names the file {entry.get('file')!r} for {environment}, expected "
-                f"'{environment}.h5'"
-            )
-        for group, facts in entry["groups"].items():
-            for fact in ("trajectories", "transitions"):
-                if not isinstance(facts.get(fact), int) or not 0 < facts[fact] <= 10**10:
-                    raise SplitError(
-                        f"the manifest says {facts.get(fact)!r} {fact} for {environment}, {group}"
-                    )
-
-
-def _is_there(name: str, target: Path, digest: str, *, by_name: bool) -> bool:
-    """Whether the split is in its place already; raise `UsageError` if another one is."""
-    if by_name and (SHIPPED / name / MANIFEST).exists():
-        if Split(SHIPPED / name).digest == digest:
-            return True
+def _installed(name: str, target: Path, digest: str, *, by_name: bool) -> Split | None:
+    """Return the split if it is in its place already; raise `UsageError` if another one is."""
+    shipped = Split(SHIPPED / name)
+    if by_name and (shipped.path / MANIFEST).exists():
+        if shipped.digest == digest:
+            return shipped
         raise UsageError(
-            f"split {name!r} comes with the package, and this is another one: name a directory "
-            "with --output"
+            f"split {name!r} comes with the package, and this is another one: choose an --output"
         )
     if not target.exists():
-        return False
-    try:
-        there = Split(target)
-        if there.digest == digest:
-            return all(check.ok for check in there.verify())  # a damaged copy is replaced
-    except SplitError:
-        if read_digest(target) == digest:
-            return False
-    raise UsageError(
-        f"{str(target)!r} exists and is not this split: remove it, or name another directory with "
-        "--output"
-    )
-
-
-def read_digest(directory: Path) -> str | None:
-    """Return the digest of the split in a directory; None where its manifest cannot be read."""
-    try:
-        return str(read_manifest(directory)["digest"])
-    except SplitError:
         return None
+    there = Split(target)
+    with contextlib.suppress(SplitError):
+        if there.digest == digest:
+            with contextlib.suppress(SplitError):
+                return there if all(check.ok for check in there.verify()) else None
+            return None  # a damaged copy is replaced
+    raise UsageError(
+        f"{str(target)!r} exists and is not this split: remove it, or name another with --output"
+    )
 
 
 def _bring_file(
     source: Source, split: Split, environment: str, entry: dict[str, Any], staging: Path
 ) -> None:
     """Fetch and verify one file; one that an earlier attempt has verified stays."""
-    file = split.path / entry["file"]
+    file, part = split.path / entry["file"], staging / f"{entry['file']}.part"
     if file.exists():
         with contextlib.suppress(SplitError):
             _verify(split, environment, file, entry)
             return
         file.unlink()
-    part = staging / f"{file.name}.part"
-    source.fetch(file.name, part, _most(environment, entry))
+    # The most bytes that it may have, if nothing in it were compressed, with some to spare.
+    info = ENVIRONMENTS[environment]
+    row = 4 * (info.observation_dim + info.action_dim + 1)
+    trajectory = 4 * info.observation_dim + 5 * 8 + 4096
+    sizes = [(g["transitions"], g["trajectories"]) for g in entry["groups"].values()]
+    most = 2 * _MIB + sum(_MIB + row * steps + trajectory * n for steps, n in sizes)
+    source(file.name, part, most)
     part.replace(file)
     try:
         _verify(split, environment, file, entry)
@@ -226,36 +175,22 @@ def _bring_file(
         raise
 
 
-def _most(environment: str, entry: dict[str, Any]) -> int:
-    """Return the bytes that a file may have, if nothing in it were compressed."""
-    info = ENVIRONMENTS[environment]
-    row = 4 * (info.observation_dim + info.action_dim + 1)
-    per_trajectory = 4 * info.observation_dim + 5 * 8 + 4096
-    return 2 * _SPARE + sum(
-        _SPARE + row * int(facts["transitions"]) + per_trajectory * int(facts["trajectories"])
-        for facts in entry["groups"].values()
-    )
-
-
 def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -> None:
     """Raise unless a file is whole in itself, and all in it is what the manifest says."""
     split.environment(environment).close()
     with h5py.File(file, "r") as stored:
         if elsewhere := stored.visititems_links(_leads_away) or stored.visititems(_is_outside):
             raise SplitError(f"{file.name} {elsewhere}: refused")
-        groups = group_names(stored)
-        if set(groups) != set(entry["groups"]):
-            raise SplitError(
-                f"{file.name} holds the groups {', '.join(groups)}, expected "
-                f"{', '.join(entry['groups'])}"
-            )
-        for name, facts in entry["groups"].items():
+        groups, expected = [p for p in PARTS if p in stored], list(entry["groups"])
+        if set(groups) != set(expected):
+            raise SplitError(f"{file.name} holds the groups {groups}, expected {expected}")
+        for name, group in entry["groups"].items():
             found = (len(stored[name]["seeds"]), int(stored[name]["offsets"][-1]))
-            expected = (facts["trajectories"], facts["transitions"])
-            if found != expected:
+            named = (group["trajectories"], group["transitions"])
+            if found != named:
                 raise SplitError(
                     f"{file.name}, {name} has {found[0]} trajectories with {found[1]} transitions, "
-                    f"expected {expected[0]} with {expected[1]}"
+                    f"expected {named[0]} with {named[1]}"
                 )
 
 
@@ -268,53 +203,136 @@ def _is_outside(name: str, item: h5py.Group | h5py.Dataset) -> str | None:
     return f"keeps the content of {name} in another file" if outside else None
 
 
-def _replace(target: Path, fresh: Path, aside: Path) -> None:
-    """Put the verified split in its place; a damaged copy of it goes away."""
-    if target.exists():
-        shutil.rmtree(aside, ignore_errors=True)
-        target.rename(aside)
-    fresh.rename(target)
-
-
-def _source(place: str, staging: Path) -> Source:
-    """Return what gives the files at a place; an archive on the web is downloaded first."""
+@contextlib.contextmanager
+def _open_source(place: str, archive: Path) -> Iterator[Source]:
+    """Give the files at a place; an archive on the web is downloaded to `archive` first."""
     parts = urlsplit(place)
+    path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(place)
     if parts.scheme in {"http", "https"}:
+        address = place.rstrip("/")
         if not parts.path.endswith(ARCHIVES):
-            return WebSource(place)
-        archive = staging / "archive"
-        download(place, archive, MOST_ARCHIVE)
+            yield lambda name, target, most: _download(f"{address}/{quote(name)}", target, most)
+            return
+        _download(place, archive, MOST_ARCHIVE)
+        path = archive
+    elif "://" in place and parts.scheme != "file":
+        raise UsageError(f"{place!r} cannot be fetched, expected http://, https:// or file://")
+    if path.is_dir():
+        yield functools.partial(_copy_from, path)
+    elif path.is_file():
         try:
-            return ArchiveSource(archive)
+            with _open_archive(path) as source:
+                yield source
         except SplitError:
+            # A whole download with something wrong in it would be wrong again.
             archive.unlink(missing_ok=True)
             raise
-    if parts.scheme == "file":
-        path = Path(url2pathname(parts.path))
-    elif "://" in place:
-        raise UsageError(f"{place!r} cannot be fetched, expected http://, https:// or file://")
     else:
-        path = Path(place)
-    if path.is_dir():
-        return DirectorySource(path)
-    if path.is_file():
-        return ArchiveSource(path)
-    raise SplitNotFoundError(f"there is nothing at {place}: expected a directory, a file or a URL")
+        raise SplitNotFoundError(f"there is nothing at {place}: expected a directory, file or URL")
+
+
+def _copy_from(directory: Path, name: str, target: Path, most: int) -> None:
+    try:
+        with (directory / name).open("rb") as content:
+            _copy(content, target, most, str(directory / name))
+    except FileNotFoundError:
+        raise SplitNotFoundError(f"{directory} holds no {name}") from None
 
 
 @contextlib.contextmanager
-def _alone(staging: Path) -> Iterator[None]:
-    """Let one process at a time fetch from a place."""
-    staging.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(staging, os.O_RDONLY)
-    try:
+def _open_archive(path: Path) -> Iterator[Source]:
+    """Open a tar or zip archive that holds the files of one split, in its root or one folder."""
+    with contextlib.ExitStack() as stack:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(
-                f"another process is fetching the same into {str(staging.parent.parent)!r}: wait "
-                "for it"
-            ) from None
-        yield
-    finally:
-        os.close(descriptor)
+            kind: Any = zipfile.ZipFile if zipfile.is_zipfile(path) else tarfile.open
+            members = _members(path.name, stack.enter_context(kind(path)))
+        except (OSError, *_DAMAGED) as error:
+            # tarfile's longest message has a line for every kind that it has tried.
+            why = (str(error) or type(error).__name__).splitlines()[0].rstrip(":")
+            raise SplitError(
+                f"{path.name} cannot be read as a tar or zip archive ({why}): fetch it again"
+            ) from error
+
+        def extract(name: str, target: Path, most: int) -> None:
+            if name not in members:
+                raise SplitNotFoundError(f"{path.name} holds no {name} beside its {MANIFEST}")
+            try:
+                with members[name]() as content:
+                    _copy(content, target, most, f"{name} in {path.name}")
+            except _DAMAGED as error:
+                raise SplitError(f"{path.name} is damaged at {name}: {error}") from error
+
+        yield extract
+
+
+def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
+    """Return what opens the manifest and the files beside it; refuse an archive with tricks."""
+    found: list[tuple[PurePosixPath, Callable[[], Any]]] = []
+    opened: Callable[[], Any]
+    zipped = isinstance(archive, zipfile.ZipFile)
+    for item in archive.infolist() if zipped else archive.getmembers():
+        if item.is_dir() if zipped else item.isdir():
+            continue
+        name = item.filename if zipped else item.name
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or "\\" in name:
+            raise SplitError(f"{file} holds a file with the path {name!r}: refused")
+        mode = stat.S_IFMT(item.external_attr >> 16) if zipped else 0
+        if mode not in (0, stat.S_IFREG) or not (zipped or item.isreg()):
+            raise SplitError(f"{file} holds {name!r}, which is no plain file: refused")
+        opened = functools.partial(archive.open if zipped else archive.extractfile, item)
+        found.append((path, opened))
+    folders = [path.parent for path, _ in found if path.name == MANIFEST]
+    if len(folders) != 1:
+        raise SplitError(f"{file} holds {len(folders)} files named {MANIFEST}, expected one")
+    members: dict[str, Callable[[], Any]] = {}
+    for path, opened in found:
+        if path.parent == folders[0]:
+            if path.name in members:
+                raise SplitError(f"{file} holds {str(path)!r} twice: refused")
+            members[path.name] = opened
+    return members
+
+
+def _download(address: str, target: Path, most: int) -> None:
+    """Download a file over http or https, continuing after the bytes that `target` has."""
+    have = target.stat().st_size if target.exists() else 0
+    again = "run the same command again, it goes on from there"
+    headers = {"User-Agent": f"oodd-eval/{__version__}"}
+    headers |= {"Range": f"bytes={have}-"} if have else {}
+    request = urllib.request.Request(address, headers=headers)  # noqa: S310  http or https
+    try:
+        response = urllib.request.urlopen(request, timeout=60)  # noqa: S310
+    except urllib.error.HTTPError as error:
+        error.close()
+        if have and error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+            return  # all of it is there
+        kind = SplitNotFoundError if error.code in {404, 410} else SplitError
+        raise kind(f"{address} answers {error.code} {error.reason}") from None
+    except (OSError, http.client.HTTPException) as error:
+        raise SplitError(
+            f"{address} cannot be reached: {getattr(error, 'reason', error)}"
+        ) from error
+    with response:
+        if response.status != http.client.PARTIAL_CONTENT:
+            have = 0
+        length = response.headers.get("Content-Length")
+        expected = have + int(length) if length and length.isdigit() else None
+        try:
+            _copy(response, target, most, address, have=have)
+        except (OSError, http.client.HTTPException) as error:
+            raise SplitError(f"{address} broke off ({error}): {again}") from error
+    got = target.stat().st_size
+    if expected is not None and got < expected:
+        raise SplitError(f"{address} broke off after {got} of {expected} bytes: {again}")
+
+
+def _copy(content: Any, target: Path, most: int, what: str, *, have: int = 0) -> None:
+    """Write behind the first bytes that `target` has, up to a number of bytes in all."""
+    with target.open("ab" if have else "wb") as out:
+        while block := content.read(_MIB):
+            have += len(block)
+            if have > most:
+                target.unlink()
+                raise SplitError(f"{what} has more than the {most} bytes that it may have: refused")
+            out.write(block)

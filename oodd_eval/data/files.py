@@ -1,8 +1,4 @@
-"""Files that are whole or absent: atomic replacement, a lock per directory, gzip within bounds.
-
-Every room writes through this module, so that a killed process never leaves half a file under its
-final name.
-"""
+"""Files that are whole or absent: atomic replacement, a lock per directory, gzip within bounds."""
 
 from __future__ import annotations
 
@@ -18,26 +14,16 @@ from typing import Final
 from oodd_eval.errors import OutputError, ResultsError
 
 GZIP: Final = ".gz"
-"""Ending of compressed files."""
-
 COMPRESSED_FROM: Final = 10**6
 """Bytes beyond which `compress_large` compresses; smaller files stay readable in a pull request."""
 
 MAX_BYTES: Final = 64 * 10**6
 """Most bytes that a compressed file may decompress to, unless the caller says otherwise."""
 
-_TEMPORARY: Final = re.compile(r"\..+\.(\d+)")
-
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; move it there when the block ends without an error.
-
-    Raises
-    ------
-    OutputError
-        When the file cannot be written.
-    """
+    """Give a temporary path that is moved to `path` when the block ends without an error."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +32,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"{str(path)!r} cannot be written: {error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            temporary.unlink()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -63,7 +50,7 @@ def write_text(path: Path, text: str) -> None:
 def remove_abandoned(directory: Path) -> None:
     """Remove temporary files of `replacing` whose process has ended."""
     for file in directory.glob(".*"):
-        found = _TEMPORARY.fullmatch(file.name)
+        found = re.fullmatch(r"\..+\.(\d+)", file.name)
         if found and not process_exists(int(found[1])):
             file.unlink(missing_ok=True)
 
@@ -80,32 +67,18 @@ def process_exists(pid: int) -> bool:
 
 @contextlib.contextmanager
 def lock(directory: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold an exclusive lock on a directory while the block runs.
+    """Hold an exclusive lock on a directory; without `wait`, give False while another has it.
 
-    Parameters
-    ----------
-    directory
-        An existing directory; nothing is written into it.
-    wait
-        Whether to wait for another holder. If not, the block runs without the lock.
-
-    Yields
-    ------
-    bool
-        Whether the lock is held. A file system without locks counts as held: two writers at a
-        time are not supported there.
+    A file system without locks counts as held: two writers at a time are not supported there.
     """
     import fcntl  # noqa: PLC0415  POSIX only
 
-    descriptor = os.open(directory, os.O_RDONLY)
-    held = True
+    descriptor, held = os.open(directory, os.O_RDONLY), True
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            held = False
-        except OSError:
-            held = True
+        except OSError as error:
+            held = not isinstance(error, BlockingIOError)
         yield held
     finally:
         os.close(descriptor)
@@ -117,18 +90,7 @@ def compress(content: bytes) -> bytes:
 
 
 def decompress(content: bytes, most: int = MAX_BYTES) -> bytes:
-    """Undo `compress`, never holding more than `most` bytes.
-
-    Raises
-    ------
-    ResultsError
-        When the content is damaged, cut off, followed by something else, or larger than `most`.
-
-    Examples
-    --------
-    >>> decompress(compress(b"one record"))
-    b'one record'
-    """
+    """Undo `compress`, never holding more than `most` bytes; anything else is a `ResultsError`."""
     decompressor = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
     try:
         plain = decompressor.decompress(content, most + 1)
@@ -158,19 +120,11 @@ def find_file(path: Path) -> Path | None:
     return next((p for p in (path, path.with_name(path.name + GZIP)) if p.is_file()), None)
 
 
-def read_text(path: Path, most: int = MAX_BYTES) -> str:
-    """Read UTF-8 text, decompressed if the name ends in ``.gz``.
-
-    Raises
-    ------
-    OSError, UnicodeDecodeError
-        As for a plain file.
-    ResultsError
-        When the content cannot be decompressed.
-    """
+def read_text(path: Path) -> str:
+    """Read UTF-8 text, decompressed if the name ends in ``.gz``."""
     if path.suffix != GZIP:
         return path.read_text(encoding="utf-8")
     try:
-        return decompress(path.read_bytes(), most).decode()
+        return decompress(path.read_bytes()).decode()
     except ResultsError as error:
         raise ResultsError(f"{str(path)!r} {error}") from None

@@ -1,20 +1,19 @@
-"""How a split lies on disk: one HDF5 file per environment, a manifest, content digests.
+"""Layout of a split on disk: one HDF5 file per environment, a manifest, content digests.
 
-A file holds the groups ``train``, ``calibration``, ``test/nominal`` (the twins) and
-``test/<anomaly>``. Each group stores its trajectories as ragged arrays: flat rows and offsets.
-``offsets`` count transitions, so that trajectory i owns transitions ``offsets[i]:offsets[i+1]`` and
-observation rows ``offsets[i]+i : offsets[i+1]+i+1``.
-
+A file holds one group per part. A group stores its trajectories as flat rows and offsets, counted
+in transitions: trajectory i owns transitions ``offsets[i]:offsets[i+1]`` and observation rows
+``offsets[i]+i : offsets[i+1]+i+1``. No dataset holds objects: parameters are JSON in UTF-8 bytes.
 The digest of a group covers names, dtypes, shapes and little-endian bytes of its datasets, and
-nothing of chunks or compression. No dataset holds objects: parameters are fixed-width UTF-8 bytes.
+nothing of chunks or compression.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,20 +21,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.files import replacing, write_text
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 1
-"""Version of this layout."""
-
-TWINS: Final = "test/nominal"
+MANIFEST: Final = "manifest.json"
 
 NOMINAL_DTYPES: Final = {
-    "observations": "<f4",
-    "actions": "<f4",
-    "rewards": "<f4",
-    "offsets": "<i8",
-    "seeds": "<i8",
+    **dict.fromkeys(("observations", "actions", "rewards"), "<f4"),
+    **dict.fromkeys(("offsets", "seeds"), "<i8"),
     "terminated": "|u1",
 }
 ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {"onsets": "<i8", "redraws": "<i8", "parameters": "|S"}
@@ -45,17 +41,9 @@ _BLOCK: Final = 1 << 21
 """Bytes that are held at once while content is digested or written."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Blocks:
-    """A dataset that comes in blocks of rows, because it may be larger than memory.
-
-    Attributes
-    ----------
-    shape
-        Of the whole.
-    blocks
-        Gives its rows from the first to the last, as arrays of any length.
-    """
+    """A dataset that may be larger than memory: `blocks` gives its rows in order."""
 
     shape: tuple[int, ...]
     blocks: Callable[[], Iterable[NDArray[Any]]]
@@ -73,12 +61,12 @@ class Blocks:
             yield np.concatenate(held)
 
 
-Groups = Mapping[str, Mapping[str, NDArray[Any] | Blocks]]
+Arrays = Mapping[str, NDArray[Any] | Blocks]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class GroupCheck:
-    """What verification found for one group of one file."""
+    """The digests of one group of one file: the manifest's, and the content's."""
 
     file: str
     group: str
@@ -87,20 +75,13 @@ class GroupCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether the content is what the manifest names."""
+        """True when the content is what the manifest names."""
         return self.expected == self.found
-
-
-def group_names(file: h5py.File) -> list[str]:
-    """Return the trajectory groups of a file, in the benchmark's order."""
-    names = ["train", "calibration", TWINS, *(f"test/{a}" for a in ANOMALIES)]
-    return [name for name in names if name in file]
 
 
 def dtypes_of(group: str) -> dict[str, str]:
     """Return names and dtypes of the datasets a group must have."""
-    nominal = group in {"train", "calibration", TWINS}
-    return dict(NOMINAL_DTYPES if nominal else ANOMALOUS_DTYPES)
+    return dict(NOMINAL_DTYPES if group in {TRAIN, CALIBRATION, TWINS} else ANOMALOUS_DTYPES)
 
 
 def check_layout(file: str, name: str, group: h5py.Group) -> None:
@@ -117,11 +98,8 @@ def check_layout(file: str, name: str, group: h5py.Group) -> None:
     if n < 0 or offsets[0] != 0 or (np.diff(offsets) < 1).any():
         raise SplitError(f"{where}: offsets must start at 0 and rise by at least 1 per trajectory")
     total = int(offsets[-1])
-    lengths = {
-        dataset: {"observations": total + n, "actions": total, "rewards": total, "offsets": n + 1}
-        .get(dataset, n)
-        for dataset in dtypes_of(name)
-    }  # fmt: skip
+    lengths = dict.fromkeys(dtypes_of(name), n)
+    lengths |= {"observations": total + n, "actions": total, "rewards": total, "offsets": n + 1}
     for dataset, expected in lengths.items():
         if len(group[dataset]) != expected:
             raise SplitError(
@@ -131,13 +109,7 @@ def check_layout(file: str, name: str, group: h5py.Group) -> None:
 
 
 def content_digest(group: Mapping[str, Any]) -> str:
-    """SHA-256 of a group's content, read in blocks of bounded size.
-
-    Parameters
-    ----------
-    group
-        Datasets by name: HDF5 datasets or arrays.
-    """
+    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size."""
     sha = hashlib.sha256()
     for name in sorted(group):
         data = group[name]
@@ -150,7 +122,7 @@ def content_digest(group: Mapping[str, Any]) -> str:
 
 
 def _blocks(data: Any) -> Iterator[NDArray[Any]]:
-    """Yield all rows in blocks of whole chunks, so that each chunk is unpacked once."""
+    # In whole chunks, so that each is decompressed once.
     row = max(1, int(np.prod(data.shape[1:], dtype=np.int64)) * data.dtype.itemsize)
     chunk = (getattr(data, "chunks", None) or (1,))[0]
     step = chunk * max(1, _BLOCK // (row * chunk))
@@ -158,20 +130,20 @@ def _blocks(data: Any) -> Iterator[NDArray[Any]]:
         yield np.asarray(data[start : start + step])
 
 
-def environment_digest(groups: Mapping[str, str]) -> str:
-    """Digest of an environment from the digests of its groups."""
-    return canonical_digest(dict(groups))
+def environment_digest(groups: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the digest of an environment from what the manifest says of its groups."""
+    return _canonical_digest({name: entry["sha256"] for name, entry in groups.items()})
 
 
-def canonical_digest(value: Any) -> str:
-    """SHA-256 of a JSON value with sorted keys and no white space."""
+def split_digest(environments: Mapping[str, Any], definition: Mapping[str, Any]) -> str:
+    """Return the digest of a split from its manifest's environments and recipe."""
+    digests = {name: environment_digest(entry["groups"]) for name, entry in environments.items()}
+    return _canonical_digest({"environments": digests, "definition": dict(definition)})
+
+
+def _canonical_digest(value: Any) -> str:
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def split_digest(environments: Mapping[str, str], definition: Mapping[str, Any]) -> str:
-    """Digest of a split from those of its environments and its recipe."""
-    return canonical_digest({"environments": dict(environments), "definition": dict(definition)})
 
 
 def pack_parameters(parameters: list[dict[str, Any]]) -> NDArray[np.bytes_]:
@@ -180,95 +152,97 @@ def pack_parameters(parameters: list[dict[str, Any]]) -> NDArray[np.bytes_]:
     return np.array(texts, dtype=f"S{max(map(len, texts), default=1)}")
 
 
-def write_environment(path: Path, groups: Groups) -> dict[str, dict[str, Any]]:
-    """Write the groups of one environment; return what the manifest says of each.
-
-    The file appears under its name only when it is complete.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    facts: dict[str, dict[str, Any]] = {}
-    with h5py.File(partial, "w", libver="v110") as file:
+def write_environment(
+    path: Path, groups: Iterable[tuple[str, Arrays]], policy: str
+) -> dict[str, Any]:
+    """Write an environment's groups, one at a time, in one step; return its manifest entry."""
+    entries: dict[str, dict[str, Any]] = {}
+    with replacing(path) as partial, h5py.File(partial, "w", libver="v110") as file:
         file.attrs["schema"] = SCHEMA
-        for name, arrays in groups.items():
+        for name, arrays in groups:
             group = file.create_group(name)
             for dataset, dtype in dtypes_of(name).items():
                 _write(group, dataset, arrays[dataset], dtype)
             check_layout(path.name, name, group)
-            facts[name] = {
-                "sha256": content_digest(group),
-                "trajectories": len(group["seeds"]),
-                "transitions": int(group["offsets"][-1]),
-            }
-    partial.replace(path)
-    return facts
+            n, total = len(group["seeds"]), int(group["offsets"][-1])
+            digest = content_digest(group)
+            entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
+    digest = environment_digest(entries)
+    return {"file": path.name, "policy": policy, "digest": digest, "groups": entries}
 
 
 def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: str) -> None:
     if not isinstance(content, Blocks):
         array = np.asarray(content)
-        # Texts keep their width.
-        dtype = array.dtype.str if name == "parameters" else dtype
+        dtype = array.dtype.str if name == "parameters" else dtype  # texts keep their width
         content = Blocks(array.shape, lambda: [array])
     row = int(np.prod(content.shape[1:], dtype=np.int64)) * np.dtype(dtype).itemsize
-    # Tiny datasets grow when compressed.
-    packed = content.shape[0] * row > 512
-    dataset = group.create_dataset(
-        name, content.shape, dtype, track_times=False,
-        **({"shuffle": True, "compression": "gzip", "compression_opts": 9} if packed else {}),
-    )  # fmt: skip
+    gzip = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
+    packing = gzip if content.shape[0] * row > 512 else {}  # tiny datasets grow
+    dataset = group.create_dataset(name, content.shape, dtype, track_times=False, **packing)
     # Whole chunks, so that each is compressed once.
-    step = dataset.chunks[0] if dataset.chunks else 1
-    start = 0
+    step, start = dataset.chunks[0] if dataset.chunks else 1, 0
     for block in content.of_length(step * max(1, _BLOCK // (row * step))):
         dataset[start : start + len(block)] = block.astype(dtype, copy=False)
         start += len(block)
 
 
-def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
-    """Write ``manifest.json``, replacing an older one only when complete."""
-    partial = directory / "manifest.json.partial"
-    partial.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    partial.replace(directory / "manifest.json")
+@functools.cache
+def _manifest_schema() -> Any:
+    # The core of pydantic: its models would take longer to import than a split to open.
+    from pydantic_core import SchemaValidator, core_schema  # noqa: PLC0415  slow to import
+
+    def record(**fields: core_schema.CoreSchema) -> core_schema.CoreSchema:
+        typed = {name: core_schema.typed_dict_field(field) for name, field in fields.items()}
+        return core_schema.typed_dict_schema(typed, extra_behavior="allow")
+
+    text, by_name = core_schema.str_schema(), core_schema.dict_schema
+    # Others trust these numbers with memory and disk.
+    count = core_schema.int_schema(gt=0, le=10**10)
+    group = record(sha256=text, trajectories=count, transitions=count)
+    environment = record(file=text, policy=text, digest=text, groups=by_name(text, group))
+    environments, schema = by_name(text, environment), core_schema.literal_schema([SCHEMA])
+    named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
+    manifest = record(schema=schema, **named, environments=environments, digest=text)
+    return SchemaValidator(manifest, core_schema.CoreConfig(strict=True))
+
+
+def write_manifest(
+    directory: Path,
+    definition: SplitDefinition,
+    environments: Mapping[str, Any],
+    generator: int,
+    versions: Mapping[str, str],
+) -> None:
+    """Write ``manifest.json`` in one step from the entries of environments, in their order."""
+    recipe = dataclasses.asdict(definition)
+    digest = split_digest(environments, recipe)
+    manifest = {"schema": SCHEMA, "name": definition.name, "definition": recipe}
+    manifest |= {"generator": generator, "environments": environments, "digest": digest}
+    manifest["versions"] = versions
+    write_text(directory / MANIFEST, json.dumps(manifest, indent=1) + "\n")
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
-    """Read and check the manifest of a split directory.
+    """Read a manifest; `SplitError` when it is unreadable, edited, or a field is not as it must."""
+    from pydantic_core import ValidationError  # noqa: PLC0415  slow to import
 
-    Raises
-    ------
-    SplitError
-        When it cannot be read, has another schema, or lacks a field.
-    """
-    file = directory / "manifest.json"
+    file = directory / MANIFEST
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        manifest: dict[str, Any] = _manifest_schema().validate_json(file.read_bytes())
+    except ValidationError as error:
+        found = "; ".join(
+            f"{'.'.join(map(str, p['loc'])) or 'content'}: {p['msg']}"
+            + (f", got {p['input']!r}"[:100] if p["type"] != "missing" else "")
+            for p in error.errors(include_url=False)
+        )
+        raise SplitError(f"{file} is not a split's manifest: {found}") from None
+    except OSError as error:
         raise SplitError(f"{file} cannot be read as a split's manifest: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("schema") != SCHEMA:
-        found = manifest.get("schema") if isinstance(manifest, dict) else type(manifest).__name__
-        raise SplitError(f"{file} has schema {found!r}, expected {SCHEMA}")
-    missing = {"name", "definition", "generator", "environments", "digest"} - set(manifest)
-    if missing:
-        raise SplitError(f"{file} lacks {', '.join(sorted(missing))}")
-    for field in ("environments", "definition"):
-        if not isinstance(manifest[field], dict):
-            found = type(manifest[field]).__name__
-            raise SplitError(f"{file}: {field} must be an object, got {found}")
-    digests = {
-        e: environment_digest(_hashes(file, e, m)) for e, m in manifest["environments"].items()
-    }
-    expected = split_digest(digests, manifest["definition"])
+    expected = split_digest(manifest["environments"], manifest["definition"])
     if manifest["digest"] != expected:
         raise SplitError(
             f"{file} names the digest {manifest['digest']}, but its entries make {expected}: "
             "it was edited; build or fetch the split again"
         )
     return manifest
-
-
-def _hashes(file: Path, environment: str, entry: Any) -> dict[str, str]:
-    try:
-        return {name: str(facts["sha256"]) for name, facts in entry["groups"].items()}
-    except (TypeError, KeyError, AttributeError) as error:
-        raise SplitError(f"{file}: the entry of {environment} is incomplete ({error})") from None

@@ -6,8 +6,10 @@ Time runs as in the protocol: observations ``o_0 .. o_T`` (T + 1 rows) and the c
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +24,9 @@ class Trajectory:
     Parameters
     ----------
     observations : array of shape (T + 1, D)
-        Rows ``o_0 .. o_T`` in the simulator's units; stored as read-only float32.
+        Rows ``o_0 .. o_T`` in the simulator's units; stored as read-only float32, as are actions.
     actions : array of shape (T, A)
         Rows ``a_0 .. a_{T-1}``, commanded by the policy; a discrete action is a one-hot row.
-        Stored as read-only float32.
 
     Raises
     ------
@@ -50,8 +51,7 @@ class Trajectory:
         if len(o) != len(a) + 1:
             raise TrajectoryError(
                 f"a trajectory has one observation more than actions: got {len(o)} observations "
-                f"and {len(a)} actions, expected {len(a) + 1} observations (o_0 .. o_T) for "
-                f"{len(a)} actions (a_0 .. a_T-1)"
+                f"and {len(a)} actions, expected {len(a) + 1} observations (o_0 .. o_T)"
             )
         object.__setattr__(self, "observations", o)
         object.__setattr__(self, "actions", a)
@@ -65,7 +65,7 @@ class Trajectory:
         return len(self.observations)
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """Return the episode as it was known at an earlier time: only prefixes ``[:n]``, n >= 1."""
+        """Return the first n observations as an episode: only ``[:n]`` with n >= 1 is allowed."""
         n = len(range(len(self))[rows]) if isinstance(rows, slice) else 0
         if n < 1 or rows.step not in (None, 1) or rows.start not in (None, 0):
             raise TrajectoryError(
@@ -90,6 +90,22 @@ class Trajectory:
         return int(self.actions.shape[1])
 
 
+class TrajectorySequence(Sequence[Trajectory]):
+    """Trajectories that are read when asked for; a subclass reads one in `_one`."""
+
+    @overload
+    def __getitem__(self, index: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Trajectory]: ...
+    def __getitem__(self, index: int | slice) -> Trajectory | list[Trajectory]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self._one(range(len(self))[index])
+
+    @abstractmethod
+    def _one(self, i: int) -> Trajectory: ...
+
+
 def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
     try:
         array = np.array(values, dtype=np.float32, order="C", ndmin=1)
@@ -111,19 +127,8 @@ def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
     return array
 
 
-def pad(
-    arrays: Sequence[NDArray[np.float32]],
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Stack sequences of unequal length, padded with zeros behind their ends.
-
-    Parameters
-    ----------
-    arrays : sequence of B arrays of shape (n_b, D)
-
-    Returns
-    -------
-    batch : float32 array of shape (B, max n_b, D)
-    lengths : int64 array of shape (B,)
+def pad(arrays: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Stack arrays of shape (n_b, D) into (B, max n_b, D), zeros behind their ends; return lengths.
 
     Examples
     --------

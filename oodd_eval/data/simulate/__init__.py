@@ -1,4 +1,1 @@
-"""Simulators, anomalies, policies and recording: the only importer of gymnasium and pybullet.
-
-Needs the extra ``sim``; evaluating a frozen split does not come here.
-"""
+"""Simulators, anomalies, policies and recording (extra ``sim``): frozen splits need none."""

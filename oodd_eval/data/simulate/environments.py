@@ -1,27 +1,54 @@
 """The seven simulators behind one small interface.
 
-A simulator is used for one episode: `make` gives a fresh one each time, because PyBullet's client
-and Box2D's world keep hidden state that makes later episodes differ from first ones with the same
-seed. Attributes that anomalies change (gravity, link lengths, motor power) are reached through
-`Simulator.set` and read back from the simulator itself through `Simulator.get`.
+A simulator is used for one episode: PyBullet's client and Box2D's world keep hidden state that
+makes later episodes differ from first ones with the same seed.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import inspect
 import math
+import os
+import sys
 import types
 import warnings
-from collections.abc import Callable
-from typing import Any, ClassVar, Protocol
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.quiet import quiet_streams
-from oodd_eval.errors import MissingExtraError, SimulationError, UnknownNameError
+from oodd_eval.errors import MissingExtraError, UnknownNameError
+
+
+@contextmanager
+def quiet_streams() -> Iterator[None]:
+    """Send file descriptors 1 and 2 to the null device: PyBullet prints from C, past Python."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
+    try:
+        saved = [(fd, os.dup(fd)) for fd in (1, 2)]
+    except OSError:  # a process without these streams
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd, _ in saved:
+            os.dup2(null, fd)
+        yield
+    finally:
+        # C has buffers of its own: their content has to go while the null device is in place.
+        ctypes.CDLL(None).fflush(None)
+        for fd, copy in saved:
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(null)
+
 
 try:
     # Box2D's C module warns while it is imported, and crashes where warnings are errors.
@@ -34,47 +61,51 @@ try:
         from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 except ImportError as error:  # a clear way out for those who only installed the core
     raise MissingExtraError(
-        f"recording trajectories needs the simulators ({error}): "
-        "install them with pip install 'oodd-eval[sim]'"
+        f"recording needs the simulators ({error}): pip install 'oodd-eval[sim]'"
     ) from error
 
 Row = NDArray[np.float32]
 
 
-class Simulator(Protocol):
-    """One episode of one environment.
+class Simulator:
+    """One episode of one environment, in a `wind` of -1, 0 or +1: the direction of its pushes."""
 
-    ``wind`` is read every step: -1, 0 or +1, the direction into which a gust pushes in this step.
-    """
+    names: ClassVar[Mapping[str, str]] = {}
+    """The environment's names of attributes that it calls otherwise."""
 
-    wind: int
+    def __init__(self, env: Any) -> None:
+        self.env, self.wind = env, 0
 
     def reset(self, seed: int) -> Row:
         """Start the episode; return the observation of shape (D,)."""
-        ...
+        return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
 
     def step(self, action: Any) -> tuple[Row, float, bool]:
-        """Advance by one commanded action: next observation, reward, whether the episode ended."""
-        ...
+        """Advance by one commanded action; return observation, reward and True at the end."""
+        row, reward, over, _, _ = self.env.step(self.command(action))
+        return np.asarray(row, dtype=np.float32), float(reward), bool(over)
+
+    def command(self, action: Any) -> Any:
+        """Return what the environment is given for an action in the present wind."""
+        return action
 
     def set(self, attribute: str, value: float) -> None:
         """Change an attribute of the dynamics from the next step on."""
-        ...
+        setattr(self.env, self.names.get(attribute, attribute), value)
 
     def get(self, attribute: str) -> float:
         """Read an attribute back from where the simulator itself reads it."""
-        ...
+        return float(getattr(self.env, self.names.get(attribute, attribute)))
 
     def close(self) -> None:
         """Release what the simulator holds."""
-        ...
+        self.env.close()
 
 
 class _Acrobot(AcrobotEnv):
-    """Acrobot whose gravity can be changed.
+    """Acrobot whose gravity can be changed: the stock equations hold it as a local constant.
 
-    The stock equations hold gravity as a local constant. They stay in force until gravity is
-    changed; then the same double pendulum is solved from its mass matrix.
+    They stay in force until then; after, the same pendulum is solved from its mass matrix.
     """
 
     gravity = 9.8
@@ -85,10 +116,7 @@ class _Acrobot(AcrobotEnv):
         return self.derivative(s_augmented)
 
     def derivative(self, state: Any) -> tuple[float, float, float, float, float]:
-        """Time derivative of (theta1, theta2, omega1, omega2, torque) at ``self.gravity``.
-
-        Lagrange's equations M(theta2) dω + c(theta, ω) = (0, torque), solved as a 2 x 2 system.
-        """
+        """Solve Lagrange's equations M(theta2) dω + c(theta, ω) = (0, torque) for (ω, dω, 0)."""
         theta1, theta2, omega1, omega2, torque = state
         m1, m2, l1 = self.LINK_MASS_1, self.LINK_MASS_2, self.LINK_LENGTH_1
         lc1, lc2, inertia, g = self.LINK_COM_POS_1, self.LINK_COM_POS_2, self.LINK_MOI, self.gravity
@@ -108,68 +136,50 @@ class _Acrobot(AcrobotEnv):
         return omega1, omega2, acceleration1, acceleration2, 0.0
 
 
-class Acrobot:
+class Acrobot(Simulator):
     """Acrobot-v1: torque on the joint between two links; wind adds torque of its own sign."""
 
+    names: ClassVar = {
+        f"link_{w}_{i}": f"LINK_{w.upper()}_{i}" for w in ("mass", "length") for i in "12"
+    }
+
     def __init__(self) -> None:
-        self.env: Any = _Acrobot()
-        self.wind = 0
+        super().__init__(_Acrobot())
 
-    def reset(self, seed: int) -> Row:
-        return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
-
-    def step(self, action: int) -> tuple[Row, float, bool]:
+    def command(self, action: int) -> int:
         # Per instance: action 0 is torque -1, action 2 is torque +1.
-        self.env.AVAIL_TORQUE = {0: [-1.0, 0.0, 1.0], 1: [0.0, 0.0, 2.0], -1: [-2.0, 0.0, 0.0]}[
-            self.wind
-        ]
-        row, reward, over, _, _ = self.env.step(int(action))
-        return row, float(reward), bool(over)
+        torques = {0: [-1.0, 0.0, 1.0], 1: [0.0, 0.0, 2.0], -1: [-2.0, 0.0, 0.0]}
+        self.env.AVAIL_TORQUE = torques[self.wind]
+        return int(action)
 
     def set(self, attribute: str, value: float) -> None:
-        if attribute == "gravity":
-            self.env.gravity = value
-        elif attribute.startswith("link_length_"):
-            link = attribute[-1]
-            # Only link 1's length enters the equations; both centres of mass follow their length.
-            setattr(self.env, f"LINK_LENGTH_{link}", value)
-            setattr(self.env, f"LINK_COM_POS_{link}", value / 2)
-        else:
-            setattr(self.env, attribute.upper(), value)
+        super().set(attribute, value)
+        if attribute.startswith("link_length_"):  # the centre of mass follows
+            setattr(self.env, f"LINK_COM_POS_{attribute[-1]}", value / 2)
 
     def get(self, attribute: str) -> float:
         if attribute.startswith("link_length_"):
             return 2 * float(getattr(self.env, f"LINK_COM_POS_{attribute[-1]}"))
-        return float(getattr(self.env, attribute if attribute == "gravity" else attribute.upper()))
-
-    def close(self) -> None:
-        self.env.close()
+        return super().get(attribute)
 
 
-class CartPole:
+class CartPole(Simulator):
     """CartPole-v1: a push of 10 N to the left or right; wind takes pushes away or doubles them."""
 
+    names: ClassVar = {"pole_length": "length", "pole_mass": "masspole"}
+
     def __init__(self) -> None:
-        self.env: Any = CartPoleEnv()
-        self.wind = 0
+        super().__init__(CartPoleEnv())
         self._force = self.env.force_mag
 
-    def reset(self, seed: int) -> Row:
-        return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
-
-    def step(self, action: int) -> tuple[Row, float, bool]:
+    def command(self, action: int) -> int:
         direction = 1 if action == 1 else -1
-        # Against the wind: no force; with it: one unit more.
         self.env.force_mag = self._force * (1 + self.wind * direction)
-        row, reward, over, _, _ = self.env.step(int(action))
-        return row, float(reward), bool(over)
+        return int(action)
 
     def set(self, attribute: str, value: float) -> None:
-        env = self.env
-        setattr(
-            env, {"pole_length": "length", "pole_mass": "masspole"}.get(attribute, attribute), value
-        )
-        # Two derived quantities that the simulator computes once.
+        super().set(attribute, value)
+        env = self.env  # computes two quantities once
         env.total_mass = env.masspole + env.masscart
         env.polemass_length = env.masspole * env.length
 
@@ -178,56 +188,38 @@ class CartPole:
             return float(self.env.polemass_length / self.env.masspole)
         if attribute == "pole_mass":
             return float(self.env.total_mass - self.env.masscart)
-        return float(self.env.gravity)
-
-    def close(self) -> None:
-        self.env.close()
+        return super().get(attribute)
 
 
-class LunarLander:
-    """LunarLander-v3: engine 1 pushes to -x, engine 3 to +x, engine 2 upwards."""
+class LunarLander(Simulator):
+    """LunarLander-v3: engines 1 and 3 push to -x and +x; wind doubles one and stops the other."""
 
     def __init__(self) -> None:
-        self.env: Any = lunar_lander.LunarLander()
-        self.wind = 0
-        # Engine powers are globals of the simulator's module. This instance's step gets a copy of
-        # these globals, so that a changed power is seen by this episode alone.
+        super().__init__(lunar_lander.LunarLander())
+        # Engine powers are globals of the module: this instance's step gets a copy of its own.
         self._globals = dict(vars(lunar_lander))
         step = lunar_lander.LunarLander.step
-        own_step = types.FunctionType(
-            step.__code__, self._globals, step.__name__, step.__defaults__, step.__closure__
-        )
+        own_step = types.FunctionType(step.__code__, self._globals, closure=step.__closure__)
         setattr(self.env, "step", types.MethodType(own_step, self.env))  # noqa: B010  # for mypy
         self._side_power = float(self._globals["SIDE_ENGINE_POWER"])
 
-    def reset(self, seed: int) -> Row:
-        return np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
-
-    def step(self, action: int) -> tuple[Row, float, bool]:
+    def command(self, action: int) -> int:
         push = {1: -1, 3: 1}.get(int(action), 0)
-        # Against the wind: no engine; with it: the side engine doubled.
-        effective = 0 if push * self.wind < 0 else int(action)
         self._globals["SIDE_ENGINE_POWER"] = self._side_power * (2 if push * self.wind > 0 else 1)
-        row, reward, over, _, _ = self.env.step(effective)
-        return np.asarray(row, dtype=np.float32), float(reward), bool(over)
+        return 0 if push * self.wind < 0 else int(action)
 
     def set(self, attribute: str, value: float) -> None:
         if attribute == "gravity":
             # The environment reads its gravity at reset only; the world's acts at once.
             self.env.world.gravity = (0.0, -value)
-        elif attribute == "side_engine_power":
-            self._side_power = value
-            self._globals["SIDE_ENGINE_POWER"] = value
-        else:
-            self._globals["MAIN_ENGINE_POWER"] = value
+            return
+        self._globals[attribute.upper()] = value
+        self._side_power = value if attribute == "side_engine_power" else self._side_power
 
     def get(self, attribute: str) -> float:
         if attribute == "gravity":
             return -float(self.env.world.gravity[1])
         return float(self._globals[attribute.upper()])
-
-    def close(self) -> None:
-        self.env.close()
 
 
 _FUNCTIONS = {
@@ -237,81 +229,45 @@ _FUNCTIONS = {
 }
 
 
-class Bullet:
+class Bullet(Simulator):
     """One of the four PyBullet robots in a client of its own; wind adds to every motor command."""
 
-    wind_strength: ClassVar[float] = 0.33
-
-    def __init__(self, kind: type) -> None:
-        self.env: Any = kind()
-        self.wind = 0
+    def __init__(self, environment: str) -> None:
+        robot = ENVIRONMENTS[environment].title
+        super().__init__(getattr(bullet, f"{robot}BulletEnv")())
 
     def reset(self, seed: int) -> Row:
         with quiet_streams():
-            row = np.asarray(self.env.reset(seed=seed)[0], dtype=np.float32)
+            row = super().reset(seed)
         # The client binds a function to itself whenever one is called, some twenty times a step.
         client = self.env._p  # noqa: SLF001  # the simulator's only handle
         for name, function in _FUNCTIONS.items():
             setattr(client, name, functools.partial(function, physicsClientId=client._client))  # noqa: SLF001
         return row
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Row, float, bool]:
-        if self.wind:
-            action = np.clip(action + np.float32(self.wind * self.wind_strength), -1, 1)
-        row, reward, over, _, _ = self.env.step(action)
-        return np.asarray(row, dtype=np.float32), float(reward), bool(over)
+    def command(self, action: Row) -> Row:
+        return np.clip(action + np.float32(self.wind * 0.33), -1, 1) if self.wind else action
 
     def set(self, attribute: str, value: float) -> None:
         if attribute == "gravity":
-            # Acts on all further steps of this client, which ends with the episode.
             self.env._p.setGravity(0, 0, -value)  # noqa: SLF001  # the simulator's only handle
         else:
             self.env.robot.power = value
 
     def get(self, attribute: str) -> float:
-        if attribute == "gravity":
-            parameters = self.env._p.getPhysicsEngineParameters()  # noqa: SLF001
-            return -float(parameters["gravityAccelerationZ"])
-        return float(self.env.robot.power)
+        if attribute != "gravity":
+            return float(self.env.robot.power)
+        return -float(self.env._p.getPhysicsEngineParameters()["gravityAccelerationZ"])  # noqa: SLF001
 
     def close(self) -> None:
         with quiet_streams():
-            self.env.close()
-
-
-_BULLET = {
-    "ant": bullet.AntBulletEnv,
-    "halfcheetah": bullet.HalfCheetahBulletEnv,
-    "hopper": bullet.HopperBulletEnv,
-    "walker2d": bullet.Walker2DBulletEnv,
-}
-_CLASSIC: dict[str, Callable[[], Simulator]] = {
-    "acrobot": Acrobot,
-    "cartpole": CartPole,
-    "lunarlander": LunarLander,
-}
+            super().close()
 
 
 def make(environment: str) -> Simulator:
-    """Return a fresh simulator of an environment, to be used for one episode and closed.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that is not in `oodd_eval.data.facts.ENVIRONMENTS`.
-    """
-    if environment in _BULLET:
-        return Bullet(_BULLET[environment])
-    if environment in _CLASSIC:
-        return _CLASSIC[environment]()
-    raise UnknownNameError("environment", environment, ENVIRONMENTS)
-
-
-def check_observation(environment: str, row: Row) -> None:
-    """Raise `SimulationError` unless the simulator gives what the benchmark's table says."""
-    expected = ENVIRONMENTS[environment].observation_dim
-    if row.shape != (expected,):
-        raise SimulationError(
-            f"{environment}'s simulator gave an observation of shape {row.shape}, expected "
-            f"({expected},): another version of the simulator is installed than the benchmark's"
-        )
+    """Return a fresh simulator of an environment, to be used for one episode and closed."""
+    if environment not in ENVIRONMENTS:
+        raise UnknownNameError("environment", environment, ENVIRONMENTS)
+    classic: dict[str, Any] = {"acrobot": Acrobot, "cartpole": CartPole, "lunarlander": LunarLander}
+    found: Simulator = classic.get(environment, functools.partial(Bullet, environment))()
+    return found

@@ -1,14 +1,11 @@
 """Frozen nominal policies: arrays in npz files, provenance in a JSON file beside them.
 
-A policy is deterministic. Its forward pass runs in float64; continuous actions are rounded to a
-grid of 2^-16 so that the last bits of a matrix product cannot reach the simulator. Files are read
-without pickle.
+A policy is deterministic: its forward pass runs in float64, and is rounded to a grid of 2^-16 so
+that the last bits of a matrix product cannot reach the simulator.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS, EnvironmentInfo
+from oodd_eval.data.layout import content_digest
 from oodd_eval.errors import PolicyError, UnknownNameError
 
 FROZEN: Final = Path(__file__).with_name("frozen")
-"""Where the committed policies lie."""
-
 ACTION_GRID: Final = 2.0**16
-
 LAYERS: Final = {
     "TD3": ("W1", "b1", "W2", "b2", "W3", "b3"),
     "IQN": ("W1", "b1", "W2", "b2", "C", "c", "W3", "b3", "W4", "b4", "quantiles"),
@@ -49,7 +44,7 @@ class TD3Policy:
     """tanh(relu(relu(o W1 + b1) W2 + b2) W3 + b3): the actor of TD3 (Fujimoto et al. 2018)."""
 
     def __init__(self, arrays: Arrays) -> None:
-        self.digest = content_digest(arrays)
+        self.digest = policy_digest(arrays)
         self._layers = [np.asarray(arrays[name], dtype=np.float64) for name in LAYERS["TD3"]]
 
     def act(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -68,7 +63,7 @@ class IQNPolicy:
     """
 
     def __init__(self, arrays: Arrays) -> None:
-        self.digest = content_digest(arrays)
+        self.digest = policy_digest(arrays)
         w = {name: np.asarray(arrays[name], dtype=np.float64) for name in LAYERS["IQN"]}
         count = int(arrays["quantiles"])
         tau = (2 * np.arange(count) + 1) / (2 * count)
@@ -90,27 +85,13 @@ class IQNPolicy:
         return int(np.argmax(np.round(self.values(row) * ACTION_GRID)))
 
 
-def content_digest(arrays: Arrays) -> str:
-    """SHA-256 of names, dtypes, shapes and little-endian bytes, in the order of sorted names."""
-    sha = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.asarray(arrays[name])
-        array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<")))
-        sha.update(f"{name}|{array.dtype.str}|{array.shape}|".encode())
-        sha.update(array.tobytes())
-    return sha.hexdigest()
+def policy_digest(arrays: Arrays) -> str:
+    """Return the digest of a policy's arrays, see `content_digest`."""
+    return content_digest({name: np.atleast_1d(array) for name, array in arrays.items()})
 
 
 def load_policy(environment: str, path: str | Path | None = None) -> Policy:
-    """Load the frozen policy of an environment, or another policy file for it.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown environment.
-    PolicyError
-        When the file is missing, is no npz of plain arrays, or does not fit the environment.
-    """
+    """Load the frozen policy of an environment, or another file; `PolicyError` if it is none."""
     if environment not in ENVIRONMENTS:
         raise UnknownNameError("environment", environment, ENVIRONMENTS)
     info = ENVIRONMENTS[environment]
@@ -120,28 +101,18 @@ def load_policy(environment: str, path: str | Path | None = None) -> Policy:
             arrays = {n: stored[n] for n in LAYERS[info.policy] if n in stored.files}
     except FileNotFoundError:
         raise PolicyError(
-            f"no policy for {environment}: {file.name} does not exist; train one with "
-            f"`oodd-eval policies train {environment}`"
+            f"{file.name} does not exist: train it, `oodd-eval policies train {environment}`"
         ) from None
     # TypeError: a single array instead of an npz, which cannot be entered.
     except (BadZipFile, ValueError, TypeError, OSError, EOFError, zlib.error) as error:
-        raise PolicyError(
-            f"{file.name} is not a policy file (expected an npz of plain arrays): {error}"
-        ) from error
-    _check(file.name, info, arrays)
-    return _make(info, arrays)
+        raise PolicyError(f"{file.name} is not a policy file of plain arrays: {error}") from error
+    return make_policy(file.name, info, arrays)
 
 
-def _make(info: EnvironmentInfo, arrays: Arrays) -> Policy:
-    return TD3Policy(arrays) if info.policy == "TD3" else IQNPolicy(arrays)
-
-
-def _check(file: str, info: EnvironmentInfo, arrays: Arrays) -> None:
-    missing = [name for name in LAYERS[info.policy] if name not in arrays]
-    if missing:
-        raise PolicyError(
-            f"{file} lacks the arrays {', '.join(missing)} of a {info.policy} policy for {info.id}"
-        )
+def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
+    """Return a policy for an environment; `PolicyError` unless the arrays of a file are one."""
+    if missing := ", ".join(name for name in LAYERS[info.policy] if name not in arrays):
+        raise PolicyError(f"{file} lacks the arrays {missing} of a {info.policy} policy")
     last = arrays["b3"] if info.policy == "TD3" else arrays["b4"]
     found = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
     if found != (info.observation_dim, info.action_dim):
@@ -151,52 +122,11 @@ def _check(file: str, info: EnvironmentInfo, arrays: Arrays) -> None:
         )
     if any(a.dtype.kind not in "fiu" for a in arrays.values()):
         raise PolicyError(f"{file} holds arrays that are not numbers, expected float32 weights")
-    bad = [name for name, a in arrays.items() if not np.isfinite(a).all()]
-    if bad:
+    if bad := [name for name, a in arrays.items() if not np.isfinite(a).all()]:
         raise PolicyError(f"{file} holds values that are not finite in {', '.join(bad)}")
     try:
-        _make(info, arrays).act(np.zeros(info.observation_dim, np.float32))
+        policy: Policy = TD3Policy(arrays) if info.policy == "TD3" else IQNPolicy(arrays)
+        policy.act(np.zeros(info.observation_dim, np.float32))
     except (ValueError, TypeError, IndexError) as error:
-        raise PolicyError(
-            f"{file} holds layers that do not fit one another, expected the {info.policy} policy's "
-            f"chain of matrices: {error}"
-        ) from error
-
-
-def provenance(environment: str) -> dict[str, Any]:
-    """Return the provenance of a frozen policy: algorithm, steps, seed, curve, returns, digest."""
-    file = FROZEN / f"{environment}.json"
-    if not file.exists():
-        raise PolicyError(f"no provenance for the policy of {environment}: {file.name} is missing")
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
-
-
-def freeze_policy(
-    environment: str, arrays: Arrays, facts: Mapping[str, Any], directory: Path = FROZEN
-) -> str:
-    """Write a policy (float32 arrays) and its provenance; return the content digest.
-
-    Raises
-    ------
-    PolicyError
-        When the arrays do not make a policy for the environment.
-    """
-    info = ENVIRONMENTS[environment]
-    packed = {
-        name: np.asarray(arrays[name]).astype(np.int64 if name == "quantiles" else np.float32)
-        for name in LAYERS[info.policy]
-        if name in arrays
-    }
-    _check(f"{environment}.npz", info, packed)
-    digest = content_digest(packed)
-    directory.mkdir(parents=True, exist_ok=True)
-    partial = directory / f"{environment}.npz.partial"
-    with partial.open("wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **packed)
-    partial.replace(directory / f"{environment}.npz")
-    text = json.dumps({"environment": environment, **facts, "digest": digest}, indent=1)
-    partial = directory / f"{environment}.json.partial"
-    partial.write_text(text + "\n", encoding="utf-8")
-    partial.replace(directory / f"{environment}.json")
-    return digest
+        raise PolicyError(f"{file} holds layers that do not fit one another: {error}") from error
+    return policy

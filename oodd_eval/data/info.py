@@ -1,0 +1,87 @@
+"""A description of a split: sizes, lengths, onsets and returns, and the paper's Table 2."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.data.parts import AnomalousSet, EnvironmentData
+from oodd_eval.data.split import Split
+
+_KINDS = ("nominal", *ANOMALIES)
+Rows = list[list[str]]
+Returns = Mapping[str, NDArray[np.float64]]
+"""Of the test part by kind: ``nominal`` and the anomalies."""
+
+
+def describe(split: Split) -> str:
+    """Return all there is to know of a split as plain text; opens and verifies every file."""
+    manifest = split.manifest
+    definition = manifest["definition"]
+    cap = definition["episode_cap"] or "the simulator's"
+    recipe = (
+        f"split {split.name}, digest {split.digest}\n{definition['train']} training, "
+        f"{definition['calibration']} calibration trajectories, {definition['test']} test seeds; "
+        f"episode cap {cap}; seed base {definition['seed_base']}; "
+        f"generator {manifest['generator']}\nin {split.path}"
+    )
+    lines = [recipe]
+    header = ["group", "trajectories", "transitions", "length", "onset", "redraws", "return"]
+    returns: dict[str, Returns] = {}
+    for name in split.environments:
+        entry = manifest["environments"][name]
+        size = (split.path / entry["file"]).stat().st_size / 1e6
+        title = f"{ENVIRONMENTS[name].title}: {size:.2f} MB, policy {entry['policy'][:12]}"
+        with closing(split.environment(name)) as data:
+            lines += ["", _table(title, header, group_rows(data))]
+            returns[name] = collect_returns(data)
+    title = "Table 2: mean return of the policies, nominal and under each anomaly"
+    return "\n".join(
+        [*lines, "", _table(title, ["Environment", "", *_KINDS], return_rows(returns))]
+    )
+
+
+def group_rows(data: EnvironmentData) -> Rows:
+    """Return per part: trajectories, transitions, lengths, onsets, redraws and returns."""
+    rows = []
+    anomalous = map(data.anomalous, data.anomalies)
+    for part in (data.train, data.calibration, data.twins, *anomalous):
+        drawn = ["", ""]
+        if isinstance(part, AnomalousSet):
+            drawn = [_span(part.onsets), str(part.redraws.sum())]
+        sizes = [str(len(part)), str(part.lengths.sum()), _span(part.lengths)]
+        mean = f"{part.returns.mean():.1f} ± {part.returns.std():.1f}"
+        rows.append([part.group, *sizes, *drawn, mean])
+    return rows
+
+
+def collect_returns(data: EnvironmentData) -> Returns:
+    """Return the returns of the test part by kind."""
+    return {"nominal": data.twins.returns} | {a: data.anomalous(a).returns for a in data.anomalies}
+
+
+def return_rows(returns: Mapping[str, Returns]) -> Rows:
+    """Return mean returns by environment and kind, ours above the paper's, which has no cap."""
+    rows = []
+    for environment, found in returns.items():
+        paper = paper_tables()["table2_policy_return"][environment]
+        ours = [f"{found[k].mean():.1f}" if k in found else "" for k in _KINDS]
+        title = ENVIRONMENTS[environment].title
+        rows += [[title, "ours", *ours], ["", "paper", *(f"{paper[k]:.1f}" for k in _KINDS)]]
+    return rows
+
+
+def _span(values: NDArray[np.int64]) -> str:
+    """Return the range of some integers, as one number when they are equal."""
+    return "..".join(map(str, sorted({values.min(), values.max()})))
+
+
+def _table(title: str, header: Sequence[str], rows: Rows) -> str:
+    from tabulate import tabulate  # noqa: PLC0415  only where tables are set
+
+    # Numbers are formatted already; tabulate would parse them and drop zeros behind the point.
+    return f"{title}\n\n{tabulate(rows, header, 'simple', disable_numparse=True)}"

@@ -1,0 +1,174 @@
+"""The parts of an environment's data: training, calibration, twins and one part per anomaly.
+
+Names, onsets and parameters stay with the harness; a detector is handed `Trajectory` objects only.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
+from oodd_eval.errors import SplitError, UnknownNameError
+
+TRAIN: Final = "train"
+CALIBRATION: Final = "calibration"
+TWINS: Final = "test/nominal"
+
+PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
+"""All parts in the benchmark's order. Each is a group of the environment's file."""
+
+_ROWS: Final = 1 << 14
+"""Transitions that are read at once from a large part, unless a single trajectory has more."""
+
+_KEPT: Final = 1 << 24
+"""Bytes up to which a part is decompressed once and kept."""
+
+
+class TrajectorySet(TrajectorySequence):
+    """The trajectories of one part, decompressed once, or a few at a time beyond 16 MiB.
+
+    `group` is the name of the part, such as ``"test/iid"``; `lengths` and `seeds` (int64, of shape
+    (n,)) are the transitions of each trajectory and the environment's seeds.
+    """
+
+    def __init__(self, file: h5py.File, group: str) -> None:
+        self._data = file[group]
+        self.group = group
+        self._offsets: NDArray[np.int64] = self._data["offsets"][:]
+        self.lengths: NDArray[np.int64] = np.diff(self._offsets)
+        self.seeds: NDArray[np.int64] = self._data["seeds"][:]
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def _one(self, i: int) -> Trajectory:
+        return next(self._read(i, i + 1))
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        # Several at a time: a chunk of the file holds rows of many trajectories.
+        start = 0
+        while start < len(self):
+            most = self._offsets[start] + max(self.lengths[start], _ROWS)
+            stop = int(np.searchsorted(self._offsets, most, side="right")) - 1
+            yield from self._read(start, stop)
+            start = stop
+
+    @functools.cached_property
+    def _rows(self) -> tuple[Any, Any]:
+        """Observation and action rows: arrays of a small part, datasets of a large one."""
+        observations, actions = self._data["observations"], self._data["actions"]
+        if observations.nbytes + actions.nbytes > _KEPT:
+            return observations, actions
+        return observations[:], actions[:]
+
+    def _read(self, start: int, stop: int) -> Iterator[Trajectory]:
+        """Yield the trajectories of a range, whose rows are read at once."""
+        first, last = int(self._offsets[start]), int(self._offsets[stop])
+        observations, actions = self._rows
+        observations, actions = observations[first + start : last + stop], actions[first:last]
+        for i in range(start, stop):
+            a, b = self._offsets[i : i + 2] - first
+            yield Trajectory(observations[a + i - start : b + i - start + 1], actions[a:b])
+
+    def rewards(self, index: int) -> NDArray[np.float32]:
+        """Return the rewards of trajectory number `index`, float32 of shape (T,)."""
+        i = range(len(self))[index]
+        found: NDArray[np.float32] = self._data["rewards"][self._offsets[i] : self._offsets[i + 1]]
+        return found
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """Sum of rewards of each trajectory, of shape (n,)."""
+        rewards = self._data["rewards"][:].astype(np.float64)
+        return np.add.reduceat(rewards, self._offsets[:-1]) if len(self) else np.zeros(0)
+
+    @property
+    def terminated(self) -> NDArray[np.bool_]:
+        """True for each episode that the simulator ended, False for one that the cap ended."""
+        return np.asarray(self._data["terminated"][:], dtype=bool)
+
+
+class AnomalousSet(TrajectorySet):
+    """Anomalous trajectories and what is known of them; number i is the twin of test seed i.
+
+    `onsets` (int64, of shape (n,)) are the first observations that may differ from the twins',
+    `redraws` the numbers of draws that were rejected.
+    """
+
+    def __init__(self, file: h5py.File, group: str) -> None:
+        super().__init__(file, group)
+        self.onsets: NDArray[np.int64] = self._data["onsets"][:]
+        self.redraws: NDArray[np.int64] = self._data["redraws"][:]
+
+    @functools.cached_property
+    def parameters(self) -> list[dict[str, Any]]:
+        """Values that the anomaly drew for each trajectory."""
+        return [json.loads(text) for text in self._data["parameters"][:]]
+
+
+class EnvironmentData:
+    """The verified content of one environment: `id` is its name, `digest` that of all its parts."""
+
+    def __init__(self, environment: str, file: h5py.File, digest: str) -> None:
+        self.id, self.digest, self._file = environment, digest, file
+
+    @functools.cached_property
+    def train(self) -> TrajectorySet:
+        """Nominal trajectories to fit on."""
+        return TrajectorySet(self._file, TRAIN)
+
+    @functools.cached_property
+    def calibration(self) -> TrajectorySet:
+        """Nominal trajectories that standardize scores and calibrate alarms."""
+        return TrajectorySet(self._file, CALIBRATION)
+
+    @functools.cached_property
+    def twins(self) -> TrajectorySet:
+        """Nominal test trajectories, one per test seed."""
+        return TrajectorySet(self._file, TWINS)
+
+    def anomalous(self, anomaly: str) -> AnomalousSet:
+        """Return the test trajectories with one of `anomalies`, in the order of their twins.
+
+        Raises `UnknownNameError` when the benchmark has no such anomaly, `SplitError` when this
+        split has no such part.
+        """
+        if anomaly not in ANOMALIES:
+            raise UnknownNameError("anomaly", anomaly, ANOMALIES)
+        if f"test/{anomaly}" not in self._file:
+            raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
+        return AnomalousSet(self._file, f"test/{anomaly}")
+
+    @property
+    def anomalies(self) -> tuple[str, ...]:
+        """Names of the anomalies in this split."""
+        return tuple(a for a in ANOMALIES if f"test/{a}" in self._file)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def parts_of(data: EnvironmentData, anomalies: Iterable[str]) -> dict[str, TrajectorySet]:
+    """Return the parts to score by name: calibration, the twins and the anomalies."""
+    anomalous = {f"test/{a}": data.anomalous(a) for a in anomalies}
+    return {CALIBRATION: data.calibration, TWINS: data.twins, **anomalous}
+
+
+def lengths_of(sets: Mapping[str, TrajectorySet], limit: int | None) -> dict[str, list[int]]:
+    """Return the number of observations of each trajectory to score, by part."""
+    return {part: [int(n) + 1 for n in s.lengths[:limit]] for part, s in sets.items()}
+
+
+def limited(n: int, limit: int | None) -> int:
+    """Return the number of trajectories that are used out of n."""
+    return n if limit is None else min(n, limit)

@@ -1,1 +1,0 @@
-"""Splits on their way: copies fetched from elsewhere, and exports to other projects' formats."""
