@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.metrics.alarms import (
-    MIN_STEPS,
-    Monitor,
-    calibrate,
-    calibrated_contributions,
-    false_alarm_rate,
-)
+from oodd_eval.metrics.alarms import Monitor, calibrate, false_alarm_rate
 from oodd_eval.metrics.auc import AlarmRule
 from oodd_eval.metrics.cusum import Standardization, cusum
 
@@ -50,18 +44,6 @@ def test_quiet_scores_need_no_threshold():
 
 def test_without_defined_scores_there_is_no_threshold():
     assert math.isnan(calibrate([np.array([math.nan])], rule(), 0.01))
-
-
-def test_a_target_is_offered_only_where_the_calibration_part_can_support_it():
-    noise = np.random.default_rng(1)
-    calibration = list(noise.normal(size=(5, 400)))
-    test, twins = list(noise.normal(size=(2, 100))), list(noise.normal(size=(2, 100)))
-    thresholds, found = calibrated_contributions(calibration, test, twins, [40, 50], rule())
-    assert MIN_STEPS["at_1pct"] <= 2000
-    assert list(thresholds) == ["threshold_at_1pct"]
-    assert set(found) == {
-        f"{m}_at_1pct" for m in ("far", "far_twin", "delay", "delay_censored", "missed")
-    }
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -14,21 +14,18 @@ from oodd_eval import evaluate
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import OutputError, ResultsError
 from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, auc_contributions
-from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Standardization, cusum
-from oodd_eval.results.curve_file import check_curves
-from oodd_eval.results.curves import (
+from oodd_eval.metrics.curves import (
     FPR,
     Sweep,
-    _rounded,
     delay_far,
     example,
-    make_curves,
     mean_matched_roc,
-    read_curves,
     roc,
+    rounded,
     thresholds,
-    write_curves,
 )
+from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Standardization, cusum
+from oodd_eval.results.curve_file import check_curves, make_curves, read_curves, write_curves
 from oodd_eval.results.directory import ResultsDirectory
 
 RULE = AlarmRule(Standardization(mean=0.0, std=1.0))
@@ -214,7 +211,7 @@ def stored(tiny_split, tmp_path_factory):
 
 def test_curves_of_a_run_agree_with_its_records(stored):
     records, _, curves = stored
-    assert [u["cell"] for u in curves["units"]] == [r.cell for r in records]
+    assert [u["cell"] for u in curves["units"]] == [str(r.cell) for r in records]
     for record, unit in zip(records, curves["units"], strict=True):
         assert (unit["environment"], unit["anomaly"]) == ("cartpole", record.anomaly)
         points = unit["delay_far"]
@@ -255,8 +252,9 @@ def test_written_curves_are_read_back(stored, tmp_path):
 
 
 def test_curves_that_cannot_be_written_are_said_so(stored, tmp_path):
+    (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
-        write_curves(stored[2], tmp_path / "no" / "curves.json")
+        write_curves(stored[2], tmp_path / "file" / "curves.json")
 
 
 @pytest.mark.parametrize("text", [None, "{", "[" * 100_000, "\xff"])
@@ -269,32 +267,37 @@ def test_files_that_are_no_json_are_refused(tmp_path, text):
 
 
 DAMAGE = [
-    (("schema",), 2, "schema is 2, expected 1"),
-    (("schema",), True, "schema is True, expected int"),
-    (("units",), {}, "units is {}, expected list"),
-    (("more",), 1, "unknown ['more']"),
-    (("units", 0), [], "units[0] is 'list', expected a JSON object"),
-    (("units", 0, "cell"), 7, "units[0].cell is 7, expected str"),
+    (("schema",), 2, "schema is 2"),
+    (("schema",), True, "schema is True"),
+    (("units",), {}, "units is {}"),
+    (("more",), 1, "more is 1"),
+    (("units", 0), [], "units[0] is []"),
+    (("units", 0, "cell"), 7, "units[0].cell is 7"),
     (("units", 0, "environment"), "moon", "units[0].environment is 'moon'"),
     (("units", 0, "anomaly"), "x", "units[0].anomaly is 'x'"),
-    (("units", 0, "horizon"), "1", "units[0].horizon is '1', expected int"),
-    (("units", 0, "roc"), {"fpr": []}, "units[0].roc has other fields than expected: missing"),
-    (("units", 0, "roc", "tpr"), [0.5], "units[0].roc.tpr is '1 numbers', expected 25"),
-    (("units", 0, "roc", "tpr", 3), 1.1, "units[0].roc.tpr[3] is 1.1, expected a number in [0, 1]"),
-    (("units", 0, "roc", "fpr", 2), 0.0, "units[0].roc.fpr[2] is 0.0, expected at least"),
+    (("units", 0, "horizon"), "1", "units[0].horizon is '1'"),
+    (("units", 0, "seed"), False, "units[0].seed is False"),
+    (("units", 0, "roc"), {"fpr": []}, "units[0].roc.tpr is "),
+    (("units", 0, "roc", "tpr"), [0.5], "units[0].roc.tpr is '1 numbers'"),
+    (("units", 0, "roc", "tpr"), [0.5] * 2000, "units[0].roc.tpr is ["),
+    (("units", 0, "roc", "tpr", 3), 1.1, "units[0].roc.tpr[3] is 1.1"),
+    (("units", 0, "roc", "tpr", 3), True, "units[0].roc.tpr[3] is True"),
+    (("units", 0, "roc", "fpr", 2), 0.0, "units[0].roc.fpr[2] is 0.0"),
     (("units", 0, "roc", "fpr", 2), math.nan, "units[0].roc.fpr[2] is nan"),
     (("units", 0, "roc", "fpr", 2), "0.1", "units[0].roc.fpr[2] is '0.1'"),
     (("units", 0, "delay_far", "far", 0), -0.1, "units[0].delay_far.far[0] is -0.1"),
     (("units", 0, "delay_far", "delay_censored", 0), math.inf, "delay_censored[0] is inf"),
     (("units", 0, "delay_far", "delay_censored", 0), 10**400, "delay_censored[0] is 1000"),
     (("units", 0, "example", "index"), -1, "units[0].example.index is -1"),
+    (("units", 0, "example", "index"), 1.0, "units[0].example.index is 1.0"),
     (("units", 0, "example", "auc_matched"), 2, "units[0].example.auc_matched is 2"),
-    (("units", 0, "example", "onset"), 999, "units[0].example.onset is 999, expected less than"),
-    (("units", 0, "example", "start"), 60, "units[0].example.start is 60, expected at most onset"),
+    (("units", 0, "example", "onset"), 999, "units[0].example.onset is 999"),
+    (("units", 0, "example", "start"), 60, "units[0].example.start is 60"),
     (("units", 0, "example", "scores"), [], "units[0].example.scores is '0 numbers'"),
+    (("units", 0, "example", "scores", 1), 1e16, "units[0].example.scores[1] is 1e+16"),
     (("units", 0, "example", "cusum", 1), None, "units[0].example.cusum[1] is None"),
     (("units", 0, "example", "cusum", 1), -1, "units[0].example.cusum[1] is -1"),
-    (("units", 0, "example", "alarms"), [500], "units[0].example.alarms[0] is 500, expected a row"),
+    (("units", 0, "example", "alarms"), [500], "units[0].example.alarms[0] is 500"),
     (("units", 0, "example", "alarms"), [1.5], "units[0].example.alarms[0] is 1.5"),
 ]
 
@@ -309,13 +312,14 @@ def test_every_damaged_field_is_named(stored, path, value, message):
     place[last] = value
     with pytest.raises(ResultsError) as caught:
         check_curves(plain, "curves.json")
+    assert str(caught.value).startswith("curves.json: ")
     assert message in str(caught.value)
 
 
 def test_a_cell_may_occur_once(stored):
     plain = copy.deepcopy(stored[2])
     plain["units"][1]["cell"] = plain["units"][0]["cell"]
-    with pytest.raises(ResultsError, match=r"units\[1\].cell is .* did not occur before"):
+    with pytest.raises(ResultsError, match=r"units\[1\].cell is .* before"):
         check_curves(plain, "curves.json")
 
 
@@ -328,14 +332,7 @@ def test_an_example_ends_with_its_trajectory(stored):
         check_curves(plain, "curves.json")
 
 
-def test_lists_are_of_limited_length(stored):
-    plain = copy.deepcopy(stored[2])
-    plain["units"][0]["roc"] = {"fpr": [0] * 2000, "tpr": [0] * 2000}
-    with pytest.raises(ResultsError, match="'2000 numbers', expected at most 1000"):
-        check_curves(plain, "curves.json")
-
-
 def test_numbers_are_rounded_for_drawing():
-    assert _rounded({"a": [1 / 3, 2.0, 123456.0, 1e-9], "b": None, "c": math.inf}) == {
+    assert rounded({"a": [1 / 3, 2.0, 123456.0, 1e-9], "b": None, "c": math.inf}) == {
         "a": [0.333, 2, 123000, 0], "b": None, "c": 10**12,
     }  # fmt: skip

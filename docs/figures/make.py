@@ -15,13 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from oodd_eval import load_split
-from oodd_eval.data.split import AnomalousSet, EnvironmentData
+from oodd_eval.data.parts import AnomalousSet, EnvironmentData
 from oodd_eval.metrics.alarms import calibrate
 from oodd_eval.metrics.auc import AlarmRule, auc_onset, auc_same_times, first_delay
+from oodd_eval.metrics.curves import Sweep, delay_far, thresholds
 from oodd_eval.metrics.cusum import UNIT, Standardization, cusum
 from oodd_eval.plugins.contract import Detector, Scores
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.results.curves import Sweep, delay_far, thresholds
 
 ENVIRONMENT = "hopper"
 DYNAMICS, SENSOR = "components", "shutdown"

@@ -1,1 +1,1 @@
-"""Room."""
+"""Metrics: pure functions of score arrays, their catalogue, intervals and ranks."""

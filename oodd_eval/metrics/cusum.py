@@ -25,27 +25,14 @@ THRESHOLD: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Standardization:
-    """Mean and standard deviation of a detector's nominal scores.
-
-    Attributes
-    ----------
-    mean, std
-        Over all defined calibration scores, ddof 0; NaN when there are none.
-    """
+    """Mean and standard deviation (ddof 0) of all defined calibration scores; NaN without any."""
 
     mean: float
     std: float
 
     @classmethod
     def fit(cls, scores: Iterable[Floats]) -> Standardization:
-        """Pool all defined scores of the calibration trajectories.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> Standardization.fit([np.array([np.nan, 1.0]), np.array([3.0])])
-        Standardization(mean=2.0, std=1.0)
-        """
+        """Pool all defined scores of the calibration trajectories."""
         pooled = np.concatenate([np.zeros(0), *(s[~np.isnan(s)] for s in scores)])
         if not pooled.size:
             return cls(math.nan, math.nan)
@@ -64,19 +51,16 @@ class Standardization:
 def cusum(
     x: Floats, *, drift: float = DRIFT, threshold: float = THRESHOLD
 ) -> tuple[Floats, Alarms]:
-    """One-sided cumulative sum (CUSUM) of standardized scores, with alarms.
+    """One-sided cumulative sum (CUSUM; Page, Biometrika 41, 1954) of standardized scores.
 
     ``S_t = max(0, S_{t-1} + x_t - drift)``; an alarm at every t with ``S_t > threshold``, after
-    which the sum starts again at 0.
-
-    The sum rises when scores exceed their nominal mean by more than the drift and forgets
-    excursions below it, so that a lasting small rise and a short large one both raise an alarm.
+    which the sum starts again at 0. A lasting small rise of the scores and a short large one both
+    raise an alarm.
 
     Parameters
     ----------
     x : float64 array of shape (T + 1,)
-        Standardized scores, see `Standardization`; in units of 0.01 standard deviations. NaN
-        before the first defined step.
+        Scores as `Standardization` returns them; NaN before the first defined step.
     drift
         Allowance per step, in the unit of x. Larger: fewer false alarms, blind to smaller changes.
     threshold
@@ -88,23 +72,14 @@ def cusum(
         ``S_t`` before the reset that an alarm brings; 0 where x is undefined.
     alarms : bool array of shape (T + 1,)
 
-    See Also
-    --------
-    detecta_alarms : the two-sided rule on raw first differences of the package detecta.
-    oodd_eval.metrics.alarms.calibrate : thresholds with a false-alarm rate chosen in advance.
-
     Notes
     -----
-    With the paper's drift 0.0018 and threshold 0.01, that is 0.18 and 1 standard deviation, expect
-    an alarm at roughly every tenth nominal step.
-
-    References
-    ----------
-    E. S. Page, "Continuous inspection schemes", Biometrika 41, 1954.
+    With the paper's drift and threshold, 0.18 and 1 standard deviation, expect an alarm at roughly
+    every tenth nominal step; `oodd_eval.metrics.alarms.calibrate` finds a threshold with a
+    false-alarm rate chosen in advance.
 
     Examples
     --------
-    >>> import numpy as np
     >>> statistic, alarms = cusum(np.array([np.nan, 0.5, 0.5, 2.0, 0.0]), drift=0.25, threshold=1)
     >>> statistic.tolist(), alarms.tolist()
     ([0.0, 0.25, 0.5, 2.25, 0.0], [False, False, False, True, False])
@@ -112,8 +87,7 @@ def cusum(
     statistic = np.zeros(len(x))
     alarms = np.zeros(len(x), dtype=bool)
     total = 0.0
-    # A scalar loop over Python floats: the reset makes the recursion sequential, and this is
-    # several times faster than indexing numpy scalars.
+    # The reset makes the recursion sequential; Python floats are faster than numpy scalars.
     for t, value in enumerate((x - drift).tolist()):
         if value != value:  # noqa: PLR0124  # NaN: not defined yet
             continue
@@ -131,29 +105,16 @@ def cusum(
 def detecta_alarms(
     scores: Floats, *, drift: float = DRIFT, threshold: float = THRESHOLD
 ) -> NDArray[np.int64]:
-    """Alarm times of the two-sided CUSUM on first differences, as the package detecta has it.
+    """Alarm times of the two-sided CUSUM on first differences of defined scores.
 
     ``g+_t = max(0, g+_{t-1} + d_t - drift)``, ``g-_t = max(0, g-_{t-1} - d_t - drift)`` with
     ``d_t = s_t - s_{t-1}``; an alarm when either exceeds the threshold, after which both start
     again at 0. The released code of the paper applies this rule to raw scores; it is here for
-    comparison and enters no metric.
-
-    Parameters
-    ----------
-    scores : float64 array of shape (n,)
-        Defined scores only.
-
-    Returns
-    -------
-    int64 array of alarm times.
-
-    Notes
-    -----
-    Equal to ``detecta.detect_cusum(x, threshold, drift, ending=False)[0]`` of detecta 0.1.0.
+    comparison and enters no metric. Equal to ``detecta.detect_cusum(scores, threshold, drift,
+    ending=False)[0]`` of detecta 0.1.0.
 
     Examples
     --------
-    >>> import numpy as np
     >>> detecta_alarms(np.array([0.0, 0.0, 1.0, 1.0, 0.0]), drift=0.0, threshold=0.5).tolist()
     [2, 4]
     """

@@ -4,8 +4,8 @@ A row is better than another when the paired bootstrap over test seeds says so a
 correction over all ordered pairs of the table. Ranks count the rows that are better; rows that
 share a tie group cannot be told apart.
 
-Everything here is a function of arrays: per row and detector seed, the numerators and denominators
-of a metric in every cell. Higher is better.
+Rows are given as the numerators and denominators of a metric, per detector seed and cell. Higher
+is better.
 """
 
 from __future__ import annotations
@@ -24,42 +24,36 @@ from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, percentiles
 
 ALPHA: Final = 0.05
-"""Family-wise error rate of one table: of calling any row better that is not."""
+"""Highest chance that a table calls any row better that is not (family-wise error rate)."""
 
 MIN_RESAMPLES: Final = 10_000
-"""Fewest resamples that ranks are made with."""
+"""Least number of bootstrap resamples."""
 
 RESAMPLES_PER_PAIR: Final = 50
-"""With R resamples no p-value is below 1 / (R + 1); R grows with the number of pairs, so that
-Holm's correction leaves room for significance in a table of any length."""
+"""Resamples per ordered pair: no p-value is below 1 / (R + 1), so R has to grow with the number of
+pairs for anything to stay significant after Holm's correction."""
 
 OWN_SEEDS: Final = "detector seeds"
-"""Source of noise beside the environments' test seeds."""
+"""Source of noise that a row's own detector seeds are."""
 
 NOISE: Final = 1e-12
-"""Differences up to this are rounding: equal rows have to come out equal on every machine."""
+"""Largest difference that is taken for rounding, so that equal rows are equal on every machine."""
 
 Floats = NDArray[np.float64]
-Cell = tuple[str, str]
+Place = tuple[str, str]
 """Environment and anomaly; cells of one environment share their resamples."""
-Row = Mapping[int, Mapping[Cell, Contribution]]
+Row = Mapping[int, Mapping[Place, Contribution]]
 """One row's contributions by detector seed and cell."""
 Influences = dict[str, Floats]
 """By source of noise: how much each test or detector seed shifts a mean, centred on 0."""
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """One ordered pair of rows: how much better the first is than the second.
+class PairTest:
+    """The test of one ordered pair of rows: whether the first is better than the second.
 
-    Attributes
-    ----------
-    first, second
-        Names of the rows.
-    difference, low, high
-        Mean of the first minus mean of the second over all cells, with the paired 95 % interval.
-    p, p_holm
-        One-sided p-value of "not better", and the same after Holm's correction.
+    The difference is that of their means over all cells, with its paired 95 % interval; `p` is the
+    one-sided p-value of "not better", and `p_holm` the same after Holm's correction.
     """
 
     first: str
@@ -72,59 +66,38 @@ class Comparison:
 
     @property
     def better(self) -> bool:
-        """Whether the first row is significantly better than the second."""
+        """True when the first row is significantly better than the second."""
         return self.p_holm <= ALPHA
 
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Ranked rows of one table.
+    """Ranked rows of one table: ranks by row, tie groups and the tests of all ordered pairs.
 
-    Attributes
-    ----------
-    ranks
-        By row: 1 + the number of rows that are significantly better.
-    groups
-        Tie groups, see `tie_groups`.
-    comparisons
-        All ordered pairs.
-    resamples
-        Number of bootstrap resamples R.
+    A rank is 1 + the number of rows that are significantly better.
     """
 
     ranks: dict[str, int]
     groups: list[tuple[str, ...]]
-    comparisons: list[Comparison]
+    comparisons: list[PairTest]
     resamples: int
 
     def letters(self, row: str) -> str:
-        """Return the letters of the tie groups that a row shares with others, such as ``"ab"``.
-
-        Empty for a row that is told apart from all others.
-        """
+        """Return the letters of the tie groups that a row shares with others, such as ``"ab"``."""
         shared = [group for group in self.groups if len(group) > 1]
         return "".join(_letter(i) for i, group in enumerate(shared) if row in group)
 
 
 def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
-    """Rank the rows of one table.
+    """Rank the rows of one table, in the same way for any order of rows, seeds and cells.
 
     Parameters
     ----------
     rows
-        By name. All have the same cells for each of their detector seeds, and the same test
-        trajectories in a cell.
+        By name. ResultsError: rows differ in cells or in the number of test trajectories, or a cell
+        has no value.
     resamples
         Number of bootstrap resamples R; by default at least 10 000 and 50 per ordered pair.
-
-    Returns
-    -------
-    The same for any order of rows, seeds and cells.
-
-    Raises
-    ------
-    ResultsError
-        When rows differ in cells or in the number of test trajectories, or a cell has no value.
 
     Notes
     -----
@@ -136,9 +109,8 @@ def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
     ``2 ** -N`` with N test seeds in all environments together: if neither row is better, each
     seed's difference might as well have the other sign.
 
-    Test seeds are drawn jointly for all rows and all anomalies of an environment, so that
-    differences are paired. A row with several detector seeds has these drawn, too, independently of
-    other rows, because seed 0 of one detector has nothing in common with seed 0 of another; the two
+    Test seeds are drawn jointly for all rows and anomalies of an environment, so that differences
+    are paired. Several detector seeds of a row are drawn, too, independently of other rows; the two
     sources of noise are added.
     """
     names = sorted(rows)
@@ -147,41 +119,39 @@ def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
     count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * len(pairs))
     draws = {e: bootstrap_weights(n, key=e, resamples=count) for e, n in shape.items()}
     for name in names:
-        own = _source(OWN_SEEDS, name)
+        own = f"{OWN_SEEDS} of {name}"
         draws[own] = bootstrap_weights(len(rows[name]), key=own, resamples=count)
-    influences = {name: _influences(rows[name]) for name in names}
+    influences = {name: _influences(name, rows[name]) for name in names}
     floor = 2.0 ** -sum(shape.values())
     means = {name: _mean(rows[name]) for name in names}
     found = []
     for a, b in pairs:
-        effect = _difference(a, b, influences)
+        effect = _difference(influences[a], influences[b])
         difference = means[a] - means[b]
         shifts, exceeding, falling = _test(difference, effect, draws)
         low, high = percentiles(difference + shifts)
         for first, second, sign, k in ((a, b, 1, exceeding), (b, a, -1, falling)):
             ends = (low, high) if sign > 0 else (-high, -low)
             p = max((1 + k) / (count + 1), floor)
-            found.append(Comparison(first, second, sign * difference, *ends, p, math.nan))
+            found.append(PairTest(first, second, sign * difference, *ends, p, math.nan))
     corrected = holm(np.array([c.p for c in found]))
     comparisons = [replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
     better = {(c.first, c.second) for c in comparisons if c.better}
     ranks = {name: 1 + sum((other, name) in better for other in names) for name in names}
     order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
-    return Ranking(
-        {name: ranks[name] for name in order}, tie_groups(order, better), comparisons, count
-    )
+    ranks = {name: ranks[name] for name in order}
+    return Ranking(ranks, tie_groups(order, better), comparisons, count)
 
 
 def holm(p: Floats) -> Floats:
-    """Return p-values after Holm's step-down correction for the number of them.
+    """Return p-values after Holm's step-down correction for the number of them (Holm, 1979).
 
     The i-th smallest of m p-values (i from 1) is multiplied by ``m - i + 1``; a corrected value is
     at least as large as those of smaller p-values, and at most 1. Calling significant what is at
-    most alpha keeps the chance of any false call at alpha, whatever the dependence (Holm, 1979).
+    most alpha keeps the chance of any false call at alpha, whatever the dependence.
 
     Examples
     --------
-    >>> import numpy as np
     >>> holm(np.array([0.01, 0.04, 0.03, 0.005])).round(3).tolist()
     [0.03, 0.06, 0.06, 0.02]
     """
@@ -193,23 +163,11 @@ def holm(p: Floats) -> Floats:
 
 
 def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[tuple[str, ...]]:
-    """Return the largest sets of rows of which no two can be told apart.
+    """Return the largest sets of rows of which no two can be told apart, in the rows' order.
 
-    Parameters
-    ----------
-    names
-        Rows, best first.
-    better
-        Pairs (better, worse) that are significant.
-
-    Returns
-    -------
-    Groups in the order of their members; every row is in at least one.
-
-    Notes
-    -----
     "Cannot be told apart" is not transitive: the first may be better than the third while the
     second is told apart from neither. Then there are two groups, with the second row in both.
+    Significant pairs are (better, worse).
 
     Examples
     --------
@@ -221,25 +179,16 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
         split = [g for g in groups if not g.issuperset(pair)]
         split += [g - {one} for g in groups if g.issuperset(pair) for one in pair]
         groups = [g for g in set(split) if not any(g < other for other in split)]
-    position = {name: i for i, name in enumerate(names)}
-    return sorted(
-        (tuple(sorted(g, key=position.__getitem__)) for g in groups),
-        key=lambda group: [position[name] for name in group],
-    )
+    # By position, since names have an order of their own.
+    positions = sorted(sorted(map(names.index, group)) for group in groups)
+    return [tuple(names[i] for i in group) for group in positions]
 
 
-def win_rates(values: Mapping[str, Mapping[Cell, float]]) -> dict[tuple[str, str], float]:
+def win_rates(values: Mapping[str, Mapping[Place, float]]) -> dict[tuple[str, str], float]:
     """Return the share of cells in which a row's value is higher than another's, for all pairs.
 
-    Parameters
-    ----------
-    values
-        By row and cell; NaN where undefined.
-
-    Returns
-    -------
-    By (row, other): over the cells that both have, equal values counting one half, so that a pair's
-    two rates sum to 1; NaN without common cells.
+    Shares are over the cells that both have, equal values counting one half, so that a pair's two
+    rates sum to 1; NaN without common cells.
 
     Examples
     --------
@@ -250,12 +199,9 @@ def win_rates(values: Mapping[str, Mapping[Cell, float]]) -> dict[tuple[str, str
     rates = {}
     for row, other in itertools.permutations(values, 2):
         common = [(values[row][c], values[other][c]) for c in values[row] if c in values[other]]
-        wins = [
-            0.5 if abs(x - y) <= NOISE else float(x > y)
-            for x, y in common
-            if not np.isnan([x, y]).any()
-        ]
-        rates[row, other] = sum(wins) / len(wins) if wins else float("nan")
+        defined = [x - y for x, y in common if not math.isnan(x) and not math.isnan(y)]
+        wins = [0.5 if abs(d) <= NOISE else float(d > 0) for d in defined]
+        rates[row, other] = sum(wins) / len(wins) if wins else math.nan
     return rates
 
 
@@ -271,10 +217,8 @@ def _shape(rows: Mapping[str, Row]) -> dict[str, int]:
                     "only rows with all cells are ranked"
                 )
             for cell, contribution in cells.items():
-                where = "/".join(cell)
-                n = len(contribution.numerator)
-                size = sizes.setdefault(cell[0], n)
-                if n != size:
+                where, n = "/".join(cell), len(contribution.numerator)
+                if n != (size := sizes.setdefault(cell[0], n)):
                     raise ResultsError(
                         f"{name} has {n} test trajectories in {where}, expected {size}: rows of "
                         "one table are of the same split and limit"
@@ -289,11 +233,10 @@ def _mean(row: Row) -> float:
     return float(np.mean([row[s][c].value for s in sorted(row) for c in sorted(row[s])]))
 
 
-def _influences(row: Row) -> Influences:
+def _influences(name: str, row: Row) -> Influences:
     """Return what every drawn thing adds to the row's mean, centred, by source of noise.
 
-    The mean of a resample is linearized: a trajectory of weight w adds w times its influence. For
-    the mean over trajectories that a matched AUC is, this is exact.
+    A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
     """
     seeds, cells = sorted(row), sorted(row[min(row)])
     found: Influences = {}
@@ -302,7 +245,7 @@ def _influences(row: Row) -> Influences:
         found[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
     if len(seeds) > 1:
         means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
-        found[OWN_SEEDS] = means - means.mean()
+        found[f"{OWN_SEEDS} of {name}"] = means - means.mean()
     return found
 
 
@@ -311,20 +254,11 @@ def _influence(contribution: Contribution) -> Floats:
     return residuals * len(residuals) / float(contribution.denominator.sum())
 
 
-def _difference(first: str, second: str, influences: Mapping[str, Influences]) -> Influences:
+def _difference(first: Influences, second: Influences) -> Influences:
     """Return the influences on the difference of two means."""
-    found: Influences = {}
-    for name, sign in ((first, 1.0), (second, -1.0)):
-        for source, influence in influences[name].items():
-            shared = _source(source, name)
-            found[shared] = found.get(shared, 0.0) + sign * influence
+    found = {source: first.get(source, 0.0) - second.get(source, 0.0) for source in first | second}
     # Rounding alone must not look like a difference between seeds.
     return {source: np.where(np.abs(z) > NOISE, z, 0.0) for source, z in found.items()}
-
-
-def _source(source: str, name: str) -> str:
-    """Return the name of a source of noise: a row's own seeds are nobody else's."""
-    return f"{source} of {name}" if source == OWN_SEEDS else source
 
 
 def _test(
@@ -345,9 +279,8 @@ def _test(
         observed = np.divide(difference, np.sqrt(variance))
         # Where all seeds agree to the last digit, no shift over no spread is no shift.
         studentized = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
-    exceeding = int(np.count_nonzero(studentized >= observed))
-    falling = int(np.count_nonzero(studentized <= observed))
-    return shifts, exceeding, falling
+    exceeding, falling = studentized >= observed, studentized <= observed
+    return shifts, int(exceeding.sum()), int(falling.sum())
 
 
 def _variance(spread: Any, n: int) -> Any:

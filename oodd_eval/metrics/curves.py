@@ -1,0 +1,190 @@
+"""Illustrations computed from scores: ROC curves, delay against false alarms, one example.
+
+They are drawn on the leaderboard's site and decide nothing; numbers are rounded for drawing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.metrics.alarms import defined_steps, highest_statistic
+from oodd_eval.metrics.auc import AlarmRule, Floats, auc_same_times, first_delay
+from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Alarms, cusum
+
+FPR: Final = tuple((i / 24) ** 2 for i in range(25))
+"""False-positive rates at which ROC curves are given, denser towards 0."""
+
+THRESHOLDS: Final = 25
+"""Number of CUSUM thresholds at which delay and false-alarm rate are given."""
+
+BEFORE: Final = 40
+AFTER: Final = 60
+"""Rows of an example before its onset, and from it on."""
+
+LARGEST: Final = 1e12
+"""Scores and statistics beyond this many units are drawn as this many."""
+
+
+def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
+    """Return the true-positive rate at given false-positive rates, ties as diagonal lines.
+
+    Where the curve is vertical, it is its upper end; NaN when either class has no defined score.
+    The area under the curve is `oodd_eval.metrics.auc.auc`.
+
+    >>> roc(np.array([2.0, 3.0]), np.array([1.0, 2.0]), np.array([0.0, 0.25, 0.5, 1.0])).tolist()
+    [0.5, 0.75, 1.0, 1.0]
+    """
+    positives = np.sort(positives[~np.isnan(positives)])
+    negatives = np.sort(negatives[~np.isnan(negatives)])
+    if not positives.size or not negatives.size:
+        return np.full(len(fpr), np.nan)
+    # One vertex per distinct score, from the highest down, and the corner (0, 0) before them.
+    scores = np.unique(np.concatenate([positives, negatives]))[::-1]
+    x = np.concatenate([[0], negatives.size - np.searchsorted(negatives, scores, side="left")])
+    y = np.concatenate([[0], positives.size - np.searchsorted(positives, scores, side="left")])
+    x, y = x / negatives.size, y / positives.size
+    left = np.searchsorted(x, fpr, side="right") - 1
+    right = np.minimum(left + 1, len(x) - 1)
+    width = x[right] - x[left]
+    share = np.where(width > 0, (fpr - x[left]) / np.where(width > 0, width, 1.0), 0.0)
+    result: Floats = y[left] + share * (y[right] - y[left])
+    return result
+
+
+def mean_matched_roc(
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    onsets: Sequence[int],
+    fpr: Floats | Sequence[float] = FPR,
+) -> Floats:
+    """Return the matched ROC curve of a cell: averaged over trajectories at equal rates.
+
+    Scores are compared at the times of ``auc_matched``, so the area under the average is the
+    average of the areas. NaN when no trajectory has a curve.
+    """
+    grid = np.asarray(fpr, dtype=np.float64)
+    spans = [slice(t, min(map(len, two))) for t, *two in zip(onsets, anomalous, twins, strict=True)]
+    pairs = zip(anomalous, twins, spans, strict=True)
+    curves = np.array([roc(a[span], b[span], grid) for a, b, span in pairs])
+    defined = curves[~np.isnan(curves[:, 0])]
+    return defined.mean(axis=0) if len(defined) else np.full(len(grid), np.nan)
+
+
+def thresholds(twins: Sequence[Floats], rule: AlarmRule, n: int = THRESHOLDS) -> Floats:
+    """Return CUSUM thresholds over the whole range in which the twins' false-alarm rate changes.
+
+    They are 0, the paper's, and a geometric sequence from a tenth of it to the first at which no
+    twin raises an alarm any more, but at least to ten times the paper's.
+    """
+    top = min(max(highest_statistic(twins, rule), 10 * THRESHOLD), LARGEST)
+    between = np.geomspace(THRESHOLD / 10, top, n - 2)
+    # The end is met exactly, so that the last false-alarm rate is 0.
+    between[-1] = top
+    return np.unique(np.concatenate([[0.0, THRESHOLD], between]))
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One fitted detector's alarms on the nominal twins under several thresholds, ascending.
+
+    They are the same for all anomalies, and most of the work. `quiet` has the alarms of each twin
+    for each rule.
+    """
+
+    rules: list[AlarmRule]
+    twins: Sequence[Floats]
+    quiet: list[list[Alarms]]
+
+    @classmethod
+    def over(cls, twins: Sequence[Floats], rule: AlarmRule, at: Floats) -> Sweep:
+        """Find the alarms of the twins at every threshold."""
+        rules = [replace(rule, threshold=threshold) for threshold in at.tolist()]
+        return cls(rules, twins, [[r.alarms(b) for b in twins] for r in rules])
+
+
+def delay_far(
+    sweep: Sweep, anomalous: Sequence[Floats], onsets: Sequence[int]
+) -> dict[str, list[float]]:
+    """Return delay, misses and false-alarm rate of a cell at the thresholds of a sweep.
+
+    ``far`` is that over whole twins, and ``null_censored`` the censored delay of the twins at their
+    partners' onsets: what false alarms alone give. All are empty when the twins have no score.
+    """
+    names = ("threshold", "far", "delay_censored", "missed", "null_censored")
+    rows = []
+    steps = defined_steps(sweep.twins)
+    for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if steps else ():
+        loud = [rule.alarms(a) for a in anomalous]
+        missed = [math.isnan(first_delay(x, t)) for x, t in zip(loud, onsets, strict=True)]
+        far = sum(int(alarms.sum()) for alarms in quiet) / steps
+        rows.append((rule.threshold, far, _censored(loud, onsets), sum(missed) / len(missed),
+                     _censored(quiet, onsets)))  # fmt: skip
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def _censored(alarms: Sequence[Alarms], onsets: Sequence[int]) -> float:
+    """Return the mean delay, a miss counting as the whole remainder of the episode."""
+    pairs = [(first_delay(x, t), len(x) - t) for x, t in zip(alarms, onsets, strict=True)]
+    return sum(rest if math.isnan(delay) else delay for delay, rest in pairs) / len(pairs)
+
+
+def example(
+    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int], rule: AlarmRule
+) -> dict[str, Any]:
+    """Return the trajectory with the median matched AUC of a cell, around its onset.
+
+    It is typical of what the detector does in this cell. Of an even number it is the lower median,
+    of equals the first. All lists begin at the row ``start``: scores in standard deviations from
+    the calibration mean, CUSUM statistics before the reset that an alarm brings, and rows with an
+    alarm. None stands for what is undefined.
+    """
+    areas = [
+        auc_same_times(a, b, onset, min(len(a), len(b)))
+        for a, b, onset in zip(anomalous, twins, onsets, strict=True)
+    ]
+    ranked = sorted((area, i) for i, area in enumerate(areas) if not math.isnan(area))
+    area, index = ranked[(len(ranked) - 1) // 2] if ranked else (math.nan, 0)
+    onset = int(onsets[index])
+    start = max(0, onset - BEFORE)
+    matched = None if math.isnan(area) else area
+    found: dict[str, Any] = {"index": index, "auc_matched": matched, "onset": onset,
+                             "length": len(anomalous[index]), "start": start}  # fmt: skip
+    for prefix, scores, name in (("", anomalous[index], "scores"), ("twin_", twins[index], "twin")):
+        x = rule.standardization(scores)
+        statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
+        shown = slice(start, onset + AFTER)
+        found[name] = [None if math.isnan(v) else v for v in (x[shown] / UNIT).tolist()]
+        found[f"{prefix}cusum"] = statistic[shown].tolist()
+        found[f"{prefix}alarms"] = (start + np.flatnonzero(alarms[shown])).tolist()
+    return found
+
+
+def cell_curves(
+    sweep: Sweep, rule: AlarmRule, anomalous: Sequence[Floats], onsets: Sequence[int]
+) -> dict[str, Any]:
+    """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
+    tpr = mean_matched_roc(anomalous, sweep.twins, onsets)
+    defined = not np.isnan(tpr).any()
+    found: dict[str, Any] = rounded({
+        "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
+        "delay_far": delay_far(sweep, anomalous, onsets),
+        "example": example(anomalous, sweep.twins, onsets, rule),
+    })  # fmt: skip
+    return found
+
+
+def rounded(value: Any) -> Any:
+    """Round to three digits and five decimals, whole numbers to ints: finer than can be drawn."""
+    if isinstance(value, dict):
+        return {name: rounded(v) for name, v in value.items()}
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    if not isinstance(value, float):
+        return value
+    near = round(float(f"{min(max(value, -LARGEST), LARGEST):.3g}"), 5)
+    return int(near) if near.is_integer() else near
