@@ -8,6 +8,7 @@ import json, os, signal, subprocess, sys, threading, time
 from pathlib import Path
 import numpy as np
 from oodd_eval import DetectorSpec, hookimpl
+from oodd_eval.plugins.parameters import declared_by
 
 
 class Good:
@@ -24,7 +25,8 @@ def offer(**factories):
 """
 
 
-def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", header=HEADER):
+def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", header=HEADER,
+            group="oodd_eval"):  # fmt: skip
     """Put a plug-in of one module ``oodd_<name>`` on the path, under the entry point `name`."""
     module = f"oodd_{name}"
     distribution = distribution or f"oodd-{name}"
@@ -35,7 +37,7 @@ def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", 
     (info / "METADATA").write_text(
         f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
     )
-    (info / "entry_points.txt").write_text(f"[oodd_eval]\n{name} = {module}\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}\n")
     monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.syspath_prepend(str(path))
     # Imported by the test, it must not stay for the next one.

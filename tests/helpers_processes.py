@@ -4,18 +4,33 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
+
+import psutil
 
 SLOW = """
+def reached(point, harness):
+    \"\"\"Kill the harness the n-th time that this point is reached, if KILL_AT is point:n.\"\"\"
+    wanted, _, times = os.environ.get("KILL_AT", "").partition(":")
+    if point == wanted:
+        with open(os.environ["FITS"] + ".points", "a") as log:
+            log.write("x")
+            if log.tell() == int(times):
+                os.kill(harness, signal.SIGKILL)
+
 class Slow(Good):
-    \"\"\"Persistence that takes its time and writes a line per fit, with its process id.\"\"\"
+    \"\"\"Persistence that takes its time and writes a line per fit, with its process id.
+
+    Of the seed that ENDLESS names, a fit never ends.
+    \"\"\"
     def __init__(self, *, seed=0, horizon=1, pause=0.1):
         self.pause, self.seed, self.horizon = pause, seed, horizon
     def fit(self, nominal):
         with open(os.environ["FITS"], "a") as log:
             log.write(f"{os.getpid()} {nominal[0].observation_dim} {self.horizon} {self.seed}\\n")
-        time.sleep(self.pause)
+        reached("fit", os.getppid())
+        time.sleep(3600 if os.environ.get("ENDLESS") == str(self.seed) else self.pause)
     def score(self, x):
+        reached("score", os.getppid())
         time.sleep(self.pause / 100)
         return super().score(x) + self.seed
 
@@ -28,16 +43,36 @@ class Keeps(Slow):
     def save(self, directory):
         for name in ("one", "two"):
             (directory / name).write_text(str(self.dimension))
+            reached("save", os.getppid())
             time.sleep(self.pause)
     def load(self, directory):
+        reached("load", os.getppid())
         self.dimension = int((directory / "one").read_text())
 
 @hookimpl
+def oodd_run_started():
+    def moving(move):
+        def moved(*paths, **settings):
+            reached("move", os.getpid())
+            move(*paths, **settings)
+            reached("moved", os.getpid())
+        return moved
+    os.replace, os.rename = moving(os.replace), moving(os.rename)
+
+@hookimpl
+def oodd_cell_finished():
+    reached("cell", os.getpid())
+
+@hookimpl
+def oodd_run_finished():
+    reached("finished", os.getpid())
+
+@hookimpl
 def oodd_detectors():
-    known = {"pause": 0.1}
+    known = declared_by({"pause": 0.1})
     return [
         DetectorSpec("slow", Slow, "", parameters=known),
-        DetectorSpec("keeps", Keeps, "", parameters=known, fit_ignores=("horizon",)),
+        DetectorSpec("keeps", Keeps, "", parameters=known, horizon_decides_fit=False),
     ]
 """
 
@@ -58,13 +93,6 @@ def oodd_eval(*arguments, **settings):
     )
 
 
-def alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
 def wait_until(condition, *, seconds=120):
     """Wait for a condition, on a busy machine for long; return whether it came true."""
     deadline = time.monotonic() + seconds
@@ -76,16 +104,12 @@ def wait_until(condition, *, seconds=120):
 
 
 def workers_of(marker):
-    """Return processes of detectors whose environment holds a text."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (entry / "cmdline").read_bytes()
-            if (
-                b"oodd_eval.plugins.isolation.worker" in command
-                and marker in (entry / "environ").read_bytes()
-            ):
-                found.append(int(entry.name))
-        except OSError:
-            continue  # it ended meanwhile, or is another user's
-    return [pid for pid in found if alive(pid)]
+    """Return the ids of detectors' processes whose environment holds ``NAME=VALUE``."""
+    name, _, value = marker.partition("=")
+    return [
+        process.pid
+        for process in psutil.process_iter(["cmdline", "environ", "status"])
+        if "oodd_eval.plugins.isolation.worker" in (process.info["cmdline"] or [])
+        and (process.info["environ"] or {}).get(name) == value
+        and process.info["status"] != psutil.STATUS_ZOMBIE
+    ]

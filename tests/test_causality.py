@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from oodd_eval import evaluate
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.causality import MIN_ROWS, PROBES, check_prefix, probes
+from oodd_eval.plugins.contract import MIN_ROWS, PROBES, check_prefix, probes
 
 LENGTHS = st.dictionaries(
     st.sampled_from(["calibration", "test/nominal", "test/iid"]),

@@ -1,22 +1,30 @@
 """Every hook has a test of its name; observers cannot stop a run."""
 
 import inspect
+import sys
 from dataclasses import replace
 
 import pytest
 from helpers_plugins import install
 
 from oodd_eval import load_split
+from oodd_eval import plugins as detector_hooks
 from oodd_eval.cli.main import main
 from oodd_eval.errors import PluginError, UsageError
-from oodd_eval.plugins import hooks as hookspecs
+from oodd_eval.plugins import OBSERVER_HOOKS, hookimpl
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.hooks import hookimpl
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import Settings, run
+from oodd_eval.scoring import observers as observer_hooks
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.runner import run
 
-HOOKS = [name for name in vars(hookspecs) if name.startswith("oodd_")]
+SPECS = {
+    name: spec
+    for home in (detector_hooks, observer_hooks)
+    for name, spec in vars(home).items()
+    if name.startswith("oodd_")
+}
 
 
 class Recorder:
@@ -43,27 +51,26 @@ def watched(tiny_split):
     def carry_out(plugins=None, *observers):
         plugins = plugins or discover()
         recorder = Recorder()
-        for number, observer in enumerate((recorder, *observers)):
-            plugins.observe(observer, f"observer {number}")
         split = load_split(tiny_split)
         plan = make_plan(
             plugins, split=split.name, split_digest=split.digest, detectors=["clock"],
             environments=["cartpole"], anomalies=["iid", "gravity"],
         )  # fmt: skip
-        done = run(plan, split, plugins, Settings(jobs=1))
+        done = run(plan, split, plugins, RunSettings(jobs=1), observers=[recorder, *observers])
         return recorder.calls, plan, done
 
     return carry_out
 
 
 def test_every_hook_has_a_test_of_its_name():
-    assert len(HOOKS) == 5
-    assert {f"test_{name}" for name in HOOKS} <= set(globals())
+    assert len(SPECS) == 5
+    assert {f"test_{name}" for name in SPECS} <= set(globals())
+    assert {name for name in SPECS if hasattr(observer_hooks, name)} == set(OBSERVER_HOOKS)
 
 
-@pytest.mark.parametrize("name", HOOKS)
+@pytest.mark.parametrize("name", SPECS)
 def test_every_hook_says_when_it_is_called(name):
-    assert "Called" in inspect.getdoc(getattr(hookspecs, name))
+    assert "Called" in inspect.getdoc(SPECS[name])
 
 
 def test_oodd_detectors(monkeypatch, tmp_path):
@@ -77,7 +84,9 @@ def test_oodd_detectors(monkeypatch, tmp_path):
 
 def test_oodd_detectors_may_return_none(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "none", "@hookimpl\ndef oodd_detectors(): return None")
-    assert discover().broken == []
+    plugins = discover()
+    assert plugins.offers
+    assert [b for b in plugins.broken if b.plugin == "none"] == []
 
 
 MAKER = """
@@ -117,12 +126,12 @@ def test_a_detector_from_a_spec_runs_in_a_worker(watched, monkeypatch, tmp_path,
         environments=["cartpole"], anomalies=["iid"],
     )  # fmt: skip
     results = ResultsDirectory(tmp_path / "out")
-    done = run(plan, split, plugins, Settings(jobs=1), results)
+    done = run(plan, split, plugins, RunSettings(jobs=1), results)
     assert [(r.status, r.detector) for r in done.records] == [("ok", "mine:7")]
-    assert done.records[0].cell == f"{split.name}/cartpole/iid::mine:7[h=1,seed=0]"
+    assert str(done.records[0].cell) == f"{split.name}/cartpole/iid::mine:7[h=1,seed=0]"
     (kept,) = (tmp_path / "out" / "scores").iterdir()
     assert kept.name.startswith("mine-7-cartpole-")
-    again = run(plan, split, discover(), Settings(jobs=1), results)
+    again = run(plan, split, discover(), RunSettings(jobs=1), results)
     assert [r.status for r in again.records] == ["ok"]
 
 
@@ -196,18 +205,89 @@ def test_an_observer_may_take_fewer_arguments(watched):
     assert terse.heard == 2
 
 
-@pytest.mark.parametrize("hook", [name for name in HOOKS if "detector" not in name])
+OBSERVES = """
+HEARD = []
+@hookimpl
+def oodd_run_started(): HEARD.append("started")
+@hookimpl
+def oodd_run_finished(interrupted): HEARD.append(("finished", interrupted))
+"""
+
+
+def install_observer(monkeypatch, path, name, code):
+    install(monkeypatch, path, name, code, group="oodd_eval.observers")
+
+
+def test_a_plugin_of_the_group_of_observers_hears_of_every_run(watched, monkeypatch, tmp_path):
+    install_observer(monkeypatch, tmp_path, "nosy", OBSERVES)
+    watched()
+    assert sys.modules["oodd_nosy"].HEARD == ["started", ("finished", False)]
+
+
+def test_a_detector_plugin_observes_the_runs_that_it_was_loaded_for(watched, monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "nosy", OBSERVES)
+    watched()
+    assert "oodd_nosy" not in sys.modules
+    plugins = discover()
+    assert plugins.offers
+    watched(plugins)
+    assert sys.modules["oodd_nosy"].HEARD == ["started", ("finished", False)]
+
+
+def test_a_module_in_both_groups_is_called_once(watched, monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "a", "nosy", OBSERVES)
+    points = tmp_path / "a" / "oodd_nosy-1.0.dist-info" / "entry_points.txt"
+    points.write_text("[oodd_eval]\nnosy=oodd_nosy\n[oodd_eval.observers]\nnosy=oodd_nosy\n")
+    plugins = discover()
+    assert plugins.offers
+    watched(plugins)
+    assert sys.modules["oodd_nosy"].HEARD == ["started", ("finished", False)]
+
+
+def test_an_observer_can_be_left_out(watched, monkeypatch, tmp_path):
+    install_observer(monkeypatch, tmp_path, "nosy", "raise ValueError")
+    plugins = discover(["nosy"])
+    watched(plugins)
+    assert plugins.broken == []
+    monkeypatch.setenv("OODD_EVAL_PLUGINS", "riqn")
+    assert discover().observer_points == []
+
+
+@pytest.mark.parametrize("hook", OBSERVER_HOOKS)
+@pytest.mark.parametrize("raised", ["ValueError('no')", "SystemExit('no')"])
 def test_an_installed_observer_that_raises_is_noted_and_the_run_goes_on(
-    watched, monkeypatch, tmp_path, hook
+    watched, monkeypatch, tmp_path, hook, raised
 ):
-    install(monkeypatch, tmp_path, "moody", f"@hookimpl\ndef {hook}(): raise ValueError('no')")
+    install_observer(monkeypatch, tmp_path, "moody", f"@hookimpl\ndef {hook}(): raise {raised}")
     plugins = discover()
     calls, _, done = watched(plugins)
     assert [(b.plugin, b.distribution, b.reason) for b in plugins.broken] == [
-        ("moody", "oodd-moody", f"hook {hook} failed: ValueError: no")
+        (
+            "moody",
+            "oodd-moody",
+            f"hook {hook} failed: {raised.replace('(', ': ')[:-1]}".replace("'", ""),
+        )
     ]
     assert [r.status for r in done.records] == ["ok", "ok"]
     assert calls[-1][0] == "finished"
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("import no_such_module", "ModuleNotFoundError"),
+        ("@hookimpl\ndef oodd_run_start(): pass", "did you mean 'oodd_run_started'"),
+        ("@hookimpl\ndef oodd_run_started(nothing): pass", "nothing"),
+    ],
+)
+def test_a_broken_observer_is_named_and_harmless(watched, monkeypatch, tmp_path, code, reason):
+    install_observer(monkeypatch, tmp_path, "moody", code)
+    plugins = discover()
+    _, _, done = watched(plugins)
+    (found,) = plugins.broken
+    assert found.plugin == "moody"
+    assert reason in found.reason
+    assert [r.status for r in done.records] == ["ok", "ok"]
 
 
 def test_an_observer_of_the_program_may_raise(watched):

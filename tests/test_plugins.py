@@ -1,26 +1,44 @@
-"""Discovery: what is broken harms nobody else, and is named."""
+"""Discovery: what is broken harms nobody else, and is named; plug-ins are loaded when named."""
 
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 
 import pytest
 from helpers_plugins import install
 
-from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
+from oodd_eval.cli.main import main
+from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
 from oodd_eval.plugins.baselines import Clock
 from oodd_eval.plugins.contract import DetectorSpec
-from oodd_eval.plugins.discovery import Offer, discover, resolve_parameters
+from oodd_eval.plugins.discovery import Offer, discover, offer_of
+from oodd_eval.plugins.parameters import (
+    declared_by,
+    parameter,
+    parameters_of,
+    resolve_parameters,
+)
 
 OFFER = """
 @hookimpl
 def oodd_detectors():
     return offer({name}=Good)
 """
+BUILT_IN = {"random", "persistence", "clock"}
 
 
-def test_built_in_detectors_are_offered():
-    assert {"random", "persistence", "clock"} <= set(discover().offers)
+def broken(plugins):
+    """Load everything, and return what is broken."""
+    assert plugins.offers
+    return plugins.broken
+
+
+def test_built_in_detectors_are_an_entry_point_like_any_other():
+    plugins = discover()
+    assert set(plugins.offers) >= BUILT_IN
+    offer = plugins.offer("clock")
+    assert (offer.plugin, offer.distribution) == ("trivial", "oodd-eval")
 
 
 def test_an_installed_plugin_is_found_with_its_origin(monkeypatch, tmp_path):
@@ -38,24 +56,73 @@ def test_an_installed_plugin_is_found_with_its_origin(monkeypatch, tmp_path):
         ("class Odd(BaseException): pass\nraise Odd('on purpose')", "Odd: on purpose"),
         (
             "class Mute(Exception):\n    def __str__(self): raise ValueError\nraise Mute",
-            r"Mute: \(its text cannot be had\)",
+            r"Mute: \(no message\)",
         ),
         ("def f(:", "SyntaxError"),
         ("@hookimpl\ndef oodd_detectors(): return [1]", r"returned \[1\], expected a list of oodd"),
         ("@hookimpl\ndef oodd_detectors(): return 1 / 0", "ZeroDivisionError"),
         ("@hookimpl\ndef oodd_detector(): return []", "unknown hook 'oodd_detector'"),
-        ("@hookimpl\ndef oodd_run_started(nothing): pass", "nothing"),
+        ("@hookimpl\ndef oodd_run_start(): return []", "did you mean 'oodd_run_started'"),
+        ("@hookimpl\ndef oodd_detectors(nothing): pass", "nothing"),
     ],
 )
 def test_a_broken_plugin_is_named_and_the_others_work(monkeypatch, tmp_path, code, reason):
     install(monkeypatch, tmp_path / "a", "aaa", code)
     install(monkeypatch, tmp_path / "b", "zzz", OFFER.format(name="zzz"))
     plugins = discover()
-    (broken,) = [b for b in plugins.broken if b.plugin == "aaa"]
-    assert broken.distribution == "oodd-aaa"
-    assert re.search(reason, broken.reason)
+    (found,) = [b for b in broken(plugins) if b.plugin == "aaa"]
+    assert found.distribution == "oodd-aaa"
+    assert re.search(reason, found.reason)
     assert {"zzz", "clock"} <= set(plugins.offers)
-    assert not plugins.manager.has_plugin("aaa")
+    assert "aaa" not in plugins.loaded
+    with pytest.raises(PluginError, match=f"'aaa' cannot be loaded: .*{reason}"):
+        offer_of("aaa", "anything")
+
+
+def test_a_plugin_that_is_not_named_is_not_imported(monkeypatch, tmp_path):
+    for name in ("aaa", "zzz"):
+        install(monkeypatch, tmp_path, name, "raise SystemExit('imported')")
+    install(monkeypatch, tmp_path, "mine", OFFER.format(name="mine"))
+    plugins = discover()
+    assert plugins.select("mine,clock") == ["mine", "clock"]
+    assert plugins.broken == []
+    # No entry point has this name: all are loaded, one after the other, until it is found.
+    with pytest.raises(UnknownNameError, match="unknown detector 'yours'"):
+        plugins.select("yours")
+    assert [b.plugin for b in plugins.broken] == ["aaa", "zzz"]
+
+
+@pytest.mark.parametrize("patterns", ["all", "c*", "clock,min[ae]"])
+def test_for_a_glob_everything_is_loaded(monkeypatch, tmp_path, patterns):
+    install(monkeypatch, tmp_path, "aaa", "raise SystemExit('imported')")
+    install(monkeypatch, tmp_path, "named", OFFER.format(name="mine"))
+    plugins = discover()
+    assert "clock" in plugins.select(patterns)
+    assert "mine" in plugins.offers
+    assert [b.plugin for b in plugins.broken] == ["aaa"]
+
+
+def test_broken_plugins_are_reported_when_they_are_found(monkeypatch, tmp_path):
+    for name in ("aaa", "zzz"):
+        install(monkeypatch, tmp_path, name, "raise ValueError")
+    heard, plugins = [], discover()
+    with pytest.raises(UnknownNameError):
+        plugins.offer("nosuch")
+    plugins.report_broken_to(lambda found: heard.append(found.plugin))
+    assert heard == ["aaa", "zzz"]
+    with plugins.blaming(next(iter(plugins.loaded.values())).point):
+        raise SystemExit
+    assert heard == ["aaa", "zzz", plugins.broken[-1].plugin]
+
+
+def test_a_broken_plugin_is_named_on_standard_error(monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "mine", "import no_such_module")
+    arguments = ["run", "--env", "cartpole", "--collect-only", "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--detector", "mine"]) == 4
+    err = capsys.readouterr().err
+    assert "plug-in 'mine' of oodd-mine is broken: ModuleNotFoundError" in err
+    assert main([*arguments, "--detector", "clock"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_nothing_of_a_failed_plugin_stays(monkeypatch, tmp_path):
@@ -64,36 +131,38 @@ def test_nothing_of_a_failed_plugin_stays(monkeypatch, tmp_path):
     plugins = discover()
     assert "fine" not in plugins.offers
     assert plugins.offer("clock").distribution == "oodd-eval"
-    assert not plugins.manager.has_plugin("half")
+    assert "half" not in plugins.loaded
 
 
 def test_a_detector_offered_twice_names_both_distributions(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path / "a", "one", OFFER.format(name="same"))
     install(monkeypatch, tmp_path / "b", "two", OFFER.format(name="same"))
-    (broken,) = discover().broken
-    assert "'same' is offered twice, by oodd-one (plug-in 'one') and by oodd-two" in broken.reason
+    (found,) = broken(discover())
+    assert (
+        "'same' is offered twice, by plug-in 'one' of oodd-one and by plug-in 'two' of oodd-two"
+        in (found.reason)
+    )
 
 
-def test_no_other_distribution_takes_a_built_in_name(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "aardvark", OFFER.format(name="clock"))
+@pytest.mark.parametrize("name", ["aardvark", "clock"])
+def test_no_other_distribution_takes_a_built_in_name(monkeypatch, tmp_path, name):
+    install(monkeypatch, tmp_path, name, OFFER.format(name="clock"))
     plugins = discover()
     assert plugins.offer("clock").spec.factory is Clock
-    assert [b.plugin for b in plugins.broken] == ["aardvark"]
+    assert [b.plugin for b in broken(plugins)] == [name]
 
 
 def test_two_plugins_of_one_name_are_an_error_naming_the_other(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "trivial", OFFER.format(name="mine"))
-    (broken,) = discover().broken
-    assert (broken.distribution, broken.reason) == (
-        "oodd-trivial",
-        "oodd-eval has a plug-in of the same name: uninstall one of them",
-    )
+    (found,) = broken(discover())
+    assert found.distribution == "oodd-trivial"
+    assert "oodd-eval has a plug-in of the same name: uninstall one of them" in found.reason
 
 
 def test_the_environment_variable_restricts(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "extra", OFFER.format(name="extra"))
     monkeypatch.setenv("OODD_EVAL_PLUGINS", "extra")
-    assert set(discover().offers) == {"extra", "random", "persistence", "clock"}
+    assert set(discover().offers) == {"extra", *BUILT_IN}
 
 
 def test_a_disabled_plugin_is_left_out():
@@ -134,39 +203,59 @@ def test_a_missing_parent_package_is_missing_too():
     )
 
 
+@dataclass(frozen=True)
+class Known:
+    members: int = parameter(5, low=1, high=9)
+    rate: float | None = parameter(None, low=0, decides="scores")
+    kind: str = parameter("a", choices=("a", "b"))
+
+
 def test_parameters_are_defaults_and_overrides():
-    spec = DetectorSpec("x", Clock, "", parameters={"b": 1, "a": None})
-    assert resolve_parameters(spec, {"b": 2.5}) == {"a": None, "b": 2.5}
+    found = resolve_parameters("x", Known, {"members": 2})
+    assert list(found.items()) == [("kind", "a"), ("members", 2), ("rate", None)]
+    assert resolve_parameters("x", None, {"any": 1}, others=True) == {"any": 1}
+    assert parameters_of(None) == {}
 
 
 def test_an_unknown_parameter_suggests_the_nearest():
-    spec = DetectorSpec("x", Clock, "", parameters={"members": 5})
     with pytest.raises(UnknownNameError, match="parameter of x 'member': did you mean 'members'"):
-        resolve_parameters(spec, {"member": 1})
+        resolve_parameters("x", Known, {"member": 1})
 
 
-@pytest.mark.parametrize("value", ["five", True, None])
-def test_a_parameter_of_another_kind_is_refused(value):
-    spec = DetectorSpec("x", Clock, "", parameters={"members": 5})
-    with pytest.raises(UsageError, match="expected a number like its default 5"):
-        resolve_parameters(spec, {"members": value})
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        *(({"members": value}, "a whole number") for value in ("five", True, None, 2.5)),
+        ({"members": 0}, "at least 1"),
+        ({"members": 10}, "at most 9"),
+        ({"rate": float("nan")}, "at least 0"),
+        ({"rate": "fast"}, "a number or null"),
+        ({"kind": "c"}, "one of 'a', 'b'"),
+    ],
+)
+def test_a_value_of_another_kind_or_out_of_bounds_is_refused(given, expected):
+    with pytest.raises(UsageError, match=f"of x is .*expected {expected}"):
+        resolve_parameters("x", Known, given)
 
 
-@pytest.mark.parametrize("what", ["detectors", "envs", "metrics"])
-def test_listing_imports_nothing_heavy(what):
+def test_parameters_known_at_run_time_are_declared_by_their_defaults():
+    values = {"size": 3, "kind": "a", "rate": None}
+    declared = parameters_of(declared_by(values))
+    assert {name: p.default for name, p in declared.items()} == values
+    assert resolve_parameters("x", declared_by(values), values) == values
+
+
+@pytest.mark.parametrize(
+    "command", ["--help", "--version", "", "rn", "list detectors", "list envs"]
+)
+def test_quick_commands_import_nothing_heavy(command):
+    heavy = {"numpy", "h5py", "rich", "pydantic", "torch", "sklearn", "gymnasium", "pybullet"}
+    if not command.startswith("list"):
+        heavy |= {"pluggy", "oodd_eval.cli.listing", "oodd_eval.cli.run"}
     code = (
         "import sys\nfrom oodd_eval.cli.main import main\n"
-        f"main(['list', {what!r}])\n"
-        "sys.exit(repr({'torch', 'sklearn', 'h5py', 'gymnasium', 'pybullet'} & set(sys.modules)))"
+        f"main({command.split()!r})\n"
+        f"print({heavy!r} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.strip() == "set()"
-
-
-def test_help_imports_not_even_numpy():
-    code = (
-        "import sys\nfrom oodd_eval.cli.main import main\n"
-        "main(['--help'])\nsys.exit('numpy' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-    assert done.returncode == 0
+    assert done.stdout.splitlines()[-1] == "set()"

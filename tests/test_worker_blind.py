@@ -18,11 +18,11 @@ from helpers_spy import SPY, Findings, vectors
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.parts import lengths_of, parts_of
 from oodd_eval.metrics.auc import auc
-from oodd_eval.plugins.causality import PROBES, probes
-from oodd_eval.plugins.isolation import processes
+from oodd_eval.plugins.contract import PROBES, probes
 from oodd_eval.plugins.isolation import supervisor as isolation
-from oodd_eval.scoring.unit import lengths_of, parts_of, shuffled
+from oodd_eval.scoring.unit import shuffled
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
 
@@ -144,7 +144,7 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
             return popen(command, **settings)
 
         monkeypatch.setattr(isolation, "asdict", told)
-        monkeypatch.setattr(processes.subprocess, "Popen", start)
+        monkeypatch.setattr(isolation.subprocess, "Popen", start)
         records = evaluate("spy", split=secrets.path, environments="cartpole", anomalies="wind-l2r")
     assert [record.status for record in records] == ["ok"], records[0].reason
     found = secrets.seen_in(Findings(spying))

@@ -1,1 +1,48 @@
-"""Room."""
+"""Plug-ins: the hooks that a plug-in implements. All are optional; none may change a result.
+
+A plug-in is an importable module (or object) that an entry point of the group ``oodd_eval`` names
+and that marks functions of these names with `hookimpl`. Arguments that a hook does not need may be
+left out. Plug-ins may also observe runs: those hooks are in `oodd_eval.scoring.observers`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import pluggy
+
+if TYPE_CHECKING:
+    from oodd_eval.plugins.contract import DetectorSpec
+
+PROJECT: Final = "oodd_eval"
+"""Name of the pluggy project and of the entry-point group."""
+
+OBSERVER_HOOKS: Final = ("oodd_run_started", "oodd_cell_finished", "oodd_run_finished")
+"""Hooks that `oodd_eval.scoring.observers` specifies and calls."""
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec
+def oodd_detectors() -> list[DetectorSpec] | None:
+    """Offer detectors.
+
+    Called once, when the plug-in is loaded: when one of its detectors may have been named, or all
+    detectors are listed. It has to be quick: import heavy libraries inside the factories. Return
+    the specs; None means none.
+    """
+
+
+@hookspec(firstresult=True)
+def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
+    """Make a detector from a name with a colon, such as ``pyod:IForest``.
+
+    Called when a user names such a detector, and again in the worker that runs it, until a plug-in
+    answers; those of oodd-eval itself are asked first. Return None for names that this plug-in does
+    not handle. For a name that it handles and that leads nowhere, raise
+    `oodd_eval.errors.UsageError` or `UnknownNameError`. The name of the spec has a colon too, may
+    be tidier than `spec`, and makes the same detector. The first line of the implementation's
+    docstring says which names it knows: ``oodd-eval list detectors`` prints it. Names in results
+    are never resolved.
+    """

@@ -1,6 +1,7 @@
-"""The contract between harness and detectors: higher scores mean more anomalous.
+"""The contract between harness and detectors, and the checks that scores honour it.
 
-That is the reverse of scikit-learn's ``score_samples`` and ``decision_function``: negate theirs.
+Higher scores mean more anomalous: the reverse of scikit-learn's ``score_samples`` and
+``decision_function``, so negate theirs.
 
 A detector is fitted on nominal trajectories and then gives one float64 score per observation row.
 It is causal: ``score(x)[:n]`` equals ``score(x[:n])`` for every prefix, so that a score at time t
@@ -10,26 +11,51 @@ uses nothing after t (randomness has to be keyed by seed and time, not by call o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
-from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
+
+# Every plug-in imports this module when detectors are listed, which should not take numpy's time.
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from oodd_eval.data.trajectory import Trajectory
+
+CONTRACT: Final = 1
+"""Version of how the harness fits and scores, part of every key of scores and fits.
+
+Raise it by hand when a change of the harness changes scores.
+"""
 
 MAX_WARM_UP: Final = 20
 """Longest leading block, in rows, that a detector may declare undefined beyond its horizon."""
 
-Scores = NDArray[np.float64]
+PROBES: Final = 4
+"""Episodes of a unit that are scored a second time, cut short: a few percent of its cost."""
+
+MIN_ROWS: Final = 8
+"""Observations of the shortest episode that is cut."""
+
+TOLERANCE: Final = 1e-5
+"""Relative difference that stands for the same score where matrices differ in shape.
+
+Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
+"""
+
+PROBE_TOLERANCE: Final = 1e-3
+"""The same for the prefixes of a run, whatever the horizon: rollouts multiply rounding errors."""
+
+Scores: TypeAlias = "NDArray[np.float64]"
 
 
 @runtime_checkable
 class Detector(Protocol):
-    """What a plug-in's factory returns.
+    """A detector, as a plug-in's factory returns it.
 
     A detector may also have
 
@@ -42,11 +68,9 @@ class Detector(Protocol):
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
         """Learn from nominal trajectories, forgetting any earlier fit. The result is ignored."""
-        ...
 
     def score(self, trajectory: Trajectory) -> Scores:
         """Return float64 scores of shape (T + 1,), higher meaning more anomalous."""
-        ...
 
 
 @runtime_checkable
@@ -55,49 +79,31 @@ class StreamingDetector(Detector, Protocol):
 
     def reset(self) -> None:
         """Begin a new episode; `fit` does so too."""
-        ...
 
     def update(
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> float:
         """Return the score of the next observation, NaN where it is undefined.
 
-        The scores of an episode are those of `score` on the whole of it, to a relative 1e-5.
-
-        Parameters
-        ----------
-        observation : array of shape (D,)
-            ``o_t``.
-        action : array of shape (A,), optional
-            ``a_{t-1}``, commanded since the previous observation; None at the first one, and for
-            detectors that do not look at actions.
+        The scores of an episode are those of `score` on the whole of it, to a relative 1e-5. The
+        action is ``a_{t-1}``, commanded since the previous observation; None at the first one, and
+        for detectors that do not look at actions.
         """
-        ...
 
 
 @runtime_checkable
 class StorableDetector(Detector, Protocol):
-    """A detector whose fit can be kept in plain files.
-
-    Neither method may use pickle: what is loaded may come from anywhere. Paths are directories.
-    """
+    """A detector whose fit can be kept in plain files: never pickle, as they may be anybody's."""
 
     def save(self, directory: Path) -> None:
         """Write the fitted state as files into an empty directory."""
-        ...
 
     def load(self, directory: Path) -> None:
-        """Take over what `save` wrote.
+        """Take over what `save` wrote, instead of `fit`: scores are the same, bit for bit.
 
-        Called instead of `fit` on a new detector, made with the same parameters but for those that
-        `DetectorSpec.fit_ignores` names. Scores are then the same, bit for bit.
-
-        Raises
-        ------
-        FittedStateError
-            When the files are not what this detector saves.
+        The new detector was made with the same parameters except those that do not decide the fit
+        (`oodd_eval.plugins.parameters.parameter`). Raises `FittedStateError` for other files.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +124,19 @@ class DetectorSpec:
     inputs
         What the scores depend on: observations alone, or commanded actions too.
     parameters
-        Names and defaults of the parameters that ``--param`` may set.
+        A frozen dataclass whose fields are the parameters that ``--param`` may set, each declared
+        with `oodd_eval.plugins.parameters.parameter`. None when there are none.
     other_parameters
         Whether ``--param`` may set others than those, whose names only the factory knows.
     requires
-        Importable modules that the detector needs beyond oodd-eval's core, checked without
-        importing them; without them it is listed as unavailable.
+        Modules that it needs beyond oodd-eval's core; without them it is listed as unavailable.
     extra
         What to install when one of `requires` is missing, such as ``"oodd-eval[reference]"``.
     version
-        Version of the library that does the work, where that is not the plug-in itself, such as
+        Of the library that does the work, where that is not the plug-in itself, such as
         ``"scikit-learn.1.9.1"``: scores of another version are not taken for these.
-    fit_ignores
-        Parameters, and ``"horizon"``, that decide scores but not the fit: one saved fit then serves
-        all their values.
+    horizon_decides_fit
+        Whether the horizon changes the fitted detector; if not, one saved fit serves all horizons.
     fit_name
         Detectors of one plug-in with the same name here share fits; default `name`.
     """
@@ -141,74 +146,137 @@ class DetectorSpec:
     summary: str
     reference: str = ""
     inputs: Literal["observations", "observations+actions"] = "observations"
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: type | None = None
     other_parameters: bool = False
     requires: tuple[str, ...] = ()
     extra: str = ""
     version: str = ""
-    fit_ignores: tuple[str, ...] = ()
+    horizon_decides_fit: bool = True
     fit_name: str = ""
 
 
+def make_detector(
+    factory: Callable[..., Detector], *, seed: int, horizon: int, parameters: Mapping[str, Any]
+) -> Detector:
+    """Return an unfitted detector; raise `ContractError` for anything without `fit` and `score`."""
+    detector = factory(seed=seed, horizon=horizon, **parameters)
+    if not isinstance(detector, Detector):
+        expected = "an object with the methods fit(nominal) and score(trajectory)"
+        raise ContractError(f"the factory returned {type(detector).__name__}, expected {expected}")
+    return detector
+
+
+def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
+    """Return unchecked scores of some trajectories, scored all at once if the detector can.
+
+    Raises `ContractError` when ``score_many`` returns another number of score arrays.
+    """
+    score_many = getattr(detector, "score_many", None)
+    if score_many is None:
+        return [detector.score(trajectory) for trajectory in chunk]
+    scores = list(score_many(chunk))
+    if len(scores) != len(chunk):
+        expected = f"{len(chunk)}: one for each trajectory"
+        raise ContractError(f"score_many returned {len(scores)} score arrays, expected {expected}")
+    return scores
+
+
 def check_scores(
-    scores: object, trajectory: Trajectory, *, horizon: int, warm_up: int, detector: str, where: str
-) -> Scores:
+    scores: object, trajectory: Trajectory | int, *, horizon: int, warm_up: object, detector: str,
+    where: str,
+) -> Scores:  # fmt: skip
     """Return the scores as a float64 array if they honour the contract.
 
     Parameters
     ----------
-    scores
-        What the detector returned.
-    trajectory
-        What it was given.
+    scores, trajectory
+        What the detector returned, and was given (or its number of observations).
     horizon, warm_up
-        Prediction horizon and declared warm-up, in rows: NaN may stand in the leading
-        ``max(horizon, warm_up)`` rows only.
+        Rows: NaN may stand in the leading ``max(horizon, warm_up)`` only.
     detector, where
-        Names for the message, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
-
-    Raises
-    ------
-    ContractError
-        Naming the detector, the trajectory, what was expected and what came.
+        Names for the `ContractError` that is raised, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
     """
-    who = f"detector {detector!r} returned"
+    import numpy as np  # noqa: PLC0415  see above
+
     if not isinstance(warm_up, int) or isinstance(warm_up, bool) or not 0 <= warm_up <= MAX_WARM_UP:
-        raise ContractError(
-            f"detector {detector!r} declares warm_up = {warm_up!r}, "
-            f"expected an int between 0 and {MAX_WARM_UP}"
-        )
-    if not isinstance(scores, np.ndarray):
-        raise ContractError(
-            f"{who} {type(scores).__name__} for {where}, expected a numpy array of float64"
-        )
-    if scores.ndim != 1:
-        raise ContractError(
-            f"{who} an array of shape {scores.shape} for {where}, expected ({len(trajectory)},): "
-            "one score per observation"
-        )
-    if len(scores) != len(trajectory):
-        raise ContractError(
-            f"{who} {len(scores)} scores for {where}, expected {len(trajectory)} "
-            "(one per observation)"
-        )
-    if scores.dtype != np.float64:
-        raise ContractError(f"{who} {scores.dtype} scores for {where}, expected float64")
-    finite = np.isfinite(scores)
+        expected = f"expected an int between 0 and {MAX_WARM_UP}"
+        raise ContractError(f"detector {detector!r} declares warm_up = {warm_up!r}, {expected}")
+    rows = trajectory if isinstance(trajectory, int) else len(trajectory)
     block = max(horizon, warm_up)
-    leading = np.arange(len(scores)) < block
-    wrong = ~finite & ~(leading & np.isnan(scores))
-    if wrong.any():
-        t = int(np.flatnonzero(wrong)[0])
+    if not isinstance(scores, np.ndarray):
+        wrong = f"{type(scores).__name__} for {where}, expected a numpy array of float64"
+    elif scores.ndim != 1:
+        shape = f"an array of shape {scores.shape} for {where}"
+        wrong = f"{shape}, expected ({rows},): one score per observation"
+    elif len(scores) != rows:
+        wrong = f"{len(scores)} scores for {where}, expected {rows} (one per observation)"
+    elif scores.dtype != np.float64:
+        wrong = f"{scores.dtype} scores for {where}, expected float64"
+    elif (bad := ~np.isfinite(scores) & ~(np.isnan(scores) & (np.arange(rows) < block))).any():
+        t = int(bad.argmax())
+        allowed = f"t < {block} (the larger of horizon and declared warm-up)"
+        wrong = f"{scores[t]} at t = {t} of {where}, expected finite scores, or NaN for {allowed}"
+    elif (late := np.flatnonzero(np.diff(np.isnan(scores).astype(int)) > 0)).size:
+        wrong = f"NaN at t = {late[0] + 1} of {where}, expected it in one leading block only"
+    else:
+        return scores
+    raise ContractError(f"detector {detector!r} returned {wrong}")
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """The first `rows` observations of trajectory `index` of a part, scored on their own."""
+
+    part: str
+    index: int
+    rows: int
+
+
+def probes(lengths: Mapping[str, Sequence[int]], key: str) -> list[Probe]:
+    """Draw prefixes of different episodes, between a quarter and three quarters of each.
+
+    `lengths` are the observations of each trajectory, by part. Equal keys give equal probes.
+    """
+    import numpy as np  # noqa: PLC0415  see above
+
+    every = ((part, i, n) for part, counts in lengths.items() for i, n in enumerate(counts))
+    long = [(part, i, n) for part, i, n in every if n >= MIN_ROWS]
+    seed = int.from_bytes(hashlib.sha256(f"probes|{key}".encode()).digest())
+    rng = np.random.default_rng(seed)
+    chosen = (long[c] for c in rng.permutation(len(long))[:PROBES])
+    return [
+        Probe(part, i, int(rng.integers(n // 4, 3 * n // 4, endpoint=True)))
+        for part, i, n in chosen
+    ]
+
+
+def check_prefix(found: Scores, whole: Scores, *, detector: str, where: str) -> None:
+    """Raise `ContractError` when the scores of a prefix differ from those of the whole episode."""
+    if wrong := difference(found, whole[: len(found)], PROBE_TOLERANCE):
         raise ContractError(
-            f"{who} {scores[t]} at t = {t} of {where}, expected finite scores: NaN is allowed only "
-            f"for t < {block} (the larger of horizon and declared warm-up)"
+            f"detector {detector!r} gives the first {len(found)} of {len(whole)} observations of "
+            f"{where} other scores when they are all it gets: {wrong}; expected the same, as a "
+            f"score may use nothing after its time and nothing of other episodes (`oodd-eval check "
+            f"{detector} -k prefix`)"
         )
-    defined = np.flatnonzero(finite)
-    if defined.size and not finite[defined[0] :].all():
-        t = int(np.flatnonzero(~finite[defined[0] :])[0] + defined[0])
-        raise ContractError(
-            f"{who} NaN at t = {t} of {where}, after a defined score at t = {int(defined[0])}: "
-            "expected NaN in one leading block only"
-        )
-    return scores
+
+
+def difference(found: Scores, expected: Scores, tolerance: float = 0.0) -> str:
+    """Return where two score sequences of one length differ first; empty when they do not.
+
+    The tolerance is relative to the larger of the score itself and the mean magnitude of all
+    expected scores: a score that passes through zero has no relative precision.
+    """
+    import numpy as np  # noqa: PLC0415  see above
+
+    usual = np.abs(expected[np.isfinite(expected)])
+    # Scores near the largest float overflow here; another check finds that they are too large.
+    with np.errstate(invalid="ignore", over="ignore"):
+        scale = np.maximum(np.abs(expected), usual.mean() if usual.size else 0.0)
+        same = (found == expected) | (np.isnan(found) & np.isnan(expected))
+        if tolerance:
+            same |= np.abs(found - expected) <= tolerance * scale
+    if same.all():
+        return ""
+    t = int(np.flatnonzero(~same)[0])
+    return f"at t = {t} it is {found[t]:.10g} instead of {expected[t]:.10g}"

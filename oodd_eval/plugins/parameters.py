@@ -5,56 +5,53 @@ The same class serves the detector's spec, its factory, ``--param`` and the conf
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from oodd_eval.errors import UnknownNameError, UsageError
 
 Decides = Literal["fit", "scores", "nothing"]
+Declared = TypeVar("Declared")
 
 
 def parameter(
-    default: Any,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[Any, ...] = (),
-    decides: Decides = "fit",
+    default: Any, *, low: float | None = None, above: float | None = None,
+    high: float | None = None, choices: tuple[Any, ...] = (), decides: Decides = "fit",
     help: str = "",  # noqa: A002  argparse's word
-) -> Any:
+) -> Any:  # fmt: skip
     """Declare one parameter in a frozen dataclass of parameters.
 
-    Parameters
-    ----------
-    default
-        Value when nothing is given.
-    low, high
-        Smallest and largest value allowed.
-    choices
-        The values allowed, where there are only a few.
-    decides
-        ``"fit"``: it changes the fitted detector. ``"scores"``: it changes scores of the same fit,
-        so that fits are shared over its values. ``"nothing"``: it changes neither, such as the
-        device that computes; then it is no part of a result's identity.
-    help
-        One line.
+    Values are at least `low`, more than `above`, at most `high`, and among the `choices`, where
+    there are any. In a ``list[float]`` that holds for each value, and there has to be one.
+
+    `decides` is ``"fit"`` for what changes the fitted detector, ``"scores"`` for what changes the
+    scores of the same fit, so that fits are shared over its values, and ``"nothing"`` for what
+    changes neither, such as the device that computes: that is no part of a result's identity.
     """
-    facts = {"low": low, "high": high, "choices": choices, "decides": decides, "help": help}
+    facts = {"low": low, "above": above, "high": high, "choices": choices, "decides": decides,
+             "help": help}  # fmt: skip
+    # Dataclasses refuse defaults that all instances would share and could change.
+    if isinstance(default, list | dict):
+        made = functools.partial(copy.deepcopy, default)
+        return dataclasses.field(default_factory=made, metadata=facts)
     return dataclasses.field(default=default, metadata=facts)
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterInfo:
-    """One parameter of a detector, see `parameter`."""
+    """One parameter of a detector, see `parameter`; `items` are the types of a list's values."""
 
-    name: str
     types: tuple[type, ...]
+    items: tuple[type, ...]
     default: Any
     low: float | None = None
+    above: float | None = None
     high: float | None = None
     choices: tuple[Any, ...] = ()
     decides: Decides = "fit"
@@ -62,43 +59,61 @@ class ParameterInfo:
 
     def problem(self, value: Any) -> str:
         """Return what is wrong with a value, such as ``"expected an int"``; empty if nothing is."""
+        if list not in self.types or type(value) not in (list, tuple):
+            return self._wrong(value, self.types)
+        if self.items and not value:
+            return "expected at least one value"
+        wrong = (self._wrong(one, self.items) for one in value if self.items)
+        return next(filter(None, wrong), "")
+
+    def _wrong(self, value: Any, expected: tuple[type, ...]) -> str:
         # bool is an int to isinstance, and an int is as good as a float.
-        plain = type(value) in self.types or (float in self.types and type(value) is int)
-        if not plain:
-            return f"expected {' or '.join(_TYPE_NAMES.get(t, t.__name__) for t in self.types)}"
+        plain = type(value) in expected or (float in expected and type(value) is int)
+        if not plain and object not in expected:
+            return f"expected {' or '.join(_TYPE_NAMES.get(t, t.__name__) for t in expected)}"
         if self.choices and value not in self.choices:
             return f"expected one of {', '.join(map(repr, self.choices))}"
+        if value is None:
+            return ""
         # Written so that NaN is refused, too.
-        if self.low is not None and value is not None and not value >= self.low:
+        if self.low is not None and not value >= self.low:
             return f"expected at least {self.low:g}"
-        if self.high is not None and value is not None and not value <= self.high:
-            return f"expected at most {self.high:g}"
-        return ""
+        if self.above is not None and not value > self.above:
+            return f"expected more than {self.above:g}"
+        return "" if self.high is None or value <= self.high else f"expected at most {self.high:g}"
 
 
-_TYPE_NAMES = {
-    int: "a whole number", float: "a number", str: "a text", bool: "true or false",
-    types.NoneType: "null", list: "a list", tuple: "a list",
-}  # fmt: skip
+_TYPE_NAMES = {int: "a whole number", float: "a number", str: "a text", bool: "true or false",
+               types.NoneType: "null", list: "a list"}  # fmt: skip
 
 
 def parameters_of(declared: type | None) -> dict[str, ParameterInfo]:
     """Return the parameters that a dataclass declares, by name; none for None."""
     if declared is None:
         return {}
-    hints = typing.get_type_hints(declared)
-    return {
-        f.name: ParameterInfo(f.name, _types_of(hints[f.name]), f.default, **f.metadata)
-        for f in dataclasses.fields(declared)
-    }
+    hints, found = typing.get_type_hints(declared), {}
+    for f in dataclasses.fields(declared):
+        hint = hints[f.name]
+        within = typing.get_args(hint) if typing.get_origin(hint) is list else ()
+        items = tuple(t for part in within for t in _types_of(part))
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        found[f.name] = ParameterInfo(_types_of(hint), items, default, **f.metadata)
+    return found
 
 
 def _types_of(hint: Any) -> tuple[type, ...]:
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return tuple(t for part in typing.get_args(hint) for t in _types_of(part))
-    if typing.get_origin(hint) is Literal:
-        return tuple(dict.fromkeys(type(value) for value in typing.get_args(hint)))
-    return (typing.get_origin(hint) or hint,)
+    """Return the plain types of an annotation; ``object`` and ``Any`` allow every value."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return tuple(t for part in inner for t in _types_of(part))
+    if origin is Literal:
+        return tuple(dict.fromkeys(type(value) for value in inner))
+    return (object,) if hint is Any else (origin or hint,)
+
+
+def checked(declared: type[Declared], detector: str, values: Mapping[str, Any]) -> Declared:
+    """Return what `resolve_parameters` returns as an instance of the dataclass: for factories."""
+    return declared(**resolve_parameters(detector, declared, values))
 
 
 def resolve_parameters(
@@ -106,30 +121,27 @@ def resolve_parameters(
 ) -> dict[str, Any]:
     """Return a detector's parameters with defaults filled in, sorted by name.
 
-    Parameters
-    ----------
-    detector
-        Its name, for messages.
-    declared
-        Its dataclass of parameters; None when it has none.
-    given
-        Values by name.
-    others
-        Whether the detector takes names that it does not declare.
-
-    Raises
-    ------
-    UnknownNameError
-        When `given` names a parameter that the detector does not declare.
-    UsageError
-        When a value has another type or lies outside of its bounds.
+    Raises `UnknownNameError` for a name that it does not declare, unless it takes `others`, and
+    `UsageError` for a value of another type or out of bounds.
     """
     known = parameters_of(declared)
     for name, value in given.items():
-        if name not in known:
-            if others:
-                continue
+        if name not in known and not others:
             raise UnknownNameError(f"parameter of {detector}", name, known)
-        if problem := known[name].problem(value):
+        if name in known and (problem := known[name].problem(value)):
             raise UsageError(f"parameter {name!r} of {detector} is {value!r}, {problem}")
     return dict(sorted({**{n: p.default for n, p in known.items()}, **given}.items()))
+
+
+def declared_by(defaults: Mapping[str, Any], base: type = object) -> type:
+    """Return a dataclass of parameters for defaults that are known at run time only.
+
+    Values have to be of the default's kind: a number, a text or a truth value. Where the default is
+    something else, such as None, any value will do. Parameters of `base` come first.
+    """
+    kinds = {bool: bool, str: str, int: float, float: float}
+    fields = []
+    for name, value in defaults.items():
+        kind = next((k for t, k in kinds.items() if isinstance(value, t)), object)
+        fields.append((name, kind, parameter(value)))
+    return dataclasses.make_dataclass("Parameters", fields, bases=(base,), frozen=True)

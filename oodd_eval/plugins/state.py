@@ -12,7 +12,7 @@ import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,77 +22,44 @@ from oodd_eval.errors import FittedStateError
 STATE: Final = "state.json"
 ARRAYS: Final = "arrays.npz"
 
+Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
-def save_state(
-    directory: Path, *, kind: str, settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-) -> None:
-    """Write a fitted state into a directory.
 
-    Parameters
-    ----------
-    directory
-        An existing directory.
-    kind
-        What is saved, with the version of its layout: ``"mewma/1"``.
-    settings
-        What a detector must have been made with to load it; JSON values.
-    arrays
-        Numbers, by name; arrays of objects are refused.
+def save_state(directory: Path, *, kind: str, settings: Mapping[str, Any], arrays: Arrays) -> None:
+    """Write arrays of numbers and the settings (JSON values) that a detector needs to load them.
+
+    `kind` names the state, with the version of its layout: ``"mewma/1"``.
     """
     np.savez_compressed(directory / ARRAYS, allow_pickle=False, **arrays)
     state = {"kind": kind, "settings": dict(settings)}
     (directory / STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
 
 
-def load_state(
-    directory: Path, *, kind: str, settings: Mapping[str, Any]
-) -> dict[str, NDArray[Any]]:
+def load_state(directory: Path, *, kind: str, settings: Mapping[str, Any]) -> Arrays:
     """Return the arrays of a saved state.
 
-    Raises
-    ------
-    FittedStateError
-        When files are missing or damaged, or of another kind or other settings.
+    Raises `FittedStateError` for missing or damaged files, another kind, or other settings.
     """
+    # What JSON makes of the settings is what was written: tuples come back as lists.
+    wanted = {"kind": kind, "settings": json.loads(json.dumps(dict(settings)))}
     try:
         state = json.loads((directory / STATE).read_text(encoding="utf-8"))
-        # What JSON makes of the settings is what was written: tuples come back as lists.
-        wanted = {"kind": kind, "settings": json.loads(json.dumps(dict(settings)))}
-        if state != wanted:
-            raise FittedStateError(
-                f"{str(directory)!r} holds {state}, expected {wanted}: make the detector with the "
-                "parameters that it was saved with"
-            )
         with np.load(directory / ARRAYS, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
-        if isinstance(error, FittedStateError):
-            raise
-        raise FittedStateError(
-            f"{str(directory)!r} cannot be read as a saved detector ({STATE}, {ARRAYS}): {error}"
-        ) from None
+        what = f"{str(directory)!r} cannot be read as a saved detector ({STATE}, {ARRAYS})"
+        raise FittedStateError(f"{what}: {error}") from None
+    if state != wanted:
+        advice = "make the detector with the parameters that it was saved with"
+        raise FittedStateError(f"{str(directory)!r} holds {state}, expected {wanted}: {advice}")
+    return arrays
 
 
-def take(
-    arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], kind: str = "f"
-) -> NDArray[Any]:
-    """Return one array of a loaded state after a look at its shape and kind of numbers.
+def take(arrays: Arrays, name: str, shape: tuple[int | None, ...], kind: str = "f") -> NDArray[Any]:
+    """Return one array of `load_state`, or raise `FittedStateError` when it is something else.
 
-    Parameters
-    ----------
-    arrays
-        From `load_state`.
-    name
-        Which.
-    shape
-        Expected lengths; None where any will do.
-    kind
-        ``"f"`` for finite floats, ``"i"`` for integers.
-
-    Raises
-    ------
-    FittedStateError
-        When it is absent, or something else.
+    `shape` has the expected lengths, None where any will do; `kind` is ``"f"`` for finite floats
+    and ``"i"`` for integers.
     """
     found = arrays.get(name)
     if (
@@ -103,8 +70,6 @@ def take(
         or (kind == "f" and not np.isfinite(found).all())
     ):
         what = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
-        raise FittedStateError(
-            f"saved array {name!r} is {what}, expected finite numbers of kind {kind!r} and shape "
-            f"{shape} (None: any)"
-        )
+        expected = f"finite numbers of kind {kind!r} and shape {shape} (None: any)"
+        raise FittedStateError(f"saved array {name!r} is {what}, expected {expected}")
     return found

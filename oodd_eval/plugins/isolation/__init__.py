@@ -1,1 +1,103 @@
-"""Room."""
+"""Detectors in processes of their own, with limits: a failing one is a status, never a crash.
+
+Harness and workers exchange JSON and arrays over pipes, nothing executable. A frame is an
+8-byte little-endian length and that many bytes: UTF-8 JSON, or an array as `numpy.save` writes it
+with pickling refused. The messages before say which of the two comes next.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import OoddError
+
+
+class ChannelClosedError(OoddError, EOFError):
+    """The other side ended before the message was complete."""
+
+
+class ChannelGarbledError(OoddError, ValueError):
+    """Bytes that are no message: the detector wrote into the pipe."""
+
+
+LONGEST_FRAME: Final = 2**31
+"""Bytes of a frame, at most; a length beyond that was not written by a channel."""
+
+
+class Channel:
+    """A conversation over two file descriptors; -1 for the one of a direction that is not used.
+
+    `wait` is called before every read, and may raise to give up; by default reads block.
+    """
+
+    def __init__(self, reading: int, writing: int, wait: Callable[[], None] = lambda: None) -> None:
+        self._reading, self._writing, self._wait = reading, writing, wait
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a JSON object. Values JSON does not know are sent as their text."""
+        self._send_frame(json.dumps(message, default=repr).encode())
+
+    def receive(self) -> dict[str, Any]:
+        """Receive a JSON object; `ChannelGarbledError` when something else comes."""
+        try:
+            message = json.loads(self._receive_frame())
+        except (ValueError, RecursionError) as error:
+            raise ChannelGarbledError(f"expected JSON over the pipe: {error}") from None
+        if not isinstance(message, dict):
+            raise ChannelGarbledError(f"expected a JSON object over the pipe, got {message!r:.80}")
+        return message
+
+    def send_array(self, array: NDArray[Any]) -> None:
+        """Send an array that holds no Python objects."""
+        buffer = io.BytesIO()
+        np.save(buffer, array, allow_pickle=False)
+        self._send_frame(buffer.getbuffer())
+
+    def receive_array(self) -> NDArray[Any]:
+        """Receive an array; raise as `receive` does."""
+        frame = io.BytesIO(self._receive_frame())
+        try:
+            array: NDArray[Any] = np.load(frame, allow_pickle=False)
+        except (ValueError, OSError, EOFError, MemoryError) as error:
+            raise ChannelGarbledError(f"expected an array over the pipe: {error}") from None
+        return array
+
+    def send_trajectory(self, trajectory: Trajectory) -> None:
+        """Send what a detector may know of an episode."""
+        self.send_array(trajectory.observations)
+        self.send_array(trajectory.actions)
+
+    def receive_trajectory(self) -> Trajectory:
+        """Receive an episode."""
+        observations = self.receive_array()
+        return Trajectory(observations, self.receive_array())
+
+    def _send_frame(self, payload: bytes | memoryview) -> None:
+        for part in (len(payload).to_bytes(8, "little"), payload):
+            rest = memoryview(part)
+            while rest:
+                rest = rest[os.write(self._writing, rest) :]
+
+    def _receive_frame(self) -> bytes:
+        length = int.from_bytes(self._receive_bytes(8), "little")
+        if length > LONGEST_FRAME:
+            raise ChannelGarbledError(f"a message of {length} bytes was announced over the pipe")
+        return self._receive_bytes(length)
+
+    def _receive_bytes(self, n: int) -> bytes:
+        parts = bytearray()
+        while len(parts) < n:
+            self._wait()
+            part = os.read(self._reading, min(n - len(parts), 1 << 20))
+            if not part:
+                raise ChannelClosedError(f"the other side ended after {len(parts)} of {n} bytes")
+            parts += part
+        return bytes(parts)

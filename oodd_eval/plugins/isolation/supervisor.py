@@ -1,38 +1,56 @@
 """Run one detector in a process of its own, with limits, and turn every way to fail into a status.
 
 A crash, a hang, a memory blow-up, ``sys.exit`` or a raise of the detector ends the worker, never
-the harness. POSIX only; the memory limit is watched through ``/proc`` (Linux).
+the harness. All that the worker has started is ended with it: its process group, its descendants,
+and those that left both, which a mark in the environment that they inherited gives away. POSIX
+only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import secrets
 import select
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
+from pathlib import Path
 from typing import Any, Final, Protocol
 
+import psutil
+
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.plugins.isolation.messages import Channel, ChannelClosedError, ChannelGarbledError
-from oodd_eval.plugins.isolation.processes import Child
+from oodd_eval.errors import OoddError
+from oodd_eval.plugins.isolation import Channel, ChannelClosedError, ChannelGarbledError
 
-CHUNK: Final = 64
-"""Trajectories that a worker scores at once."""
+MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
+LOG_BYTES: Final = 64_000
+_PATIENCE: Final = 5.0  # seconds for which marked processes are hunted, should they multiply
 
-POLL_SECONDS: Final = 0.05
+_SINGLE_THREAD: Final = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS", "LOKY_MAX_CPU_COUNT",
+)  # fmt: skip
+
+CHUNK: Final = 64  # trajectories that a worker scores at once
+
+POLL_SECONDS: Final = 0.05  # between two looks at a worker that is silent
+_END_POLL_SECONDS: Final = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a worker is told beside the trajectories.
+    """The first message to a worker; the trajectories follow, `train` of them to fit on.
 
-    `train` is how many of them are to fit on. `load` is the directory of a fitted detector, which
-    then replaces the fit; `save` the empty one where a fitted detector may save itself. Both are
-    empty where there is none.
+    `load` is the directory of a kept fit, which replaces fitting; `save` is an empty directory
+    where the detector may save its fit. Both are empty where there is none.
     """
 
     plugin: str
@@ -55,24 +73,11 @@ class Limits:
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of a fit.
+    """Scores of a fit, or the way in which it failed.
 
-    Attributes
-    ----------
-    status
-        ``"ok"``, ``"error"``, ``"timeout"``, ``"oom"``, ``"invalid"``, ``"incompatible"`` or
-        ``"unavailable"``.
-    reason
-        One line for a status other than ok.
-    scores
-        What the detector returned for each trajectory, in the order in which they were sent; not
-        checked.
-    warm_up
-        What the detector declares.
-    seconds_fit, seconds_score, peak_rss_mb
-        Cost; None where the worker did not come so far.
-    log
-        The end of what the detector printed.
+    `status` is as in a record, with a reason of one line unless ok. `scores` and `warm_up` are the
+    detector's own, not checked. Costs are None when the worker ended before they were known. `log`
+    is the end of the detector's output.
     """
 
     status: str = "ok"
@@ -88,172 +93,214 @@ class Outcome:
 class Stop(Protocol):
     """A flag that another thread sets to end the work, such as `threading.Event`."""
 
-    def is_set(self) -> bool:
-        """Whether to stop."""
-        ...
+    def is_set(self) -> bool: ...  # noqa: D102  see there
 
 
-class _Abort(Exception):  # noqa: N818  a signal between two functions here, never seen outside
-    """The worker has to end: status and reason."""
+class GivenUpError(OoddError, RuntimeError):
+    """A process has to end: the status and reason of its cell, and what is told of the process."""
+
+    def __init__(self, status: str, reason: str, told: str = "") -> None:
+        super().__init__(reason)
+        self.status, self.reason, self.told = status, reason, told
+
+
+class Child:
+    """A module run as ``python -m MODULE READ_FD WRITE_FD LIFELINE_FD``, within limits.
+
+    It has no standard input, the import path of this process, one thread for numerical libraries,
+    and none of the variables that steer the harness. The system closes the lifeline when this
+    process is killed: see `oodd_eval.plugins.isolation.worker.connect`. `sending` is the descriptor
+    to write to it, for the caller to close; `channel` gives up with `GivenUpError` at a limit.
+    """
+
+    def __init__(self, module: str, limits: Limits, stop: Stop | None = None) -> None:
+        reading, self.sending = os.pipe()
+        self._receiving, writing = os.pipe()
+        lifeline, self._held = os.pipe()
+        descriptors = reading, writing, lifeline
+        self._mark = secrets.token_hex(8)
+        self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
+            [sys.executable, "-P", "-m", module, *map(str, descriptors)],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            pass_fds=descriptors, env={**_environment(), MARK: self._mark},
+            start_new_session=True,
+        )  # fmt: skip
+        for descriptor in descriptors:
+            os.close(descriptor)
+        self.channel = Channel(self._receiving, self.sending, self._wait)
+        self._limits, self._stop = limits, stop
+        self._seen = psutil.Process(self._process.pid)
+        self._printed = b""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.start_clock()
+
+    def start_clock(self) -> None:
+        """Count the seconds of the limit from now on."""
+        self._start = time.monotonic()
+
+    @property
+    def exited(self) -> bool:
+        """Tell whether it has ended; its id is not given to others until `end` was called."""
+        try:
+            return bool(self._seen.status() == psutil.STATUS_ZOMBIE)
+        except psutil.NoSuchProcess:
+            return True
+
+    def wait_for_exit(self, *, seconds: float) -> bool:
+        """Wait until it has ended; return False when it has not, after so many seconds."""
+        deadline = time.monotonic() + seconds
+        while not self.exited:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(_END_POLL_SECONDS)
+        return True
+
+    def end(self) -> str:
+        """Kill it with all that it has started, and return the end of what was printed."""
+        strays: list[psutil.Process] = []
+        with contextlib.suppress(psutil.Error):
+            strays = self._seen.children(recursive=True)
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+        self.returncode = self._process.wait()
+        deadline = time.monotonic() + _PATIENCE
+        strays, clean = [*strays, *_marked(self._mark)], 1
+        # A process whose parent ended during one search is found by the next one.
+        while (strays or clean < 2) and time.monotonic() < deadline:
+            for stray in strays:
+                with contextlib.suppress(psutil.Error):
+                    stray.kill()
+            time.sleep(_END_POLL_SECONDS)
+            clean = 1 if strays else clean + 1
+            strays = list(_marked(self._mark))
+        # A process that escaped could hold the pipe open for ever: do not wait for it.
+        self._reader.join(timeout=1.0)
+        os.close(self._receiving)
+        os.close(self._held)
+        return self._printed.decode(errors="replace")
+
+    def _read(self) -> None:
+        """Read what is printed, and keep the end of it."""
+        if self._process.stdout:
+            with self._process.stdout as pipe:
+                while part := os.read(pipe.fileno(), 1 << 16):
+                    self._printed = (self._printed + part)[-LOG_BYTES:]
+
+    def death(self) -> str:
+        """Say how it ended, after `end`."""
+        if self.returncode < 0:
+            return f"was killed by {signal.Signals(-self.returncode).name}"
+        return f"ended with exit code {self.returncode}"
+
+    def _wait(self) -> None:
+        """Wait for the next bytes, and give up when a limit is passed."""
+        while not self._ready(POLL_SECONDS):
+            self._check()
+            if self.exited:
+                # A grandchild may hold the pipe open, so that its end would never come.
+                if not self._ready(0):
+                    raise ChannelClosedError("the process ended")
+                return
+        self._check()
+
+    def _ready(self, seconds: float) -> bool:
+        return bool(select.select([self._receiving], [], [], seconds)[0])
+
+    def _check(self) -> None:
+        if self._stop and self._stop.is_set():
+            raise GivenUpError("error", "interrupted")
+        seconds, memory = self._limits.seconds, self._limits.memory
+        if seconds is not None and time.monotonic() - self._start > seconds:
+            reason = f"not done after {seconds:g} s (--timeout)"
+            raise GivenUpError("timeout", reason, f"was {reason}")
+        if memory is not None and (used := self._resident_bytes()) > memory:
+            held, most = f"{used / 1e6:.0f} MB", f"{memory / 1e6:.0f} MB (--memory)"
+            reason = f"resident memory {held} is over the limit of {most}"
+            raise GivenUpError("oom", reason, f"held {held}, more than {most}")
+
+    def _resident_bytes(self) -> int:
+        with contextlib.suppress(psutil.Error):
+            return int(self._seen.memory_info().rss)
+        return 0
 
 
 def run_isolated(
-    request: Request,
-    train: Iterable[Trajectory],
-    score: Iterable[Trajectory],
-    again: Iterable[Trajectory] = (),
-    *,
-    limits: Limits,
-    stop: Stop,
-) -> Outcome:
+    request: Request, train: Iterable[Trajectory], score: Iterable[Trajectory],
+    again: Iterable[Trajectory] = (), *, limits: Limits, stop: Stop,
+) -> Outcome:  # fmt: skip
     """Fit on `train`, score `score` and then `again` in a worker process.
 
-    Parameters
-    ----------
-    request
-        The detector and how to make it.
-    train, score, again
-        Trajectories, read lazily and in order. `again` never shares a chunk with `score`, so that
-        its company changes no digit there.
-    limits
-        Enforced from outside: the whole process group of the worker is killed.
-    stop
-        When set, the worker is killed and the outcome has the status ``"error"``.
-
-    Returns
-    -------
-    Outcome
-        Never raises for what the detector does; errors of reading the trajectories pass through.
+    Each iterable is read once, lazily and from another thread, the next one when the one before is
+    exhausted: what `score` gave may still serve for `again`. `again` never shares a chunk with
+    `score`, so that its company changes no digit there. When `stop` is set, the worker is killed
+    and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
-    to_worker, from_harness = _pipe()
-    to_harness, from_worker = _pipe()
-    # Closed by the system when this process is killed, which ends the worker.
-    lifeline, held = _pipe()
-    for_worker = (to_worker, from_worker, lifeline)
-    child = Child("oodd_eval.plugins.isolation.worker", for_worker)
-    outcome = Outcome()
-    sender = _Sender(from_harness, request, train, chain(_chunks(score), _chunks(again)))
-    watch = _Watch(child, to_harness, limits, stop)
-    died = silent = False
-    try:
-        _converse(Channel(to_harness, None, watch), outcome)
-    except _Abort as abort:
-        outcome.status, outcome.reason = abort.args
-    except (ChannelGarbledError, KeyError):
-        outcome.status = "error"
-        outcome.reason = "the detector wrote into the pipe between worker and harness"
-    except ChannelClosedError:
-        died = True
-        silent = not child.wait_for_exit(seconds=5.0)
-    finally:
-        outcome.log = child.end()
-        os.close(to_harness)
-        os.close(held)
-        sender.join()
-    if sender.error:
-        raise sender.error
-    if died:
-        outcome.status, outcome.reason = _death(child, outcome, silent=silent)
+    child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
+    # From another thread, so that neither side can deadlock on a full pipe.
+    with ThreadPoolExecutor(1) as pool:
+        chunks = chain(_chunks(score), _chunks(again))
+        sent = pool.submit(_send, child, request, train, chunks)
+        try:
+            _converse(child.channel, outcome)
+        except GivenUpError as error:
+            outcome.status, outcome.reason = error.status, error.reason
+        except (ChannelGarbledError, KeyError):
+            outcome.status = "error"
+            outcome.reason = "the detector wrote into the pipe between worker and harness"
+        except ChannelClosedError:
+            doing = "fitting" if outcome.seconds_fit is None else "scoring"
+            outcome.status = "error"
+            if not child.wait_for_exit(seconds=5.0):
+                outcome.reason = f"the worker closed its pipe while {doing}, without a result"
+        finally:
+            outcome.log = child.end()
+    sent.result()
+    if outcome.status == "error" and not outcome.reason:
+        outcome.reason = f"the worker {child.death()} while {doing}"
+        if child.returncode == -signal.SIGKILL:
+            cause = "(most likely out of memory)"
+            outcome.status = "oom"
+            outcome.reason = f"the system killed the worker while {doing} {cause}"
     return outcome
 
 
 def _converse(channel: Channel, outcome: Outcome) -> None:
-    """Receive what the worker has to say, message by message, into `outcome`."""
-    first = channel.receive()
-    if "status" in first:
-        raise _Abort(first["status"], first["reason"])
-    outcome.seconds_fit, outcome.warm_up = first["seconds_fit"], first["warm_up"]
-    while True:
+    """Receive the worker's messages into `outcome` until the last one."""
+    while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
-            raise _Abort(message["status"], message["reason"])
-        if "seconds_score" in message:
-            outcome.seconds_score = message["seconds_score"]
+            raise GivenUpError(message["status"], message["reason"])
+        if outcome.seconds_fit is None:
+            outcome.seconds_fit, outcome.warm_up = message["seconds_fit"], message["warm_up"]
+        elif "seconds_score" in message:
             outcome.peak_rss_mb = message["peak_rss_mb"]
-            return
-        if message["type"] != "array":
-            raise _Abort(
-                "invalid", f"score returned {message['type']}, expected a numpy array of float64"
-            )
-        outcome.scores.append(channel.receive_array())
+            outcome.seconds_score = message["seconds_score"]
+        elif message["type"] == "array":
+            outcome.scores.append(channel.receive_array())
+        else:
+            wrong = f"score returned {message['type']}, expected a numpy array of float64"
+            raise GivenUpError("invalid", wrong)
 
 
-class _Watch:
-    """Wait for the worker's next bytes, and give up when a limit is passed."""
-
-    def __init__(self, child: Child, descriptor: int, limits: Limits, stop: Stop) -> None:
-        self._child, self._descriptor = child, descriptor
-        self._limits, self._stop = limits, stop
-        self._start = time.monotonic()
-
-    def __call__(self) -> None:
-        while not select.select([self._descriptor], [], [], POLL_SECONDS)[0]:
-            self._check()
-            if self._child.exited:
-                # A grandchild may hold the pipe open, so that its end would never come.
-                if not select.select([self._descriptor], [], [], 0)[0]:
-                    raise ChannelClosedError("the worker ended")
-                return
-        self._check()
-
-    def _check(self) -> None:
-        if self._stop.is_set():
-            raise _Abort("error", "interrupted")
-        seconds, memory = self._limits.seconds, self._limits.memory
-        if seconds is not None and time.monotonic() - self._start > seconds:
-            raise _Abort("timeout", f"not done after {seconds:g} s (--timeout)")
-        if memory is not None and (used := self._child.resident_bytes) > memory:
-            raise _Abort(
-                "oom",
-                f"resident memory {used / 1e6:.0f} MB is over the limit of {memory / 1e6:.0f} MB "
-                "(--memory)",
-            )
-
-
-class _Sender:
-    """Send the request and the trajectories from a thread, so that nobody waits for nobody."""
-
-    def __init__(
-        self,
-        descriptor: int,
-        request: Request,
-        train: Iterable[Trajectory],
-        chunks: Iterable[list[Trajectory]],
-    ) -> None:
-        self.error: BaseException | None = None
-        self._descriptor = descriptor
-        self._thread = threading.Thread(
-            target=self._run, args=(request, train, chunks), daemon=True
-        )
-        self._thread.start()
-
-    def _run(
-        self, request: Request, train: Iterable[Trajectory], chunks: Iterable[list[Trajectory]]
-    ) -> None:
-        channel = Channel(None, self._descriptor)
-        try:
-            channel.send(asdict(request))
-            for trajectory in train:
+def _send(
+    child: Child, request: Request, train: Iterable[Trajectory], chunks: Iterable[list[Trajectory]]
+) -> None:
+    channel = child.channel
+    try:
+        channel.send(asdict(request))
+        for trajectory in train:
+            channel.send_trajectory(trajectory)
+        for chunk in chunks:
+            channel.send({"score": len(chunk)})
+            for trajectory in chunk:
                 channel.send_trajectory(trajectory)
-            for chunk in chunks:
-                channel.send({"score": len(chunk)})
-                for trajectory in chunk:
-                    channel.send_trajectory(trajectory)
-            channel.send({"score": 0})
-        except BrokenPipeError:
-            pass  # The worker ended; the receiving side finds out why.
-        except BaseException as error:  # noqa: BLE001  raised again where the caller waits
-            self.error = error
-        finally:
-            os.close(self._descriptor)
-
-    def join(self) -> None:
-        self._thread.join()
-
-
-def _pipe() -> tuple[int, int]:
-    reading, writing = os.pipe()
-    return reading, writing
+        channel.send({"score": 0})
+    except BrokenPipeError:
+        pass  # The worker ended; the receiving side finds out why.
+    finally:
+        os.close(child.sending)
 
 
 def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
@@ -262,11 +309,19 @@ def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
         yield chunk
 
 
-def _death(child: Child, outcome: Outcome, *, silent: bool) -> tuple[str, str]:
-    """Say how a worker ended that did not say so itself."""
-    doing = "fitting" if outcome.seconds_fit is None else "scoring"
-    if silent:
-        return "error", f"the worker closed its pipe while {doing}, without a result"
-    if child.process.returncode == -signal.SIGKILL:
-        return "oom", f"the system killed the worker while {doing} (most likely out of memory)"
-    return "error", f"the worker {child.death()} while {doing}"
+def _environment() -> dict[str, str]:
+    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+    # A detector must not see the harness's settings, nor the test that pytest names.
+    steering = ("OODD_EVAL_", "PYTEST_CURRENT_TEST")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(steering)}
+    single = dict.fromkeys(_SINGLE_THREAD, "1")
+    return {**kept, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
+
+
+def _marked(mark: str) -> Iterator[psutil.Process]:
+    """Yield the running processes whose environment holds a mark."""
+    for pid in psutil.pids():
+        with contextlib.suppress(psutil.Error, OSError):
+            process = psutil.Process(pid)
+            if process.environ().get(MARK) == mark:
+                yield process

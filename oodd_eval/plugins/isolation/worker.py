@@ -2,102 +2,76 @@
 
 It never holds onsets, anomalies, twins' pairing or the name of the environment. Training
 trajectories come first, in the order of the split; then, shuffled together and in chunks, the
-trajectories to score. The harness starts it as ``python -m oodd_eval.plugins.isolation.worker READ_FD WRITE_FD
-LIFELINE_FD``: messages have descriptors of their own, so that nothing a detector prints gets
-between them, and the end of the harness is the end of its workers.
+trajectories to score. Messages have descriptors of their own, so that nothing that a detector
+prints gets between them.
 """
 
 from __future__ import annotations
 
 import faulthandler
+import math
 import os
 import resource
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Final, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, PluginError
-from oodd_eval.plugins.contract import Detector, StorableDetector
-from oodd_eval.plugins.discovery import describe, discover
-from oodd_eval.plugins.isolation.messages import Channel
-from oodd_eval.plugins.isolation.trajectory_file import Spool
+from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
+from oodd_eval.errors import ContractError, TrajectoryError
+from oodd_eval.plugins.contract import StorableDetector, make_detector, score_chunk
+from oodd_eval.plugins.discovery import describe, offer_of
+from oodd_eval.plugins.isolation import Channel
+
+_STATUSES: Final[dict[type[BaseException], str]] = {
+    MemoryError: "oom", NotImplementedError: "incompatible", ContractError: "invalid",
+    ModuleNotFoundError: "unavailable",
+}  # fmt: skip
+"""Status of a cell by what its detector raised."""
 
 
-def make_detector(
-    factory: Callable[..., Detector], *, seed: int, horizon: int, parameters: Mapping[str, Any]
-) -> Detector:
-    """Make an unfitted detector.
+class TrajectoryFile(TrajectorySequence):
+    """Trajectories in a temporary file: a sequence that may be larger than memory.
 
-    Raises
-    ------
-    ContractError
-        When the factory returns something without `fit` and `score`.
+    Every access reads the trajectory again, so that only those that somebody holds are in memory.
     """
-    detector = factory(seed=seed, horizon=horizon, **parameters)
-    if not isinstance(detector, Detector):
-        raise ContractError(
-            f"the factory returned {type(detector).__name__}, expected an object with the methods "
-            "fit(nominal) and score(trajectory)"
-        )
-    return detector
 
+    def __init__(self, trajectories: Iterable[Trajectory]) -> None:
+        self._places: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
+        self._file = tempfile.TemporaryFile(prefix="oodd-eval-")  # noqa: SIM115  open as long as self
+        for t in trajectories:
+            self._places.append((self._file.tell(), t.observations.shape, t.actions.shape))
+            self._file.write(t.observations.data)
+            self._file.write(t.actions.data)
+        self._file.flush()
 
-def save_fitted(detector: Detector, directory: str) -> None:
-    """Let a detector that can save its fit do so.
+    def __len__(self) -> int:
+        return len(self._places)
 
-    What fails here is printed and costs a later run the time of a fit, but no score.
-    """
-    if directory and isinstance(detector, StorableDetector):
-        try:
-            detector.save(Path(directory))
-        except Exception:  # noqa: BLE001  a detector may raise anything
-            traceback.print_exc()
-            shutil.rmtree(directory)
-            Path(directory).mkdir()
+    def _one(self, i: int) -> Trajectory:
+        start, observations, actions = self._places[i]
+        middle = start + 4 * math.prod(observations)
+        return Trajectory(self._matrix(start, observations), self._matrix(middle, actions))
 
+    def close(self) -> None:
+        """Give the file back; nothing can be read any more."""
+        self._file.close()
 
-def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
-    """Score some trajectories, all at once if the detector can; the scores are not checked yet.
-
-    Raises
-    ------
-    ContractError
-        When ``score_many`` returns another number of score arrays than it got trajectories.
-    """
-    score_many = getattr(detector, "score_many", None)
-    if score_many is None:
-        return [detector.score(trajectory) for trajectory in chunk]
-    scores = list(score_many(chunk))
-    if len(scores) != len(chunk):
-        raise ContractError(
-            f"score_many returned {len(scores)} score arrays, expected {len(chunk)}: one for each "
-            "trajectory"
-        )
-    return scores
-
-
-def classify(error: BaseException) -> str:
-    """Return the status of a cell whose detector raised this."""
-    match error:
-        case MemoryError():
-            return "oom"
-        case NotImplementedError():
-            return "incompatible"
-        case ContractError():
-            return "invalid"
-        case ModuleNotFoundError() if not isinstance(error, PluginError):
-            return "unavailable"
-        case _:
-            return "error"
+    def _matrix(self, start: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        # Reading at a place leaves alone the position that forked processes share.
+        content = os.pread(self._file.fileno(), 4 * math.prod(shape), start)
+        if len(content) != 4 * math.prod(shape):
+            raise TrajectoryError("the temporary file of training trajectories was cut short")
+        return np.frombuffer(content, dtype=np.float32).reshape(shape)
 
 
 def reason_of(error: BaseException) -> str:
@@ -110,10 +84,8 @@ def reason_of(error: BaseException) -> str:
 
 
 def peak_rss_mb() -> float:
-    """Return the largest resident memory of this process so far, in MB of 10^6 bytes.
-
-    Linux keeps it per program; getrusage would also count the harness this was started from.
-    """
+    """Return the largest resident memory of this process so far, in MB of 10^6 bytes."""
+    # Linux keeps it per program; getrusage would also count the harness this was started from.
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         kib = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
@@ -126,28 +98,28 @@ def peak_rss_mb() -> float:
 def serve(channel: Channel) -> None:
     """Fit the requested detector and score what comes until a chunk of zero."""
     request = channel.receive()
-    train = Spool(channel.receive_trajectory() for _ in range(request["train"]))
-    plugins = discover(only=[request["plugin"]])
-    for broken in plugins.broken:
-        raise PluginError(f"plug-in {broken.plugin!r} cannot be loaded: {broken.reason}")
-    spec = plugins.offer(request["detector"]).spec
+    train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
+    spec = offer_of(request["plugin"], request["detector"]).spec
 
     start = time.perf_counter()
-    detector = make_detector(
-        spec.factory,
-        seed=request["seed"],
-        horizon=request["horizon"],
-        parameters=request["parameters"],
-    )
-    if request["load"]:
-        if not isinstance(detector, StorableDetector):
-            raise ContractError("a detector that had saved itself has no load(directory) any more")
+    given = {name: request[name] for name in ("seed", "horizon", "parameters")}
+    detector = make_detector(spec.factory, **given)
+    if not request["load"]:
+        detector.fit(train)
+    elif isinstance(detector, StorableDetector):
         detector.load(Path(request["load"]))
     else:
-        detector.fit(train)
+        raise ContractError("a detector that had saved itself has no load(directory) any more")
     seconds_fit = time.perf_counter() - start
-    if not request["load"]:
-        save_fitted(detector, request["save"])
+    if request["save"] and isinstance(detector, StorableDetector):
+        # A failure costs a later run the time of a fit, no more.
+        directory = Path(request["save"])
+        try:
+            detector.save(directory)
+        except Exception:  # noqa: BLE001  a detector may raise anything
+            traceback.print_exc()
+            shutil.rmtree(directory)
+            directory.mkdir()
     channel.send({"seconds_fit": seconds_fit, "warm_up": getattr(detector, "warm_up", 0)})
 
     seconds_score = 0.0
@@ -157,44 +129,45 @@ def serve(channel: Channel) -> None:
         scores = score_chunk(detector, chunk)
         seconds_score += time.perf_counter() - start
         for one in scores:
-            plain = isinstance(one, np.ndarray) and not one.dtype.hasobject
-            channel.send({"type": "array" if plain else _kind(one)})
-            if plain:
+            if not isinstance(one, np.ndarray):
+                channel.send({"type": type(one).__name__})
+            elif one.dtype.hasobject:
+                channel.send({"type": "ndarray of object"})
+            else:
+                channel.send({"type": "array"})
                 channel.send_array(np.asarray(one))
     channel.send({"seconds_score": seconds_score, "peak_rss_mb": peak_rss_mb()})
 
 
-def _kind(scores: object) -> str:
-    return "ndarray of object" if isinstance(scores, np.ndarray) else type(scores).__name__
+def connect(arguments: Sequence[str]) -> Channel:
+    """Return the channel to the harness, from the command line of a process that it has started.
 
-
-def end_with(lifeline: int) -> None:
-    """Kill this process and whatever it has started when the harness is no more.
-
-    The harness holds the other end of a pipe and never writes to it; reading ends when it closes.
+    The harness never writes to the lifeline: reading it ends when the harness is no more, which
+    ends this process and whatever it has started, too.
     """
+    reading, writing, lifeline = descriptors = [int(a) for a in arguments]
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
 
     def wait() -> None:
         os.read(lifeline, 1)
         os.killpg(os.getpgid(0), signal.SIGKILL)
 
     threading.Thread(target=wait, daemon=True).start()
+    faulthandler.enable()
+    return Channel(reading, writing)
 
 
 def main(arguments: Sequence[str]) -> NoReturn:
     """Serve one request and end the process, whatever the detector has left running."""
-    reading, writing, lifeline = (int(a) for a in arguments)
-    for descriptor in (reading, writing, lifeline):
-        os.set_inheritable(descriptor, False)
-    end_with(lifeline)
-    faulthandler.enable()
-    channel = Channel(reading, writing)
+    channel = connect(arguments)
     code = 0
     try:
         serve(channel)
     except BaseException as error:  # noqa: BLE001  a detector may raise anything; all is reported
         traceback.print_exc()
-        channel.send({"status": classify(error), "reason": reason_of(error)})
+        status = next((s for kind, s in _STATUSES.items() if isinstance(error, kind)), "error")
+        channel.send({"status": status, "reason": reason_of(error)})
         code = 1
     sys.stdout.flush()
     sys.stderr.flush()

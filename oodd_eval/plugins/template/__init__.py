@@ -1,14 +1,12 @@
-"""A ready plug-in project: what ``oodd-eval new`` writes.
+"""A ready plug-in project: the files that ``oodd-eval new`` writes.
 
 Templates lie beside this module, each ending in ``.in`` so that nothing takes them for source of
-this package. `FILES` says where each goes; ``@NAME@`` and the like stand for the names of the
-project, in paths and in contents.
+this package. ``@NAME@`` and the like stand for the names of the project, in paths and in contents.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Final
 
 from oodd_eval.errors import OutputError, UsageError
 
-FILES: Final[Mapping[str, str]] = {
+FILES: Final = {
     "pyproject.toml": "pyproject.toml.in",
     "README.md": "readme.md.in",
     ".gitignore": "gitignore.in",
@@ -28,38 +26,25 @@ FILES: Final[Mapping[str, str]] = {
 }
 """Path in the project and template, in the order in which they are told."""
 
-LONGEST: Final = 30
-"""Characters of a name, at most: what keeps the lines of the templates within their limit."""
-
-RESERVED: Final = ("all", "eval")
-"""``all`` selects every detector, and ``oodd-eval`` is this distribution."""
+LONGEST: Final = 30  # so that lines of the templates stay within their limit
+_RESERVED: Final = ("all", "eval")  # every detector, and this distribution
 
 
 @dataclass(frozen=True, slots=True)
 class Project:
-    """The names of a plug-in project.
-
-    Parameters
-    ----------
-    name
-        Of the detector: lower-case letters, digits and hyphens.
-
-    Raises
-    ------
-    UsageError
-        When the name is no name of a detector, with one that would be.
+    """The names of a plug-in project, which follow from the name of its detector.
 
     Examples
     --------
     >>> project = Project("slow-drift")
-    >>> project.distribution, project.module, project.class_name
-    ('oodd-slow-drift', 'oodd_slow_drift', 'SlowDrift')
+    >>> project.distribution, project.module
+    ('oodd-slow-drift', 'oodd_slow_drift')
     """
 
     name: str
 
     def __post_init__(self) -> None:
-        if self.name in RESERVED:
+        if self.name in _RESERVED:
             raise UsageError(f"{self.name!r} means something else: choose another name")
         if not _is_name(self.name):
             close = _tidy(self.name)
@@ -72,90 +57,59 @@ class Project:
 
     @property
     def distribution(self) -> str:
-        """What pip installs."""
+        """Name for pip."""
         return f"oodd-{self.name}"
 
     @property
     def module(self) -> str:
-        """What Python imports."""
+        """Name for Python's import."""
         return self.distribution.replace("-", "_")
 
     @property
     def class_name(self) -> str:
-        """Of the detector."""
+        """Name of the detector's class, without "Detector"."""
         return "".join(part.capitalize() for part in self.name.split("-"))
 
     def render(self) -> dict[str, str]:
         """Return the contents of all files by their paths in the project."""
+        names = {"@NAME@": self.name, "@DISTRIBUTION@": self.distribution,
+                 "@MODULE@": self.module, "@CLASS@": self.class_name}  # fmt: skip
         templates = files(__name__) / "templates"
+
+        def fill(text: str) -> str:
+            return re.sub("@[A-Z]+@", lambda found: names[found[0]], text)
+
         return {
-            self._fill(path): self._fill((templates / template).read_text(encoding="utf-8"))
+            fill(path): fill((templates / template).read_text(encoding="utf-8"))
             for path, template in FILES.items()
         }
 
-    def _fill(self, text: str) -> str:
-        names = {
-            "@NAME@": self.name,
-            "@DISTRIBUTION@": self.distribution,
-            "@MODULE@": self.module,
-            "@CLASS@": self.class_name,
-        }
-        return re.sub("@[A-Z]+@", lambda found: names[found[0]], text)
-
 
 def write_project(project: Project, directory: Path) -> list[Path]:
-    """Write all files of a project.
-
-    Parameters
-    ----------
-    project
-        Its names.
-    directory
-        Where to; it must not exist, or be empty.
-
-    Returns
-    -------
-    list of Path
-        The files, beginning with `directory`.
-
-    Raises
-    ------
-    OutputError
-        When something is there already, or nothing can be written there.
-    """
-    written = []
+    """Write all files of a project into a new or empty directory, and return their paths."""
+    rendered = {directory / path: text for path, text in project.render().items()}
+    advice = "name another with --output"
     try:
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise OutputError(
-                f"{str(directory)!r} exists and is not an empty directory: name another with "
-                "--output"
-            )
-        for path, text in project.render().items():
-            file = directory / path
+            raise OutputError(f"{str(directory)!r} exists and is not an empty directory: {advice}")
+        for file, text in rendered.items():
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text, encoding="utf-8")
-            written.append(file)
     except OSError as error:
         if isinstance(error, OutputError):
             raise
-        raise OutputError(
-            f"{str(directory)!r} cannot be written: {error.strerror}; name another place with "
-            "--output"
-        ) from None
-    return written
+        reason = f"{str(directory)!r} cannot be written: {error.strerror}; {advice}"
+        raise OutputError(reason) from None
+    return list(rendered)
 
 
 def _is_name(text: str) -> bool:
-    return (
-        re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)*", text) is not None
-        and len(text) <= LONGEST
-        and not text.startswith("oodd-")
-        and text not in RESERVED
-    )
+    plain = re.fullmatch("(?!oodd-)[a-z][a-z0-9]*(-[a-z0-9]+)*", text)
+    return bool(plain) and len(text) <= LONGEST and text not in _RESERVED
 
 
 def _tidy(text: str) -> str:
-    """Return what a text would be as a name; not every text can be one."""
+    """Return a text as a name; not every text can be one."""
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", text)
     tidy = re.sub("[^a-z0-9]+", "-", words.lower()).strip("-").removeprefix("oodd-")
     return tidy[:LONGEST].strip("-").lstrip("0123456789-")
