@@ -17,6 +17,7 @@ import numpy as np
 
 from oodd_eval import DetectorSpec, Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError
+from oodd_eval.plugins.parameters import declared_by
 
 
 class Good:
@@ -68,7 +69,9 @@ class Good:
         self.reset()
 
 
-GOOD = DetectorSpec("good", Good, "", parameters={"power": 1.0}, fit_ignores=("horizon",))
+GOOD = DetectorSpec(
+    "good", Good, "", parameters=declared_by({"power": 1.0}), horizon_decides_fit=False
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ def breaks(check, message, *, also=(), **changes):
     "factory",
     "the factory returned NoScore without a method score: expected an object with fit(nominal) and "
     "score(trajectory)",
-    parameters={},
+    parameters=None,
 )
 class NoScore:
     def __init__(self, *, seed, horizon): ...
@@ -149,7 +152,7 @@ class Exits(Good):
     "declared-parameters",
     "scores change when the declared defaults (power=2.0) are spelt out: at t = 1 it is <n> "
     "instead of <n>; expected the defaults of the spec to be those of the factory",
-    parameters={"power": 2.0},
+    parameters=declared_by({"power": 2.0}),
 )
 class OtherDefault(Good): ...
 
@@ -158,7 +161,7 @@ class OtherDefault(Good): ...
     "declared-parameters",
     "the factory, called with seed=0, horizon=1, power=1.0, strength=2, raised TypeError: "
     "Good.__init__() got an unexpected keyword argument 'strength' (<...>)",
-    parameters={"power": 1.0, "strength": 2},
+    parameters=declared_by({"power": 1.0, "strength": 2}),
 )
 class NoSuchParameter(Good): ...
 
@@ -528,7 +531,7 @@ class LoadsElsewhere(Good):
 @breaks(
     "shared-fit",
     "a fit of horizon 1, loaded for horizon 3, differs from a fit of horizon 3: at t = 3 it is <n> "
-    "instead of <n>; it must not be in fit_ignores",
+    "instead of <n>; expected horizon_decides_fit=True",
 )
 class FitsItsHorizon(Good):
     def fit(self, nominal):

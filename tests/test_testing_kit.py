@@ -12,21 +12,23 @@ from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
 
 from oodd_eval import check_detector
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins.conformance import (
+from oodd_eval.plugins.conformance import CHECKS, checks_process
+from oodd_eval.plugins.conformance.supervise import MOST_ENDS
+from oodd_eval.plugins.conformance.trial import ACTIONS, EPISODES, SENSORS
+from oodd_eval.testing import (
     CheckFailedError,
     CheckSkipped,
     NonConformingError,
     Report,
     Result,
-    checks_manners,
+    Trial,
     detector_checks,
-    problem,
+    pytest_generate_tests,  # noqa: F401  gives the test below its checks
     run_checks,
+    test_contract,  # noqa: F401  a test of this module, as of a plug-in's
 )
-from oodd_eval.plugins.conformance.supervise import MOST_DEATHS
-from oodd_eval.plugins.discovery import discover
 
-NAMES = [check.name for check in detector_checks()]
+NAMES = list(CHECKS)
 
 
 @pytest.fixture
@@ -52,27 +54,40 @@ def pattern(message):
     return re.compile(escaped, re.DOTALL)
 
 
+WHOLE_KIT = ["fits-NoMood", "shape-OneShort", *(name for name in BROKEN if BROKEN[name].also)]
+"""Those after which little else can be carried out, and those that fail several checks."""
+
+
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_broken_detector_fails_its_check_with_its_message(name, apart, monkeypatch):
     broken = BROKEN[name]
     # One of the two: on a busy machine, what takes memory takes its time, too.
     if broken.check == "time-budget":
-        monkeypatch.setattr(checks_manners, "MOST_SECONDS", 0.2)
+        monkeypatch.setattr(checks_process, "MOST_SECONDS", 0.2)
     if broken.check == "memory-budget":
-        monkeypatch.setattr(checks_manners, "MOST_MEGABYTES", 100.0)
+        monkeypatch.setattr(checks_process, "MOST_MEGABYTES", 100.0)
+    with pytest.raises(CheckFailedError) as caught:
+        CHECKS[broken.check](Trial(broken.spec))
+    assert pattern(broken.message).fullmatch(str(caught.value)), caught.value
+
+
+@pytest.mark.parametrize("name", WHOLE_KIT)
+def test_of_the_whole_kit_a_broken_detector_fails_what_it_breaks_alone(name, apart):
+    broken = BROKEN[name]
     report = run_checks(broken.spec)
     failed = {result.name: result.message for result in report.failed}
     assert set(failed) == {broken.check, *broken.also}, report
-    assert pattern(broken.message).fullmatch(failed[broken.check]), failed[broken.check]
+    assert pattern(broken.message).fullmatch(failed[broken.check])
 
 
 def test_every_check_is_proven():
     assert {broken.check for broken in BROKEN.values()} == set(NAMES)
 
 
-@pytest.mark.parametrize("check", detector_checks(), ids=str)
-def test_a_good_detector_passes_every_check(check):
-    check(GOOD)
+@pytest.fixture(scope="module")
+def detector():
+    """Give `test_contract`, which the kit brings along, a good detector."""
+    return Trial(GOOD)
 
 
 @pytest.mark.parametrize("horizon", [2, 4, 20])
@@ -104,9 +119,9 @@ def test_the_page_says_of_every_check_why_and_how_to_mend_it():
 
 
 def test_the_page_names_the_budgets_and_the_size_of_the_problem():
-    for text in (f"{checks_manners.MOST_SECONDS:g} s", f"{checks_manners.MOST_MEGABYTES:g} MB",
-                 f"{problem.EPISODES} short nominal episodes", f"{problem.SENSORS} sensors",
-                 f"{problem.ACTIONS} action", f"{MOST_DEATHS} such ends"):  # fmt: skip
+    for text in (f"{checks_process.MOST_SECONDS:g} s", f"{checks_process.MOST_MEGABYTES:g} MB",
+                 f"{EPISODES} short nominal episodes", f"{SENSORS} sensors",
+                 f"{ACTIONS} action", f"{MOST_ENDS} such ends"):  # fmt: skip
         assert text in PAGE
 
 
@@ -152,7 +167,7 @@ def test_an_expected_failure_that_passes_is_a_failure():
 
 
 def test_an_expected_failure_that_does_not_apply_is_skipped():
-    expected_failures = {"save-and-load": "none", **SEE_NOTHING}
+    expected_failures = {"save-and-load": "none", "gross-anomaly": "sees nothing"}
 
     class Clock:
         def __init__(self, *, seed=0, horizon=1): ...
@@ -205,16 +220,15 @@ def test_a_check_is_called_with_a_factory_alone():
 
 
 def test_what_needs_more_than_there_is_names_the_check_to_look_at():
-    checks = {check.name: check for check in detector_checks()}
     unfit = BROKEN["fits-NoMood"].spec
     with pytest.raises(CheckSkipped, match="needs a fitted detector: see check 'fits'"):
-        checks["order"](unfit)
+        CHECKS["order"](unfit)
     with pytest.raises(CheckSkipped, match="needs a detector: see check 'factory'"):
-        checks["fits"](BROKEN["factory-NoScore"].spec)
+        CHECKS["fits"](BROKEN["factory-NoScore"].spec)
     with pytest.raises(CheckSkipped, match="needs one score per observation"):
-        checks["order"](BROKEN["shape-OneShort"].spec)
+        CHECKS["order"](BROKEN["shape-OneShort"].spec)
     with pytest.raises(CheckFailedError, match="no mood"):
-        checks["fits"](unfit)
+        CHECKS["fits"](unfit)
 
 
 def test_checks_of_one_factory_share_a_fit():
@@ -225,11 +239,10 @@ def test_checks_of_one_factory_share_a_fit():
             fits.append(len(nominal))
             super().fit(nominal)
 
-    checks = {check.name: check for check in detector_checks()}
     for name in ("fits", "shape", "causality", "prefix"):
-        checks[name](Counts)
+        CHECKS[name](Counts)
     assert fits == [12]
-    checks["shape"](Counts, horizon=2)
+    CHECKS["shape"](Counts, horizon=2)
     assert fits == [12, 12]
 
 
@@ -247,39 +260,3 @@ def test_the_network_works_again_after_a_check():
     run_checks(BROKEN["network-PhonesHome"].spec)
     with socket.create_server(("127.0.0.1", 0)) as server:
         socket.create_connection(server.getsockname()).close()
-
-
-# Shipped detectors
-
-SMALL = {"rf": {"members": 2, "trees": 2}}
-SEE_NOTHING = {"gross-anomaly": "a row for comparison: it knows nothing of the sensors"}
-
-
-def offers():
-    return discover().offers
-
-
-def persistence():
-    return offers()["persistence"].spec
-
-
-@pytest.mark.parametrize("horizon", [1, 5])
-@pytest.mark.parametrize("name", ["persistence", "random", "clock", "mewma", "mewma-a", "rf"])
-def test_shipped_detectors_conform(name, horizon):
-    expected_failures = SEE_NOTHING if name in {"random", "clock"} else {}
-    report = run_checks(
-        offers()[name].spec,
-        horizon=horizon,
-        parameters=SMALL.get(name),
-        expected_failures=expected_failures,
-    )
-    assert report.ok, report
-
-
-@pytest.mark.parametrize("name", ["riqn", "riqn-ms", "n-riqn", "npn"])
-def test_shipped_networks_conform(name):
-    samples = {} if name == "npn" else {"samples": 2, "levels": 2}
-    report = run_checks(
-        offers()[name].spec, parameters={"updates": 5, "members": 1, "chunk": 20, **samples}
-    )
-    assert report.ok, report

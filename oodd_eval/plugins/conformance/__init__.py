@@ -1,138 +1,156 @@
-"""Check that a detector honours the contract: in Python, in pytest, on the command line.
-
-In a test of a plug-in, each check is a test of its own::
-
-    import pytest
-    from oodd_eval.plugins.conformance import detector_checks
-    from oodd_mine import make_mine
-
-    @pytest.mark.parametrize("check", detector_checks(), ids=str)
-    def test_contract(check):
-        check(make_mine)
-
-In a script, all at once: ``check_detector(make_mine)``. On the command line, in a process of its
-own, so that a crash is reported too: ``oodd-eval check mine``.
-"""
+"""Checks that a detector honours the contract. `oodd_eval.testing` is their public face."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import textwrap
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
-from oodd_eval.errors import ContractError
-from oodd_eval.plugins.conformance.bench import (
-    Bench,
-    CheckFailedError,
-    CheckSkipped,
-    Factory,
-    Subject,
-)
-from oodd_eval.plugins.conformance.checks import CHECKS, carry_out
-from oodd_eval.plugins.conformance.kit import Check
-from oodd_eval.plugins.conformance.report import Report, Result, check_names, expected
+from oodd_eval.errors import UnknownNameError
+from oodd_eval.plugins.conformance import checks_consistency, checks_contract, checks_process
+from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
+from oodd_eval.plugins.discovery import printable
 
-__all__ = [
-    "Check",
-    "CheckFailedError",
-    "CheckSkipped",
-    "NonConformingError",
-    "Report",
-    "Result",
-    "check_detector",
-    "detector_checks",
-    "run_checks",
-]
+STATUSES: Final = {"passed": "passed", "failed": "failed", "skipped": "skipped",
+                   "xfailed": "failed as expected", "xpassed": "passed unexpectedly"}  # fmt: skip
+"""Statuses and what the summary calls them; failed and xpassed are not all right."""
+
+_COLUMNS: Final = 80
 
 
-class NonConformingError(ContractError, AssertionError):
-    """A detector failed checks; the message has a line for each, `report` has all results."""
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Result of one check.
 
-    def __init__(self, report: Report) -> None:
-        lines = [result.line() for result in report.failed]
-        super().__init__("\n".join([report.summary(), *lines]))
-        self.report = report
-
-
-def detector_checks() -> list[Check]:
-    """Return all checks, for ``pytest.mark.parametrize``; each is called with a factory."""
-    return list(CHECKS.values())
-
-
-def run_checks(
-    factory: Factory,
-    *,
-    horizon: int = 1,
-    seed: int = 0,
-    parameters: Mapping[str, Any] | None = None,
-    expected_failures: Mapping[str, str] | None = None,
-) -> Report:
-    """Carry out all checks in this process and return what they came to.
-
-    Parameters
-    ----------
-    factory
-        Called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec` tells its
-        declared parameters too.
-    horizon, seed, parameters
-        What the factory is called with.
-    expected_failures
-        Names of checks that are known to fail, with the reason. One that passes nevertheless is
-        not all right: the list has to be kept true.
-
-    Raises
-    ------
-    UnknownNameError
-        When an expected failure names no check.
+    The status is ``"passed"``, ``"failed"``, ``"skipped"``, ``"xfailed"`` or ``"xpassed"``; the
+    message says why; the detail is where a failing detector raised, or the end of what it printed
+    before it crashed. The first check that needs the shared fit has it in its seconds.
     """
-    expecting = dict(expected_failures or {})
-    check_names(expecting, CHECKS)
-    bench = Bench(Subject.of(factory, horizon=horizon, seed=seed, parameters=parameters))
-    return Report([expected(result, expecting) for result in carry_out(bench, CHECKS.values())])
+
+    name: str
+    status: str
+    message: str = ""
+    seconds: float = 0.0
+    detail: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True if it is as expected."""
+        return self.status not in {"failed", "xpassed"}
+
+    def line(self, width: int = 0) -> str:
+        """Return status, name and message: in one line, or below where there is no room for it."""
+        shown = self.status if self.ok else self.status.upper()
+        start = f"{shown:<8} {self.name:<{width}}"
+        if len(start) + 2 + len(self.message) <= _COLUMNS:
+            return f"{start}  {self.message}".rstrip()
+        below = textwrap.wrap(self.message, _COLUMNS - 9, break_on_hyphens=False)
+        return "\n".join([start.rstrip(), *(f"{'':9}{line}" for line in below)])
 
 
-def check_detector(
-    factory: Factory,
-    *,
-    horizon: int = 1,
-    seed: int = 0,
-    parameters: Mapping[str, Any] | None = None,
-    expected_failures: Mapping[str, str] | None = None,
-) -> Report:
-    """Check that a detector honours the contract, and print what each check came to.
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Results of the checks of one detector; printing it gives a line per check and a summary."""
 
-    Parameters
-    ----------
-    factory, horizon, seed, parameters, expected_failures
-        As for `run_checks`.
+    results: Sequence[Result] = ()
 
-    Returns
-    -------
-    Report
-        How many checks passed, were skipped or failed as expected, with messages.
+    @property
+    def ok(self) -> bool:
+        """True if no check failed, and none passed that was expected to fail."""
+        return not self.failed
 
-    Raises
-    ------
-    NonConformingError
-        When a check failed, or passed although it was expected to fail.
+    @property
+    def failed(self) -> list[Result]:
+        """The results that are not as they should be."""
+        return [result for result in self.results if not result.ok]
 
-    Examples
-    --------
-    >>> from oodd_eval.plugins.baselines import Clock
-    >>> report = check_detector(
-    ...     Clock, expected_failures={"gross-anomaly": "knows only the time"}
-    ... )  # doctest: +ELLIPSIS
-    passed   factory...
-    >>> report.ok
-    True
-    """
-    report = run_checks(
-        factory,
-        horizon=horizon,
-        seed=seed,
-        parameters=parameters,
-        expected_failures=expected_failures,
+    def summary(self) -> str:
+        """Return one line: how many checks there were, and how many came to what."""
+        counts = Counter(result.status for result in self.results)
+        parts = [f"{counts[s]} {meaning}" for s, meaning in STATUSES.items() if counts[s]]
+        seconds = sum(result.seconds for result in self.results)
+        checks = "check" if len(self.results) == 1 else "checks"
+        return f"{len(self.results)} {checks}: {', '.join(parts) or 'none ran'} in {seconds:.1f} s"
+
+    def __str__(self) -> str:
+        """Return a line per check and the summary."""
+        width = max((len(result.name) for result in self.results), default=0)
+        return "\n".join([*(result.line(width) for result in self.results), self.summary()])
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One named check; the summary says what holds when it passes."""
+
+    name: str
+    summary: str
+    function: Callable[[Trial], None]
+
+    def __call__(self, detector: Factory | Trial, **arguments: Any) -> None:
+        """Return if the detector passes; raise `CheckFailedError` or `CheckSkipped` if not.
+
+        It is given as what `Trial` takes, or as a `Trial`. The next check of the same shares the
+        fit.
+        """
+        if isinstance(detector, Trial):
+            return detector.carry_out(self.function)
+        if not _latest or _latest[0] != (detector, arguments):
+            _latest[:] = [(detector, arguments), Trial(detector, **arguments)]
+        return self(_latest[1])
+
+    def __str__(self) -> str:
+        """Return the name: the ids of parametrized tests."""
+        return self.name
+
+
+_latest: list[Any] = []
+"""The arguments of the last check that was called with a factory, and its trial."""
+
+CHECKS: Final = {
+    (name := function.__name__.removeprefix("check_").replace("_", "-")): Check(
+        name, (function.__doc__ or "").removesuffix("."), function
     )
-    print(report)  # noqa: T201  what it is for
-    if not report.ok:
-        raise NonConformingError(report)
-    return report
+    for module in (checks_contract, checks_consistency, checks_process)
+    for function in vars(module).values()
+    if getattr(function, "__name__", "").startswith("check_")
+}
+"""The checks by name, in the order in which they are carried out; a docstring says what holds."""
+
+
+def must_exist(names: Iterable[str]) -> None:
+    """Refuse names of checks that do not exist."""
+    for name in names:
+        if name not in CHECKS:
+            raise UnknownNameError("check", name, CHECKS)
+
+
+def carry_out(trial: Trial, checks: Iterable[str]) -> Iterator[Result]:
+    """Carry out the named checks of one detector, each when its result is asked for."""
+    for name in checks:
+        start = time.perf_counter()
+        status, message, detail = "passed", "", ""
+        try:
+            CHECKS[name](trial)
+        except CheckFailedError as error:
+            status, message = "failed", printable(str(error))
+            if error.__cause__:
+                lines = "".join(traceback.format_exception(error.__cause__)).splitlines()
+                detail = "\n".join(printable(line) for line in lines)
+        except CheckSkipped as skip:
+            status, message = "skipped", str(skip)
+        yield Result(name, status, message, time.perf_counter() - start, detail)
+
+
+def expected(result: Result, expected_failures: Mapping[str, str]) -> Result:
+    """Return the result in the light of the failures that are expected, by name, with reasons."""
+    reason = expected_failures.get(result.name)
+    if reason is not None and result.status == "failed":
+        return replace(result, status="xfailed", message=f"{reason} [{result.message}]")
+    if reason is not None and result.status == "passed":
+        message = f"expected to fail ({reason}): take it from the expected failures"
+        return replace(result, status="xpassed", message=message)
+    return result

@@ -1,90 +1,64 @@
-"""Checks in a process of their own: a detector that crashes or hangs fails a check, no more.
+"""Checks in processes of their own: a detector that crashes or hangs fails a check, no more.
 
-The process tells of every check before and after it. When it ends in between, the check it was at
-has failed, and a new process goes on with the next one.
+The process sends every result when it has it. When it ends in between, the check it was at has
+failed, and a new process goes on with the next one. Such a process runs this module, too, as
+``python -m oodd_eval.plugins.conformance.supervise READ_FD WRITE_FD LIFELINE_FD``.
 """
 
 from __future__ import annotations
 
 import os
-import select
+import sys
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, fields
 from typing import Any, Final
 
-from oodd_eval.plugins.conformance.report import Result
-from oodd_eval.plugins.isolation.messages import Channel, ChannelClosedError, ChannelGarbledError
-from oodd_eval.plugins.isolation.processes import Child
+from oodd_eval.plugins.conformance import Result, carry_out
+from oodd_eval.plugins.conformance.trial import Trial
+from oodd_eval.plugins.discovery import Offer, offer_of
+from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
+from oodd_eval.plugins.isolation.supervisor import Child, GivenUpError, Limits
+from oodd_eval.plugins.isolation.worker import connect
 
 GATES: Final = frozenset({"factory", "fits"})
 """Checks without which no other one can be carried out."""
 
-MOST_DEATHS: Final = 3
+MOST_ENDS: Final = 3
 """After so many checks that ended their process, the rest are not tried."""
 
-_POLL_SECONDS: Final = 0.05
 
+def supervise(
+    offer: Offer, arguments: Mapping[str, Any], checks: Sequence[str], limits: Limits
+) -> Iterator[Result]:
+    """Carry out checks in processes of their own, each within limits; yield what they came to.
 
-@dataclass(frozen=True, slots=True)
-class CheckRequest:
-    """What a process is told: the detector, how to make it, and the names of the checks."""
-
-    plugin: str
-    detector: str
-    parameters: dict[str, Any]
-    horizon: int
-    seed: int
-    checks: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class CheckLimits:
-    """Wall-clock seconds of one check, and bytes of resident memory; None means no limit."""
-
-    seconds: float | None = None
-    memory: int | None = None
-
-
-def supervise(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]:
-    """Carry out checks in processes of their own and return what each came to, one by one.
-
-    Parameters
-    ----------
-    request
-        What to check.
-    limits
-        Enforced from outside.
+    `arguments` are those of `Trial`.
     """
-    rest, deaths = list(request.checks), 0
-    while rest:
-        died = ""
-        for result in _one_process(replace(request, checks=list(rest)), limits):
+    request = {"plugin": offer.plugin, "detector": offer.spec.name, "arguments": arguments}
+    last = ""
+    for _ in range(MOST_ENDS):
+        for result in _one_process({**request, "checks": checks}, limits):
             yield result
-            rest.remove(result.name)
-            died = result.name
-        deaths += 1
-        if died in GATES or deaths == MOST_DEATHS:
-            reason = f"not tried: check '{died}' ended its process"
-            yield from (Result(name, "skipped", reason) for name in rest)
-            return
+            checks, last = checks[1:], result.name
+        if not checks or last in GATES:
+            break
+    for name in checks:
+        yield Result(name, "skipped", f"not tried: check '{last}' ended its process")
 
 
-def _one_process(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]:
-    """Give results until all are there, or the process has ended: then the last one says how."""
-    to_child, from_here = os.pipe()
-    to_here, from_child = os.pipe()
-    child = Child("oodd_eval.plugins.conformance", (to_child, from_child))
-    watch = _Watch(child, to_here, limits)
-    channel = Channel(to_here, from_here, watch)
-    ending = log = name = ""
+def _one_process(request: dict[str, Any], limits: Limits) -> Iterator[Result]:
+    """Yield results until all are there, or the process has ended: then the last one says how."""
+    child = Child("oodd_eval.plugins.conformance.supervise", limits)
+    start, ending, log, name = time.perf_counter(), "", "", request["checks"][0]
     try:
-        channel.send(asdict(request))
-        for name in request.checks:
-            watch.begin()
-            yield _result(channel.receive(), name)
-    except _LimitPassedError as passed:
-        ending = str(passed)
+        child.channel.send(request)
+        for name in request["checks"]:
+            start = time.perf_counter()
+            child.start_clock()
+            yield _result(child.channel.receive(), name)
+    except GivenUpError as error:
+        ending = error.told
     except ChannelGarbledError:
         ending = "wrote into the pipe to the harness"
     except (ChannelClosedError, BrokenPipeError):
@@ -95,43 +69,9 @@ def _one_process(request: CheckRequest, limits: CheckLimits) -> Iterator[Result]
         return
     finally:
         log = child.end()
-        os.close(to_here)
-        os.close(from_here)
-    yield Result(name, "failed", f"the process {ending or child.death()}", watch.elapsed, log)
-
-
-class _LimitPassedError(Exception):
-    """A process is over a limit; the message says over which one."""
-
-
-class _Watch:
-    """Wait for the next bytes of a process, and give up when a limit is passed."""
-
-    def __init__(self, child: Child, descriptor: int, limits: CheckLimits) -> None:
-        self._child, self._descriptor, self._limits = child, descriptor, limits
-        self.begin()
-
-    def begin(self) -> None:
-        """Start the clock of a check."""
-        self._start = time.perf_counter()
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since then."""
-        return time.perf_counter() - self._start
-
-    def __call__(self) -> None:
-        while not select.select([self._descriptor], [], [], _POLL_SECONDS)[0]:
-            seconds, memory = self._limits.seconds, self._limits.memory
-            if seconds is not None and self.elapsed > seconds:
-                raise _LimitPassedError(f"was not done after {seconds:g} s (--timeout)")
-            used = self._child.resident_bytes
-            if memory is not None and used > memory:
-                raise _LimitPassedError(
-                    f"held {used / 1e6:.0f} MB, more than {memory / 1e6:.0f} MB (--memory)"
-                )
-            if self._child.exited and not select.select([self._descriptor], [], [], 0)[0]:
-                raise ChannelClosedError("the process ended")
+        os.close(child.sending)
+    message = f"the process {ending or child.death()}"
+    yield Result(name, "failed", message, time.perf_counter() - start, log)
 
 
 def _result(message: dict[str, Any], name: str) -> Result:
@@ -139,3 +79,16 @@ def _result(message: dict[str, Any], name: str) -> Result:
     if set(message) != {field.name for field in fields(Result)} or message["name"] != name:
         raise ChannelGarbledError(f"expected the result of {name}, got {message!r:.80}")
     return Result(**message)
+
+
+def serve(command_line: Sequence[str]) -> None:
+    """Carry out one request in this process and send the results."""
+    channel = connect(command_line)
+    request = channel.receive()
+    trial = Trial(offer_of(request["plugin"], request["detector"]).spec, **request["arguments"])
+    for result in carry_out(trial, request["checks"]):
+        channel.send(asdict(result))
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1:])

@@ -1,0 +1,284 @@
+"""Checks that scores hold when asked for otherwise: again, cut short, at the edges, from a file."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.plugins.conformance.side_effects import seeded_generators
+from oodd_eval.plugins.conformance.trial import (
+    SENSORS,
+    CheckFailedError,
+    CheckSkipped,
+    Trial,
+    as_scores,
+    doing,
+    must_equal,
+    noisy_from,
+    offered,
+)  # fmt: skip
+from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector
+
+_PICKLE_SUFFIXES = frozenset({".pkl", ".pickle", ".joblib", ".dill"})
+
+
+def check_same_seed(trial: Trial) -> None:
+    """Two detectors of one seed give the same scores, whatever global generators hold."""
+    trial.fitted()
+    what = f"a second detector of seed {trial.seed}, fitted on the same trajectories, "
+    with seeded_generators(1):
+        advice = "draw all randomness from the seed"
+        trial.must_agree(trial.fit(), f"{what}has other scores", advice)
+
+
+def check_refit(trial: Trial) -> None:
+    """A second fit forgets the first one, also one of another number of sensors."""
+    trial.fitted()
+    detector = trial.fit(trial.training(sensors=SENSORS + 2, first=5000))
+    with doing("a second fit"):
+        detector.fit(trial.training(first=6000))
+        detector.fit(trial.training())
+    what = "a detector that was fitted on something else before has other scores"
+    trial.must_agree(detector, what, "fit has to begin anew")
+
+
+def check_order(trial: Trial) -> None:
+    """Scores of a trajectory do not depend on what was scored before."""
+    trajectories = [*trial.nominal(), trial.anomalous(1)[0][0]]
+    first = [trial.scores(x) for x in trajectories]
+    again = [trial.scores(x) for x in reversed(trajectories)][::-1]
+    what = "scores of a trajectory change with what was scored before"
+    for one, other in zip(first, again, strict=True):
+        must_equal(other, one, what, "score must not keep anything")
+
+
+def check_score_many(trial: Trial) -> None:
+    """score_many gives the scores of score, in whatever company."""
+    if (together := getattr(trial.fitted(), "score_many", None)) is None:
+        raise CheckSkipped("has no score_many")
+    trajectories = [*trial.nominal(), trial.anomalous(1)[0][0]]
+    alone = [trial.scores(x) for x in trajectories]
+    for chosen in (range(len(trajectories)), (3, 1), (2,)):
+        company, n = [trajectories[i] for i in chosen], f"{len(chosen)} trajectories"
+        with doing("score_many"):
+            found = list(together(company))
+        if len(found) != len(company):
+            raise CheckFailedError(f"score_many returned {len(found)} score arrays for {n}")
+        for i, x, scores in zip(chosen, company, found, strict=True):
+            what = f"score_many of {n} differs from score"
+            must_equal(as_scores(scores, x), alone[i], what, tolerance=TOLERANCE)
+
+
+def check_inputs_unchanged(trial: Trial) -> None:
+    """Trajectories, and the list of them, are left as they were."""
+    trial.fitted()
+    training, nominal = trial.training(), trial.nominal()
+    given, before = list(training), (_bytes(training), _bytes(nominal))
+    detector = trial.fit(given)
+    for x in nominal:
+        detector.score(x)
+    if [id(x) for x in given] != [id(x) for x in training]:
+        raise CheckFailedError("fit changed the list of trajectories that it was given")
+    for method, old, new in zip(("fit", "score"), before, (training, nominal), strict=True):
+        if _bytes(new) != old:
+            raise CheckFailedError(f"{method} changed the arrays of a trajectory")
+
+
+def check_read_only(trial: Trial) -> None:
+    """Trajectories in memory that cannot be written to are accepted."""
+    trial.fitted()
+    detector = trial.fit([_locked(x) for x in trial.training()])
+    with doing("score of an array that cannot be made writeable"):
+        detector.score(_locked(trial.nominal(1)[0]))
+
+
+def _bytes(trajectories: Sequence[Trajectory]) -> list[bytes]:
+    return [x.observations.tobytes() + x.actions.tobytes() for x in trajectories]
+
+
+def _locked(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory whose arrays cannot be made writeable, as those of a mapped file."""
+    locked = Trajectory(trajectory.observations, trajectory.actions)
+    for name in ("observations", "actions"):
+        array = getattr(trajectory, name)
+        view = np.frombuffer(array.tobytes(), dtype=array.dtype).reshape(array.shape)
+        object.__setattr__(locked, name, view)
+    return locked
+
+
+def check_causality(trial: Trial) -> None:
+    """Another future leaves the scores of the past as they are."""
+    trajectory, advice = trial.nominal(1)[0], "a score may use nothing after its time"
+    whole = trial.scores(trajectory)
+    for row in _rows(trial):
+        what = f"scores before t = {row} change when the episode goes on otherwise from there"
+        # The action of the row before was chosen after its observation came.
+        actions = np.concatenate([trajectory.actions[: row - 1], -trajectory.actions[row - 1 :]])
+        found = trial.scores(Trajectory(noisy_from(trajectory, row).observations, actions))
+        must_equal(found[:row], whole[:row], what, advice, TOLERANCE)
+
+
+def check_prefix(trial: Trial) -> None:
+    """The scores of a prefix are the prefix of the scores."""
+    trajectory = trial.nominal(1)[0]
+    whole = trial.scores(trajectory)
+    for n in (1, 2, *_rows(trial), len(trajectory) - 1):
+        what = f"the first {n} of {len(trajectory)} observations alone have other scores"
+        must_equal(trial.scores(trajectory[:n]), whole[:n], what, tolerance=TOLERANCE)
+
+
+def check_streaming(trial: Trial) -> None:
+    """Scores one observation at a time are those of the whole episode."""
+    detector = offered(trial.fitted(), "reset", "update")
+    # The second episode is left in the middle, so that the next one has to begin anew.
+    first, second, third = trial.nominal(3)
+    for trajectory in (first, second[: len(second) // 2], third):
+        whole = trial.scores(trajectory)
+        with doing("reset and update"):
+            detector.reset()
+            scores = map(detector.update, trajectory.observations, [None, *trajectory.actions])
+            found = np.array(list(scores), dtype=np.float64)
+        what = "update differs from score of the whole episode"
+        must_equal(found, whole, what, tolerance=TOLERANCE)
+
+
+def _rows(trial: Trial) -> tuple[int, ...]:
+    """Return rows at which to cut: around the horizon, and in the middle."""
+    return trial.horizon + 1, trial.horizon + 2, trial.rows // 2
+
+
+def check_short_trajectories(trial: Trial) -> None:
+    """Episodes of one and two observations, and as short as the horizon, are scored."""
+    for n in sorted({1, 2, trial.horizon, trial.horizon + 1}):
+        what = f"an episode of {n} observation{'s' if n > 1 else ''}"
+        _must_be_finite(trial, trial.fitted(), trial.episode(7, n), what)
+
+
+def check_constant_trajectory(trial: Trial) -> None:
+    """An episode in which nothing moves is scored with finite scores."""
+    moving = trial.episode(8)
+    rows = np.repeat(moving.observations[:1], len(moving), axis=0)
+    still = Trajectory(rows, np.zeros_like(moving.actions))
+    _must_be_finite(trial, trial.fitted(), still, "an episode in which nothing moves")
+
+
+def check_constant_sensor(trial: Trial) -> None:
+    """A sensor that never moved in training is no reason for infinite scores when it does."""
+    trial.fitted()
+    detector = trial.fit([_with_constant_sensor(x) for x in trial.training()])
+    nominal, what = trial.nominal(1)[0], "an episode with a sensor that"
+    _must_be_finite(trial, detector, _with_constant_sensor(nominal), f"{what} stands still")
+    _must_be_finite(trial, detector, nominal, f"{what} stood still in training only")
+
+
+def check_unequal_lengths(trial: Trial) -> None:
+    """Training episodes may be of unequal length, down to a single observation."""
+    trial.fitted()
+    lengths = [1, 2, 3, 2 * trial.rows, *(trial.rows - 5 * i for i in range(8))]
+    detector = trial.fit([trial.episode(9000 + i, n) for i, n in enumerate(lengths)])
+    for trajectory in trial.nominal():
+        _must_be_finite(trial, detector, trajectory, "an episode, after such a fit,")
+
+
+def _with_constant_sensor(trajectory: Trajectory) -> Trajectory:
+    observations = trajectory.observations.copy()
+    observations[:, 0] = 1.0
+    return Trajectory(observations, trajectory.actions)
+
+
+def _must_be_finite(trial: Trial, detector: Detector, trajectory: Trajectory, what: str) -> None:
+    """Refuse infinite scores, and undefined ones where an ordinary episode has none."""
+    with doing(f"score of {what}"):
+        scores = trial.scores(trajectory, detector)
+        usual = trial.scores(trial.episode(0, len(trajectory)))
+    wrong = np.flatnonzero(np.isinf(scores) | (np.isnan(scores) & ~np.isnan(usual)))
+    if wrong.size:
+        t = wrong[0]
+        raise CheckFailedError(f"{what} has the score {scores[t]} at t = {t}: expected finite ones")
+
+
+def check_save_and_load(trial: Trial) -> None:
+    """A new detector that loads what was saved gives the same scores, bit for bit."""
+    with _saved(trial.fitted()) as place:
+        trial.must_agree(_loaded(trial, place), "a detector that loaded a saved fit differs")
+
+
+def check_shared_fit(trial: Trial) -> None:
+    """One saved fit serves all horizons where the spec says that they do not decide the fit."""
+    offered(trial.fitted(), "save", "load")
+    if trial.spec.horizon_decides_fit:
+        raise CheckSkipped("does not say that fits ignore the horizon")
+    other = trial.horizon + 2
+    what = f"a fit of horizon {trial.horizon}, loaded for horizon {other}, differs from a fit of "
+    advice = "expected horizon_decides_fit=True"
+    with _saved(trial.fitted()) as place:
+        x, loaded = trial.nominal(1)[0], _loaded(trial, place, horizon=other)
+        found, wanted = trial.scores(x, loaded), trial.scores(x, trial.fit(horizon=other))
+        must_equal(found, wanted, f"{what}horizon {other}", advice)
+
+
+def check_saved_files(trial: Trial) -> None:
+    """Saved files hold data, not pickled objects, which could run anything when loaded."""
+    expected = "expected JSON, npz without objects, or safetensors"
+    with _saved(trial.fitted()) as place:
+        for path in _files(place):
+            if reason := _pickled(path):
+                name = path.relative_to(place)
+                raise CheckFailedError(f"save wrote {name}, {reason}: {expected}")
+
+
+@contextlib.contextmanager
+def _saved(detector: Detector) -> Iterator[Path]:
+    """Give the directory that a detector saved itself in."""
+    storable = offered(detector, "save", "load")
+    with tempfile.TemporaryDirectory(prefix="oodd-check-") as name:
+        with doing("save"):
+            storable.save(Path(name))
+        if not _files(Path(name)):
+            raise CheckFailedError("save wrote no file into the directory that it was given")
+        yield Path(name)
+
+
+def _loaded(trial: Trial, place: Path, **changes: Any) -> Detector:
+    detector: StorableDetector = offered(trial.make(**changes), "save", "load")
+    with doing("load"):
+        detector.load(place)
+    return detector
+
+
+def _files(directory: Path) -> list[Path]:
+    return sorted(path for path in directory.rglob("*") if path.is_file())
+
+
+def _pickled(path: Path) -> str:
+    """Say in which way a file is, or holds, a pickle; empty if it does not."""
+    if path.suffix in _PICKLE_SUFFIXES:
+        return "a pickle by its name"
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                if Path(name).suffix in _PICKLE_SUFFIXES:
+                    return f"which holds the pickle {name}"
+                with archive.open(name) as member:
+                    if name.endswith(".npy") and _holds_objects(member):
+                        return f"which holds Python objects in {name}"
+        return ""
+    with path.open("rb") as file:
+        # A pickle of protocol 2 or later begins with these two bytes.
+        if file.peek(2)[:2] in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}:
+            return "a pickle by its first bytes"
+        holds_objects = path.suffix == ".npy" and _holds_objects(file)
+        return "which holds Python objects" if holds_objects else ""
+
+
+def _holds_objects(file: IO[bytes]) -> bool:
+    first = np.lib.format.read_magic(file) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    return bool(read(file)[2].hasobject)

@@ -1,0 +1,292 @@
+"""Side effects of running code: files, network, output, settings, threads, processes, memory.
+
+An audit hook sees every file that Python opens and every address that it connects to, from whatever
+library. It cannot be removed again: one is installed at the first use and is idle in between.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import locale
+import os
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import IO, Any, Final
+from unittest.mock import patch
+
+import numpy as np
+import psutil
+
+_THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
+
+# Set before code is watched, so that setting the usual value is seen as well.
+_UNUSUAL_THREADS: Final = 3
+_UNUSUAL_SEED: Final = 0x0DD
+
+_SAMPLE_SECONDS: Final = 0.005
+
+_CALLS: Final = "connect getaddrinfo gethostbyaddr gethostbyname sendmsg sendto"
+_NETWORK: Final = frozenset(f"socket.{call}" for call in _CALLS.split())
+
+# The second argument is the open directory, seen as a whole, that the path is relative to.
+_RELATIVE: Final = frozenset({"os.remove", "os.rmdir", "shutil.rmtree"})
+
+_CHANGES: Final = {
+    **dict.fromkeys((*_RELATIVE, "os.mkdir", "os.truncate", "sqlite3.connect"), (0,)),
+    **dict.fromkeys(("os.link", "os.symlink"), (1,)),
+    "os.rename": (0, 1),
+}
+"""Events that change what is on disk, and which of their arguments are the paths that change."""
+
+_WRITING: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+
+
+@dataclass(slots=True)
+class Events:
+    """Addresses that were asked for, and paths that were written to."""
+
+    network: list[str] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Effects(Events):
+    """The side effects of one piece of work, up to its error; paths are those of `outside`."""
+
+    error: BaseException | None = None
+    seconds: float = 0.0
+    megabytes: float = 0.0  # growth of the resident memory, at its largest
+    printed: str = ""  # by Python and by libraries beneath it
+    warnings: list[str] = field(default_factory=list)  # "Category: message"
+    random: list[str] = field(default_factory=list)  # global generators whose state changed
+    threads: list[str] = field(default_factory=list)  # "thread setting: before -> after"
+    settings: list[str] = field(default_factory=list)  # "other setting: before -> after"
+    running: list[str] = field(default_factory=list)  # threads and child processes left
+
+
+_install: Final = functools.cache(sys.addaudithook)
+_recording: Final[list[Events]] = []  # the audit hook writes to the last one
+
+
+@contextlib.contextmanager
+def auditing(events: Events) -> Iterator[None]:
+    """Record events, of all threads, and refuse connections, until the block is left."""
+    _install(_hook)
+    _recording.append(events)
+    try:
+        yield
+    finally:
+        _recording.pop()
+
+
+def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    if not _recording:
+        return
+    paths: list[object] = []
+    if event == "open":
+        path, _, flags = arguments
+        paths = [path] if flags is not None and flags & _WRITING else []
+    elif event in _NETWORK and (address := _address(event, arguments)):
+        _recording[-1].network.append(address)
+        raise ConnectionRefusedError(f"no network during a check: {event} {address}")
+    elif event in _CHANGES and (event not in _RELATIVE or arguments[1] in (None, -1)):
+        paths = [arguments[index] for index in _CHANGES[event]]
+    for path in paths:
+        # Descriptors are of files that were opened before, and seen then.
+        if isinstance(path, str | bytes | os.PathLike):
+            absolute = os.path.abspath(os.fsdecode(path))  # noqa: PTH100  keeps links
+            _recording[-1].written.append(absolute)
+
+
+def _address(event: str, arguments: tuple[Any, ...]) -> str:
+    """Return where a call wants to go; empty for sockets of this machine's file system."""
+    if event.startswith("socket.gethostby"):
+        return str(arguments[0])
+    target = arguments if event == "socket.getaddrinfo" else arguments[-1]
+    return ":".join(str(part) for part in target[:2]) if isinstance(target, tuple) else ""
+
+
+def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
+    """Return the side effects of work, done in an empty directory; then the process is as before.
+
+    `settings_before` are those before libraries were imported, which is not seen otherwise.
+    """
+    seen, running_before = Effects(), _running()
+    with contextlib.ExitStack() as stack:
+        here = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="oodd-check-")))
+        stack.enter_context(_set_apart(here))
+        generators, threads = _generators(), _thread_settings()
+        settings_before = {**settings_before, "working directory": str(Path.cwd())}
+        printed = stack.enter_context(_captured())
+        caught = stack.enter_context(warnings.catch_warnings(record=True, action="always"))
+        start, memory, end = time.perf_counter(), psutil.Process().memory_info().rss, Event()
+        with auditing(seen), ThreadPoolExecutor() as pool:
+            peak = pool.submit(_peak_memory, end)
+            try:
+                work()
+            except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
+                seen.error = error
+            finally:
+                end.set()
+        seen.seconds = time.perf_counter() - start
+        seen.megabytes = (peak.result() - memory) / 1e6
+        seen.random = [name for name, state in _generators().items() if generators[name] != state]
+        seen.threads = _changes(threads, _thread_settings())
+        seen.settings = _changes(settings_before, settings())
+        seen.warnings = [
+            f"{w.category.__name__}: {' '.join(str(w.message).split())}" for w in caught or []
+        ]
+        left = sorted(str(path) for path in here.rglob("*") if path.is_file())
+        seen.written = outside([*seen.written, *left], here / "work")
+        printed.flush()
+        printed.seek(0)
+        seen.printed = printed.read()
+    seen.running = [name for _, name in sorted(_running() - running_before)]
+    return seen
+
+
+def settings() -> dict[str, str]:
+    """Return settings of the process that are the user's; a missing library has its defaults."""
+    torch = sys.modules.get("torch")
+    deterministic = bool(torch and torch.are_deterministic_algorithms_enabled())
+    handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
+    mask = os.umask(0o077)  # it can only be read by setting it
+    os.umask(mask)
+    directory = "removed"
+    with contextlib.suppress(FileNotFoundError):
+        directory = str(Path.cwd())
+    found: dict[str, object] = {
+        "numpy error handling": np.geterr(),
+        "numpy print options": np.get_printoptions(),
+        "recursion limit": sys.getrecursionlimit(),
+        "locale": locale.setlocale(locale.LC_ALL),
+        "signal handlers": {s.name: repr(h) for s, h in handlers.items()},
+        "umask": mask,
+        "working directory": directory,
+        "torch default dtype": torch.get_default_dtype() if torch else "torch.float32",
+        "torch gradients enabled": torch.is_grad_enabled() if torch else True,
+        "torch deterministic algorithms": deterministic,
+    }
+    return {name: str(value) for name, value in found.items()}
+
+
+def outside(written: Iterable[str], here: Path) -> list[str]:
+    """Return the paths that must not be written to, each once, relative to `here` if below it.
+
+    Allowed are the user's cache directory, byte code, devices, and temporary files that are gone.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    allowed = cache, Path("/dev"), Path("/proc")
+    return [
+        str(path.relative_to(here) if path.is_relative_to(here) else path)
+        for path in map(Path, dict.fromkeys(written))
+        if "__pycache__" not in path.parts
+        and not any(path.is_relative_to(place) for place in allowed)
+        and not (path.is_relative_to(tempfile.gettempdir()) and not path.exists())
+    ]
+
+
+@contextlib.contextmanager
+def seeded_generators(seed: int) -> Iterator[None]:
+    """Seed the global random generators; put them back as they were when the block is left."""
+    with contextlib.ExitStack() as back:
+        back.callback(random.setstate, random.getstate())
+        back.callback(np.random.set_state, np.random.get_state())  # noqa: NPY002
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002  the generator that is watched
+        if torch := sys.modules.get("torch"):
+            back.callback(torch.set_rng_state, torch.get_rng_state())
+            torch.random.manual_seed(seed)
+        yield
+
+
+@contextlib.contextmanager
+def _set_apart(here: Path) -> Iterator[None]:
+    """Work in empty directories, with unusual generators and thread settings; then put all back."""
+    for place in (work := here / "work", temporary := here / "temporary"):
+        place.mkdir()
+    variables = dict.fromkeys(_THREAD_VARIABLES, str(_UNUSUAL_THREADS))
+    with (
+        seeded_generators(_UNUSUAL_SEED),
+        patch.dict(os.environ, variables, TMPDIR=str(temporary)),
+        patch.object(tempfile, "tempdir", str(temporary)),
+        contextlib.chdir(work),
+        contextlib.ExitStack() as back,
+    ):
+        if torch := sys.modules.get("torch"):
+            back.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(_UNUSUAL_THREADS)
+        yield
+
+
+def _generators() -> dict[str, object]:
+    """Return the states of the global random generators."""
+    kind, words, *rest = np.random.get_state()  # noqa: NPY002
+    numpy_state = kind, np.asarray(words).tobytes(), rest
+    found: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
+    if torch := sys.modules.get("torch"):
+        found["torch"] = torch.get_rng_state().numpy().tobytes()
+    return found
+
+
+def _thread_settings() -> dict[str, str]:
+    found = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
+    if torch := sys.modules.get("torch"):
+        found["torch.get_num_threads()"] = str(torch.get_num_threads())
+    return found
+
+
+def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    both = [(n, before.get(n, "unset"), after.get(n, "unset")) for n in sorted(before | after)]
+    return [f"{name}: {old} -> {new}" for name, old, new in both if old != new]
+
+
+@contextlib.contextmanager
+def _captured() -> Iterator[IO[str]]:
+    """Send what is printed, by Python and by libraries beneath it, into a file."""
+    with tempfile.TemporaryFile("w+", errors="replace") as file, contextlib.ExitStack() as back:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        back.enter_context(contextlib.redirect_stdout(file))
+        back.enter_context(contextlib.redirect_stderr(file))
+        for descriptor in (1, 2):
+            copy = os.dup(descriptor)
+            back.callback(os.close, copy)
+            back.callback(os.dup2, copy, descriptor)
+            os.dup2(file.fileno(), descriptor)
+        yield file
+
+
+def _peak_memory(end: Event) -> int:
+    """Return the largest resident memory of this process until the end."""
+    process, peak, done = psutil.Process(), 0, False
+    while not done:
+        done = end.wait(_SAMPLE_SECONDS)
+        peak = max(peak, process.memory_info().rss)
+    return peak
+
+
+def _running() -> set[tuple[int, str]]:
+    """Return the threads that keep a process alive, and the children of this one: id and name."""
+    found = {
+        (thread.ident or 0, f"thread {thread.name}")
+        for thread in threading.enumerate()
+        if not thread.daemon and thread is not threading.main_thread()
+    }
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if child.status() != psutil.STATUS_ZOMBIE:
+                found.add((child.pid, f"process {child.pid} ({child.name()})"))
+    return found

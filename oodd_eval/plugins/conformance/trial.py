@@ -1,0 +1,232 @@
+"""A detector under test: how to make it, what to try it on, and one fit that checks share.
+
+Checks that only score share one fitted detector, because fits take the time. A check that needs
+what another one is about (a factory that works, a fit, the shape of scores) is skipped without it
+and names the other one, so that one fault is told once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import unittest
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError
+from oodd_eval.metrics.auc import Floats
+from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, settings, watch
+from oodd_eval.plugins.contract import Detector, DetectorSpec, Scores, difference
+from oodd_eval.plugins.isolation.worker import reason_of
+
+SENSORS: Final = 3
+ACTIONS: Final = 2
+EPISODES: Final = 12
+ROWS: Final = 80
+"""Observations of an episode, beyond the horizon."""
+
+Factory = Callable[..., Detector] | DetectorSpec
+"""A detector's factory, or the spec that a plug-in offers."""
+
+
+class CheckFailedError(ContractError, AssertionError):
+    """A detector does not behave as the contract asks; the message says in which way."""
+
+
+class CheckSkipped(unittest.SkipTest):
+    """A check does not apply, or cannot be carried out; pytest reports it as a skip."""
+
+
+class Trial:
+    """All that the checks of one detector share.
+
+    The factory is called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec`
+    tells its declared parameters too.
+    """
+
+    def __init__(
+        self, factory: Factory, *, horizon: int = 1, seed: int = 0,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        self.spec = factory if isinstance(factory, DetectorSpec) else DetectorSpec("", factory, "")
+        self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
+        self.arguments = {"seed": seed, "horizon": horizon, **self.parameters}
+        self.rows = ROWS + horizon  # of an ordinary episode
+        self.events = Events()  # of all checks so far
+        self._settings_before = settings()
+
+    def carry_out(self, check: Callable[[Trial], None]) -> None:
+        """Carry out a check; warnings are the matter of the check of that name alone."""
+        with warnings.catch_warnings(), auditing(self.events), doing("the detector"):
+            warnings.simplefilter("ignore")
+            check(self)
+
+    def make(self, **changes: Any) -> Detector:
+        """Return a new unfitted detector; `changes` replace seed, horizon or parameters."""
+        arguments = {**self.arguments, **changes}
+        called = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
+        with doing(f"the factory, called with {called},"):
+            detector = self.spec.factory(**arguments)
+        for method in ("fit", "score"):
+            if not callable(getattr(detector, method, None)):
+                wrong = f"{type(detector).__name__} without a method {method}"
+                expected = "expected an object with fit(nominal) and score(trajectory)"
+                raise CheckFailedError(f"the factory returned {wrong}: {expected}")
+        return detector
+
+    def unfitted(self) -> Detector:
+        """Return a new unfitted detector, for checks that are about something else."""
+        try:
+            return self.make()
+        except CheckFailedError:
+            raise CheckSkipped("needs a detector: see check 'factory'") from None
+
+    def fit(self, nominal: Sequence[Trajectory] | None = None, **changes: Any) -> Detector:
+        """Return a detector of its own, fitted on the training trajectories or the given ones."""
+        detector = self.make(**changes)
+        with doing("fit"):
+            # The harness hands over a sequence that is not a list, as here.
+            detector.fit(tuple(self.training()) if nominal is None else nominal)
+        return detector
+
+    @functools.cached_property
+    def first_fit(self) -> Detector | CheckFailedError:
+        """The fitted detector that checks share, or why it cannot be fitted or cannot score."""
+        self.unfitted()
+        try:
+            detector = self.fit()
+            with doing("score"):
+                detector.score(self.nominal(1)[0])
+        except CheckFailedError as error:
+            return error
+        return detector
+
+    def fitted(self) -> Detector:
+        """Return the shared fitted detector, for checks about something else: only to score."""
+        if isinstance(self.first_fit, CheckFailedError):
+            raise CheckSkipped("needs a fitted detector: see check 'fits'")
+        return self.first_fit
+
+    def scores(self, trajectory: Trajectory, detector: Detector | None = None) -> Scores:
+        """Return the scores of the shared detector or another one, for checks of their values."""
+        detector = self.fitted() if detector is None else detector
+        return as_scores(detector.score(trajectory), trajectory)
+
+    def must_agree(self, detector: Detector, what: str, advice: str = "", n: int = 2) -> None:
+        """Fail when a detector does not give `n` trajectories the scores of the shared one."""
+        for x in self.nominal(n):
+            must_equal(self.scores(x, detector), self.scores(x), what, advice)
+
+    def learns_nothing(self) -> bool:
+        """Tell whether a detector scores without a fit as it does after it."""
+        trajectory = self.nominal(1)[0]
+        try:
+            before = self.scores(trajectory, self.unfitted())
+        except Exception:  # noqa: BLE001  whatever it is: without a fit it does not score
+            return False
+        return np.array_equal(before, self.scores(trajectory), equal_nan=True)
+
+    @functools.cached_property
+    def effects(self) -> Effects:
+        """The side effects of making, fitting and using a new detector."""
+        self.fitted()
+        detector, training, nominal = self.unfitted(), self.training(), self.nominal()
+
+        def work() -> None:
+            self.make()
+            detector.fit(training)
+            for trajectory in nominal:
+                detector.score(trajectory)
+
+        return watch(work, self._settings_before)
+
+    def episode(self, key: int, rows: int | None = None, sensors: int = SENSORS) -> Trajectory:
+        """Return the nominal episode of a key; another number of sensors is another system."""
+        return Trajectory(*_system(key, self.rows if rows is None else rows, sensors))
+
+    def training(self, sensors: int = SENSORS, first: int = 1000) -> list[Trajectory]:
+        """Return nominal episodes of equal length to fit on."""
+        return [self.episode(first + i, sensors=sensors) for i in range(EPISODES)]
+
+    def nominal(self, n: int = 4) -> list[Trajectory]:
+        """Return nominal episodes to score, of unequal lengths, not among the training ones."""
+        return [self.episode(2000 + i, self.rows - 7 * i) for i in range(n)]
+
+    def anomalous(self, n: int = 4) -> list[tuple[Trajectory, Trajectory, int]]:
+        """Return episodes in which all sensors get ten times noisier, with twins and onsets."""
+        twins = [(self.episode(3000 + i), self.rows // 2 + i) for i in range(n)]
+        return [(noisy_from(twin, onset), twin, onset) for twin, onset in twins]
+
+
+def noisy_from(trajectory: Trajectory, row: int) -> Trajectory:
+    """Return an episode with noise of ten times the spread of each sensor from a row on."""
+    observations = trajectory.observations.astype(np.float64)
+    noise = np.random.default_rng(row).normal(size=observations[row:].shape)
+    observations[row:] += 10 * observations.std(axis=0) * noise
+    return Trajectory(observations, trajectory.actions)
+
+
+@functools.lru_cache(maxsize=256)
+def _system(key: int, rows: int, sensors: int) -> tuple[Floats, Floats]:
+    """Return observations and actions of a nominal episode of a linear-Gaussian system.
+
+    A two-dimensional state turns and decays, actions push it, and every sensor sees a combination
+    of it in units of its own, with noise.
+    """
+    system = np.random.default_rng(sensors)
+    mixing = system.normal(size=(2, sensors))
+    scale = 10.0 ** system.integers(-1, 2, size=sensors)
+    angle, decay = 0.3, 0.97
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    push = np.array([[0.2, 0.0], [0.1, 0.2]])
+    rng = np.random.default_rng([key, sensors])
+    actions = rng.uniform(-1, 1, size=(rows - 1, ACTIONS))
+    states = [rng.normal(size=2)]
+    for action in actions:
+        states.append(decay * turn @ states[-1] + push @ action + 0.1 * rng.normal(size=2))
+    noise = 0.05 * rng.normal(size=(rows, sensors))
+    return scale * (np.array(states) @ mixing + noise), actions
+
+
+@contextlib.contextmanager
+def doing(what: str) -> Iterator[None]:
+    """Turn whatever a detector raises into a failure that says what it was doing, and where."""
+    try:
+        yield
+    except (CheckFailedError, CheckSkipped):
+        raise
+    except (Exception, SystemExit) as error:
+        raised = "" if isinstance(error, SystemExit) else "raised "
+        raise CheckFailedError(f"{what} {raised}{reason_of(error)}") from error
+
+
+def as_scores(returned: object, trajectory: Trajectory) -> Scores:
+    """Return scores as float64; skip when their form, which another check is about, is wrong."""
+    if not isinstance(returned, np.ndarray) or returned.shape != (len(trajectory),):
+        raise CheckSkipped("needs one score per observation: see checks 'shape' and 'dtype'")
+    try:
+        return returned.astype(np.float64)
+    except (TypeError, ValueError):
+        raise CheckSkipped("needs scores that are numbers: see check 'dtype'") from None
+
+
+def must_equal(
+    found: Scores, wanted: Scores, what: str, advice: str = "", tolerance: float = 0.0
+) -> None:
+    """Fail when scores differ, with the first difference between `what` and `advice`."""
+    if wrong := difference(found, wanted, tolerance):
+        raise CheckFailedError(f"{what}: {wrong}" + (f"; {advice}" if advice else ""))
+
+
+def offered(detector: Detector, first: str, second: str) -> Any:
+    """Return a detector that has both of two optional methods; skip the check if it has none."""
+    has = [callable(getattr(detector, name, None)) for name in (first, second)]
+    if not any(has):
+        raise CheckSkipped(f"has no {first} and {second}")
+    if not all(has):
+        raise CheckFailedError(f"has only one of {first} and {second}: expected both, or none")
+    return detector

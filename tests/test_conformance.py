@@ -1,0 +1,73 @@
+"""Every detector that an installed plug-in offers honours the contract."""
+
+import pytest
+import torch
+
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.testing import run_checks
+
+PLUGINS = discover()
+
+ADAPTERS = [
+    "sklearn:IsolationForest",
+    "sklearn:OneClassSVM",
+    "pyod:KNN",
+    "forecast:sklearn.linear_model.Ridge",
+]
+"""Some of those that are made of any class of a library."""
+
+NETWORK = {"updates": 3, "members": 2, "chunk": 20}
+QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
+SMALL = {
+    "rf": {"members": 2, "trees": 2},
+    "riqn": QUANTILES,
+    "riqn-ms": QUANTILES,
+    "n-riqn": QUANTILES,
+    "npn": NETWORK,
+    "sklearn:IsolationForest": {"n_estimators": 10},
+}
+"""What makes a slow detector quick enough to be tried."""
+
+EXPECTED_FAILURES = {
+    name: {"gross-anomaly": "a row for comparison: it knows nothing of the sensors"}
+    for name in ("random", "clock")
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("name", "horizon"),
+    [(name, 1) for name in (*PLUGINS.offers, *ADAPTERS)]
+    + [(name, 4) for name in (*PLUGINS.offers, "forecast:sklearn.linear_model.Ridge")],
+)
+def test_every_offered_detector_conforms(name, horizon):
+    must_conform(name, horizon, SMALL.get(name))
+
+
+@pytest.mark.parametrize("name", ["riqn", "npn"])
+def test_a_network_per_sensor_conforms(name):
+    must_conform(name, 1, {**SMALL[name], "trunk": "per-feature"})
+
+
+def must_conform(name, horizon, parameters):
+    report = run_checks(
+        PLUGINS.offer(name).spec,
+        horizon=horizon,
+        parameters=parameters,
+        expected_failures=EXPECTED_FAILURES.get(name),
+    )
+    assert report.ok, report
+    assert sum(result.status == "passed" for result in report.results) >= 30
+
+
+def test_no_plugin_is_left_out():
+    assert not PLUGINS.broken
+    assert {"random", "persistence", "clock", "rf", "riqn", "riqn-ms", "n-riqn", "npn", "mewma",
+            "mewma-a"} <= set(PLUGINS.offers)  # fmt: skip
