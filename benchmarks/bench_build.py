@@ -1,4 +1,4 @@
-"""How much of a simulator's own stepping rate is left when trajectories are recorded.
+"""Recording: the share of a simulator's stepping rate that is left when trajectories are recorded.
 
 For each environment the unit of a build's work is timed, a chunk of seeds: policy, fresh simulator
 per episode, reset, anomalies, checks, stacking and writing. Against it, the same actions are
@@ -22,13 +22,12 @@ import numpy as np
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.simulate.build import Chunk, record_chunk
-from oodd_eval.data.simulate.environments import make
+from oodd_eval.data.simulate.environments import make, quiet_streams
 from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.quiet import quiet_streams
 
 FIRST_SEED = 990 * 10**6
 SHARE = 0.75
-"""What is asked for, of the four PyBullet robots."""
+"""Bounds for the four PyBullet robots."""
 
 
 def recorded(environment, part, seed, work):

@@ -1,4 +1,4 @@
-"""How quick RIQN is, beside a slow loop, the released code and the processor: one thread.
+"""Speed of RIQN beside a slow loop, the released code and the processor: one thread.
 
 ``python benchmarks/bench_riqn.py``. Every figure is measured in turns with the others, several
 times, and medians are printed, so that a busy machine slows all of them alike: read the ratios.
@@ -16,6 +16,7 @@ import functools
 import statistics
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ import torch
 from oodd_riqn import riqn
 from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
-from oodd_torch.training import Schedule, train
+from oodd_torch.training import train
 from tabulate import tabulate
 
 from oodd_eval import Trajectory
@@ -94,7 +95,7 @@ def scoring(horizon):
     made = network()
     rows = [e.observations for e in episodes(64 if horizon == 1 else 12)]
     options = {"horizon": horizon, "samples": SAMPLES, "mean_sampling": False, "seed": 0}
-    forecaster = Forecaster.of(made, **options)
+    forecaster = Forecaster(made, **options)
     steps = sum(len(r) - horizon for r in rows)
     few = 30 if horizon == 1 else 4
     walker = Walker(made, **options)
@@ -110,17 +111,12 @@ def scoring(horizon):
 def training():
     """Return transitions per second and member of training, and the peak, in every round."""
     rows = [e.observations for e in episodes(64)]
-    settings = riqn(seed=0, horizon=1).settings
-    schedule = settings.schedule
-    updates = 30
-    quick = Schedule(
-        updates, schedule.batch, schedule.chunk, schedule.levels, schedule.rates, schedule.widths,
-        evaluations=1,
-    )  # fmt: skip
+    schedule = riqn(seed=0, horizon=1).schedule
+    quick = replace(schedule, updates=30, evaluations=1)
     for _ in range(ROUNDS):
         made = network().requires_grad_()
         rngs = [np.random.default_rng(i) for i in range(MEMBERS)]
-        transitions = MEMBERS * updates * schedule.batch * schedule.chunk
+        transitions = MEMBERS * quick.updates * schedule.batch * schedule.chunk
         call = functools.partial(train, made, rows, rows[:1], quick, rngs)
         yield rate(call, transitions), peak()
 
@@ -149,7 +145,7 @@ def main():
     ]  # fmt: skip
     rounds = list(training())
     # A backward pass costs two forward passes.
-    work = 3 * flops_forward(architecture, riqn(seed=0, horizon=1).settings.levels)
+    work = 3 * flops_forward(architecture, riqn(seed=0, horizon=1).schedule.levels)
     rows.append(line("train one member", rounds, work, RELEASED_TRAINING))
     header = ["", "steps/s", "x slow loop", "x released", "MFLOP/step", "GFLOP/s", "of peak"]
     print(tabulate(rows, header, disable_numparse=True, stralign="right"))

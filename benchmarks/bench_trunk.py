@@ -1,4 +1,4 @@
-"""What a network per sensor costs beside one trunk with a head per sensor: CPU seconds.
+"""Cost of a network per sensor beside one trunk with a head per sensor: CPU seconds.
 
 ``python benchmarks/bench_trunk.py``. RIQN on the mini split, with a twentieth of the updates of a
 fit; scoring is that of the test part, and does not depend on the updates. For the AUCs run

@@ -55,7 +55,7 @@ def three_scores(detector, samples, trajectory):
     """Return the scores of a trajectory, arrays of shape (T + 1,) in the order of `SCORES`."""
     network, scale = detector.network_, detector.scale_
     rows = scale(trajectory)
-    forecaster = Forecaster.of(network, horizon=1, samples=samples, mean_sampling=False, seed=0)
+    forecaster = Forecaster(network, horizon=1, samples=samples, mean_sampling=False, seed=0)
     x = arrange([[rows]], 1)[0].expand(network.members, -1, -1, -1)
     drawn, _ = forecaster.forecast(x, network.start(1), range(1, len(rows)))
     drawn = np.sort(drawn[:, :, 0].permute(1, 3, 0, 2).flatten(2).numpy(), axis=2)  # (T, D, E M)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import torch
-
-from oodd_eval.plugins.forecasting import GRID, quantile_levels
+from oodd_torch.forecast import quantile_levels
+from oodd_torch.network import GRID
 
 
 def slow_errors(made, rows, *, horizon, samples, mean_sampling, seed):

@@ -24,12 +24,8 @@ _DEFINITION: Final = re.compile(r"^class (\w+)\([^)]*Detector[^)]*\):", re.MULTI
 def pyod_class(name: str) -> type:
     """Return a detector class of ``pyod.models`` by its bare name.
 
-    Only the module that defines it is imported: others need libraries of their own.
-
-    Raises
-    ------
-    UnknownNameError
-        When there is no such class.
+    Only the module that defines it is imported: others need libraries of their own. Raises
+    `UnknownNameError` when there is no such class.
     """
     places: dict[str, str] = {}
     directory = _directory("pyod.models")
@@ -46,50 +42,30 @@ def pyod_class(name: str) -> type:
 def sklearn_class(name: str) -> tuple[str, type]:
     """Return an outlier detector or density estimator of scikit-learn, after its shortest name.
 
-    Parameters
-    ----------
-    name
-        ``IsolationForest``, or with the path to it: ``ensemble.IsolationForest``.
-
-    Raises
-    ------
-    UsageError
-        When there is no such class, or it is something else.
+    The name is ``IsolationForest``, or with the path to it, ``ensemble.IsolationForest``. Raises
+    `UsageError` when there is no such class, or it is something else.
     """
-    short = name.rpartition(".")[2]
-    known: dict[str, type] = {}
-    for place in PLACES:
-        module = importlib.import_module(f"sklearn.{place}")
-        known.update({n: c for n in module.__all__ if _judges(c := getattr(module, n))})
+    modules = [importlib.import_module(f"sklearn.{place}") for place in PLACES]
+    known = {n: c for m in modules for n in m.__all__ if _judges(c := getattr(m, n))}
     if name in known:
         return name, known[name]
-    if short == name:
-        for place in PLACES:
-            if hasattr(importlib.import_module(f"sklearn.{place}"), name):
-                raise _no_outlier_detector(name, known)
+    short = name.rpartition(".")[2]
+    if short == name and not any(hasattr(m, name) for m in modules):
         raise UnknownNameError("outlier detector of scikit-learn", name, known)
-    found = imported(f"sklearn.{name}", f"sklearn:{name}")
+    found: Any = None if short == name else imported(f"sklearn.{name}", f"sklearn:{name}")
     if not _judges(found):
-        raise _no_outlier_detector(name, known)
+        raise UsageError(
+            f"'sklearn:{name}' is neither an outlier detector nor a density estimator; those of "
+            f"scikit-learn are {', '.join(sorted(known))}"
+        )
     return short if known.get(short) is found else name, found
 
 
 def imported(path: str, spec: str) -> Any:
-    """Import what a dotted path names.
+    """Return the object that a dotted path ``module.name`` leads to.
 
-    Parameters
-    ----------
-    path
-        ``module.name``.
-    spec
-        The name it is a part of, for messages.
-
-    Raises
-    ------
-    UsageError
-        When the path cannot be one, its module does not exist or needs a module that does not.
-    UnknownNameError
-        When the module has no such name.
+    Raises `UsageError`, naming the detector, when the path cannot be one, its module does not exist
+    or needs a module that does not, and `UnknownNameError` when the module has no such name.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name or not all(part.isidentifier() for part in path.split(".")):
@@ -115,10 +91,7 @@ def imported(path: str, spec: str) -> Any:
 def forecaster_class(path: str) -> type:
     """Return a class with `fit` and `predict`, by its dotted path.
 
-    Raises
-    ------
-    UsageError
-        When there is none; of scikit-learn's classes, when it is not a regressor.
+    Raises `UsageError` when there is none; of scikit-learn's classes, when it is not a regressor.
     """
     spec = f"forecast:{path}"
     found = _class(imported(path, spec), spec, "fit", "predict")
@@ -135,7 +108,7 @@ def forecaster_class(path: str) -> type:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """What a class's constructor takes.
+    """Parameters of a class's constructor.
 
     Attributes
     ----------
@@ -154,37 +127,21 @@ class Signature:
     @classmethod
     def of(cls, factory: type) -> Signature:
         """Read the signature of a class."""
-        plain: dict[str, Any] = {}
-        required: list[str] = []
-        others: list[str] = []
-        anything = False
-        for p in inspect.signature(factory).parameters.values():
-            if p.kind is p.VAR_KEYWORD:
-                anything = True
-            elif p.kind in (p.VAR_POSITIONAL, p.POSITIONAL_ONLY):
-                continue
-            elif p.default is p.empty:
-                required.append(p.name)
-            elif _is_plain(p.default):
-                plain[p.name] = p.default
-            else:
-                others.append(p.name)
-        return cls(plain, tuple(required), None if anything else tuple(others))
+        every = inspect.signature(factory).parameters.values()
+        anything = any(p.kind is p.VAR_KEYWORD for p in every)
+        named = [p for p in every if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        required = tuple(p.name for p in named if p.default is p.empty)
+        defaults = {p.name: p.default for p in named if p.default is not p.empty}
+        plain = {name: value for name, value in defaults.items() if _is_plain(value)}
+        others = tuple(name for name in defaults if name not in plain)
+        return cls(plain, required, None if anything else others)
 
     def __contains__(self, name: str) -> bool:
-        """Whether it names this parameter; those that ``**`` would take do not count."""
+        """Return True if it names this parameter; those that ``**`` would take do not count."""
         return name in (*self.plain, *self.required, *(self.others or ()))
 
     def check(self, given: Mapping[str, Any], spec: str) -> None:
-        """Raise unless the class can be made of these parameters.
-
-        Raises
-        ------
-        UnknownNameError
-            When it does not take one of them.
-        UsageError
-            When one that it needs is missing.
-        """
+        """Raise `UsageError` unless the class can be made of these parameters."""
         for name in given:
             if self.others is not None and name not in self:
                 raise UnknownNameError(
@@ -197,7 +154,7 @@ class Signature:
 
 
 def _is_plain(value: object) -> bool:
-    """Whether JSON gives the value back as it is."""
+    """Return True if JSON gives the value back as it is."""
     if isinstance(value, float) and not math.isfinite(value):
         return False
     try:
@@ -207,7 +164,7 @@ def _is_plain(value: object) -> bool:
 
 
 def _judges(found: object) -> bool:
-    """Whether this is a class of scikit-learn that says how nominal a row is."""
+    """Return True for a class of scikit-learn that scores how nominal a row is."""
     from sklearn.base import DensityMixin, OutlierMixin  # noqa: PLC0415  an optional extra
     from sklearn.neighbors import KernelDensity  # noqa: PLC0415  which lacks the mixin
 
@@ -215,13 +172,6 @@ def _judges(found: object) -> bool:
         inspect.isclass(found)
         and issubclass(found, DensityMixin | OutlierMixin | KernelDensity)
         and hasattr(found, "score_samples")
-    )
-
-
-def _no_outlier_detector(name: str, known: Mapping[str, type]) -> UsageError:
-    return UsageError(
-        f"'sklearn:{name}' is neither an outlier detector nor a density estimator; those of "
-        f"scikit-learn are {', '.join(sorted(known))}"
     )
 
 

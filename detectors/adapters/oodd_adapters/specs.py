@@ -1,20 +1,20 @@
-"""What the plug-in says about a class it was asked for: name, parameters, version, needs."""
+"""Specs of detectors made from a class: name, parameters, version, and what is missing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Any
 
-from oodd_adapters.detectors import ForecastDetector, OutlierDetector, Settings
+from oodd_adapters.detectors import AdapterParameters, ForecastDetector, OutlierDetector
 from oodd_adapters.names import Signature, forecaster_class, pyod_class, sklearn_class
 from oodd_eval import Detector, DetectorSpec
-from oodd_eval.results.provenance import source_digest
+from oodd_eval.plugins.parameters import checked, declared_by
+from oodd_eval.scoring.keys import source_digest
 
-DEFAULTS: Final[Mapping[str, int]] = {"window": 4, "rows": 10_000}
-"""Parameters of the adapters themselves. They hide parameters of the same name of a class."""
+_OWN = frozenset(f.name for f in fields(AdapterParameters))
 
 
 def pyod(name: str) -> DetectorSpec:
@@ -59,7 +59,7 @@ def forecast(path: str) -> DetectorSpec:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to make a detector of a class: what a spec's factory is.
+    """Make detectors of a class: the factory of a spec.
 
     Attributes
     ----------
@@ -80,44 +80,40 @@ class Recipe:
 
     @property
     def signature(self) -> Signature:
-        """What the class's constructor takes."""
+        """Return the parameters of the class's constructor."""
         return Signature.of(self.found)
 
     def spec(self, summary: str, label: str) -> DetectorSpec:
         """Return the spec; the label says which version of which library does the work."""
         signature = self.signature
-        hidden = {*self.fixed, "random_state"}
-        plain = {k: v for k, v in signature.plain.items() if k not in hidden}
+        hidden = {*self.fixed, *_OWN, "random_state"}
+        plain = {n: v for n, v in signature.plain.items() if n not in hidden}
         return DetectorSpec(
             name=self.name,
             factory=self,
             summary=summary,
             reference=f"{self.found.__module__}.{self.found.__qualname__}",
-            parameters={**plain, **DEFAULTS},
+            parameters=declared_by(plain, AdapterParameters),
             other_parameters=bool(signature.required or signature.others is None),
             version=label,
         )
 
-    def __call__(
-        self,
-        *,
-        seed: int = 0,
-        horizon: int = 1,
-        window: int = DEFAULTS["window"],
-        rows: int = DEFAULTS["rows"],
-        **parameters: Any,
-    ) -> Detector:
+    def __call__(self, *, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
         """Return an unfitted detector, as the harness asks for it."""
         signature = self.signature
+        own = {n: parameters.pop(n) for n in _OWN & parameters.keys()}
         arguments = {**parameters, **self.fixed}
         if "random_state" in signature:
             arguments.setdefault("random_state", seed)
         signature.check(arguments, self.name)
         make: Callable[[], Any] = lambda: self.found(**arguments)  # noqa: E731
-        settings = Settings(self.name, seed, horizon, window, rows)
+        given = checked(AdapterParameters, self.name, own)
         if self.outlier is None:
-            return ForecastDetector(make, settings)
-        return OutlierDetector(make, *self.outlier, settings)
+            return ForecastDetector(self.name, make, given, seed=seed, horizon=horizon)
+        method, sign = self.outlier
+        return OutlierDetector(
+            self.name, make, given, seed=seed, horizon=horizon, method=method, sign=sign
+        )
 
 
 def _present(module: str) -> bool:
@@ -134,7 +130,7 @@ def _absent(name: str, summary: str, module: str, extra: str) -> DetectorSpec:
         name=name,
         factory=_cannot_run,
         summary=summary,
-        parameters=dict(DEFAULTS),
+        parameters=AdapterParameters,
         other_parameters=True,
         requires=(module,),
         extra=extra,

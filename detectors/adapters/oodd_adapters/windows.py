@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_common.windows import windows
 
 from oodd_eval import Trajectory
 from oodd_eval.plugins.forecasting import FeatureScale
@@ -21,32 +22,11 @@ BLOCK: Final = 256
 """Rows that a library is given at once: their number has to stay the same, see `row_by_row`."""
 
 
-def windows(observations: NDArray[np.float32], times: NDArray[np.int64], length: int) -> Floats:
-    """Return the latest observations at the given times, newest first, as one row each.
-
-    Before the beginning, the first observation is repeated. A row knows nothing after its time.
-
-    Parameters
-    ----------
-    observations : array of shape (T + 1, D)
-    times : int64 array of shape (N,)
-    length
-        Observations in a window, W.
-
-    Returns
-    -------
-    array of shape (N, W * D)
-
-    Examples
-    --------
-    >>> o = np.array([[0.0], [1.0], [2.0]], np.float32)
-    >>> windows(o, np.arange(3), 2).tolist()
-    [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
-    """
-    lags = np.maximum(times[:, None] - np.arange(length), 0)  # (N, W)
-    width = length * observations.shape[1]
-    rows: Floats = observations[lags].reshape(len(times), width).astype(np.float64)
-    return rows
+def flat_windows(rows: NDArray[np.float32], times: NDArray[np.int64], length: int) -> Floats:
+    """Return the latest observations at the given times, newest first: rows of W * D numbers."""
+    width = length * rows.shape[1]
+    flat: Floats = windows(rows, times, length).reshape(len(times), width).astype(np.float64)
+    return flat
 
 
 def sample_windows(
@@ -58,27 +38,9 @@ def sample_windows(
     limit: int,
     seed: int,
 ) -> tuple[Floats, Floats]:
-    """Return windows of nominal trajectories, and what came some steps after them.
+    """Return windows (N, W * D) of standardized trajectories, and the rows (N, D) `ahead` of them.
 
-    Parameters
-    ----------
-    nominal
-        K trajectories.
-    scale
-        How to standardize them.
-    length
-        Observations in a window, W.
-    ahead
-        Steps from a window to what came after; windows have to have that many steps to go.
-    limit
-        Rows at most; of more, a random choice is taken.
-    seed
-        Decides the choice.
-
-    Returns
-    -------
-    rows : array of shape (N, W * D)
-    later : array of shape (N, D)
+    Of more than `limit` windows a random choice is taken, which the seed decides.
     """
     counts = np.array([max(len(x) - ahead, 0) for x in nominal])
     chosen = np.arange(counts.sum())
@@ -89,7 +51,7 @@ def sample_windows(
     for x, start, count in zip(nominal, starts, counts, strict=True):
         times = chosen[(chosen >= start) & (chosen < start + count)] - start
         standardized = scale(x)
-        rows.append(windows(standardized, times, length))
+        rows.append(flat_windows(standardized, times, length))
         later.append(standardized[times + ahead].astype(np.float64))
     return np.concatenate(rows), np.concatenate(later)
 
@@ -101,17 +63,7 @@ def row_by_row(function: Function, rows: Floats, *, alone: bool) -> Floats:
     size, the last one filled up with zeros, make the values of the first rows the same whatever
     follows them, to the last bit.
 
-    Parameters
-    ----------
-    function
-        From rows of shape (n, K) to values of shape (n, ...).
-    rows : array of shape (N, K)
-    alone
-        Whether to give it one row at a time: for functions that compare the rows they are given.
-
-    Returns
-    -------
-    array of shape (N, ...)
+    With `alone` it is given one row at a time: for functions that compare the rows they are given.
     """
     size = 1 if alone else BLOCK
     values = []
@@ -127,14 +79,8 @@ def compares_rows(function: Function, rows: Floats) -> bool:
     """Find out whether a function gives a row another value in other company.
 
     Some outlier detectors rank the rows of a call among each other, so that scores of a whole
-    episode would know the future. Eight rows are tried, as they are and three times as far out.
-
-    Parameters
-    ----------
-    function
-        From rows of shape (n, K) to values of shape (n, ...).
-    rows : array of shape (N, K)
-        Training rows, N >= 1.
+    episode would know the future. Eight training rows are tried, as they are and three times as far
+    out.
     """
     some = rows[np.linspace(0, len(rows) - 1, num=8).astype(int)]
     company = np.concatenate([some, 3.0 * some])

@@ -1,9 +1,4 @@
-"""What the recurrent reference detectors share: network, training, forecasting, the detector.
+"""Common code of the recurrent reference detectors: network, training, forecasts, the detector.
 
-Importing this package imports torch; plug-in modules do so inside their factories only.
+Importing the package or its `parameters` does not import torch; its other modules do.
 """
-
-from oodd_torch.detector import ForecastDetector
-from oodd_torch.settings import Settings
-
-__all__ = ["ForecastDetector", "Settings"]

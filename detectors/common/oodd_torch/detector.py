@@ -1,35 +1,56 @@
-"""A detector that scores by the prediction failure of a trained ensemble."""
+"""A detector that scores by the prediction failure of a trained ensemble of networks.
+
+The score of an observation is the mean absolute difference between it and its sampled forecasts,
+over networks, samples and sensors, in training standard deviations of the sensor.
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from oodd_common.windows import StorableWindowDetector
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import NotFittedError, UsageError
+from oodd_eval.errors import FittedStateError, UsageError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale, anomaly_scores
+from oodd_eval.plugins.state import Arrays
 from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
-from oodd_torch.settings import Settings
-from oodd_torch.storage import Fit, load_fit, save_fit
-from oodd_torch.training import train
+from oodd_torch.parameters import NetworkParameters
+from oodd_torch.training import Schedule, train
 
-HELD_OUT = 0.15
+RATES: Final = (1e-2,)
+"""Largest learning rates, in turn over the members: the larger of the paper's two.
+
+With the smaller one, 0.001, the held-out loss after the same number of updates is twice as high.
+"""
+
+WIDTHS: Final = (0.2, 0.1, 0.4, 0.2, 0.3)
+"""Widths of the quadratic part of the quantile loss, in turn over the members.
+
+In standard deviations of a sensor's change. With the usual 1 nearly all errors of a good forecast
+would fall into the quadratic part, and the minimizer would be an expectile instead of a quantile.
+"""
+
+HELD_OUT: Final = 0.15
 """Share of the nominal trajectories that decides when to stop training; at least one."""
 
-MOST_HELD_OUT = 8
+MOST_HELD_OUT: Final = 8
 """No more than so many decide it: the loss on them is looked at often, and on 75 episodes of 1000
 steps it took twice the time of the training itself."""
 
-BATCH = 64
+BATCH: Final = 64
 """Trajectories that are scored together."""
+
+WEIGHTS: Final = "weights.safetensors"
 
 
 def change_scale(episodes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
@@ -39,17 +60,7 @@ def change_scale(episodes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]
     return np.where(std < CONSTANT, 1.0, std).astype(np.float32)
 
 
-@dataclass(slots=True)
-class Stream:
-    """Where a live episode is: memory, the latest rows, and forecasts that await their times."""
-
-    memory: Tensor
-    latest: deque[NDArray[np.float32]]
-    awaited: deque[Tensor] = field(default_factory=deque)
-    now: int = 0
-
-
-class ForecastDetector:
+class NetworkDetector(StorableWindowDetector):
     r"""Mean absolute distance between an observation and its sampled forecasts.
 
     .. math:: A_t = \frac{1}{M e D} \sum_{i=1}^{M e} \sum_{d=1}^{D}
@@ -58,16 +69,22 @@ class ForecastDetector:
     Each forecast of :math:`o_t` is made from the observations up to :math:`o_{t-h}`. Undefined
     (NaN) for t < h. Higher means more anomalous.
 
+    The seed decides held-out episodes, networks, orders and quantile levels.
+
     Parameters
     ----------
-    name
-        Name for messages.
-    settings
-        See `Settings`.
-    seed
-        Decides held-out episodes, networks, orders and quantile levels.
-    horizon
-        Steps between the last observation a forecast uses and the one it predicts, h.
+    name, seed, horizon
+        See `WindowDetector`.
+    parameters
+        Those that all networks share.
+    window
+        Observations in the input, W.
+    samples, levels
+        Samples of each network, M, and quantile levels of an update.
+    recurrent, quantiles
+        Whether the networks have memory, and a quantile function as their output.
+    mean_sampling
+        Whether each step of a rollout feeds back the mean of M samples rather than one sample.
 
     Notes
     -----
@@ -76,170 +93,132 @@ class ForecastDetector:
     and time. Source: Danesh & Fern (2021), section 3 and appendix B.
     """
 
-    def __init__(self, name: str, settings: Settings, *, seed: int, horizon: int) -> None:
-        settings.check(name)
-        for what, value, least in (("seed", seed, 0), ("horizon", horizon, 1)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise UsageError(
-                    f"{what} of detector {name!r}: expected an integer of at least {least}, "
-                    f"got {value!r}"
-                )
-        self.name, self.settings, self.seed, self.horizon = name, settings, seed, horizon
-        self.fit_: Fit | None = None
-        self._forecaster: Forecaster | None = None
-        self._stream: Stream | None = None
+    kind: ClassVar[str] = "networks/2"
 
-    def fit(self, nominal: Sequence[Trajectory]) -> ForecastDetector:
-        """Train the ensemble on nominal trajectories, forgetting any earlier fit.
+    def __init__(
+        self,
+        name: str,
+        parameters: NetworkParameters,
+        *,
+        seed: int,
+        horizon: int,
+        window: int = 1,
+        samples: int = 1,
+        levels: int = 1,
+        recurrent: bool = True,
+        quantiles: bool = True,
+        mean_sampling: bool = False,
+    ) -> None:
+        super().__init__(name, seed=seed, horizon=horizon, window=window)
+        self.parameters, self.samples, self.mean_sampling = parameters, samples, mean_sampling
+        self.architecture: dict[str, Any] = {
+            "window": window,
+            "recurrent": recurrent,
+            "quantiles": quantiles,
+            "per_feature": parameters.trunk == "per-feature",
+        }
+        members = range(parameters.members)
+        self.schedule = Schedule(
+            updates=parameters.updates,
+            batch=parameters.batch,
+            chunk=parameters.chunk,
+            levels=levels,
+            rates=tuple(RATES[i % len(RATES)] for i in members),
+            widths=tuple(WIDTHS[i % len(WIDTHS)] for i in members),
+            scheduled_sampling=parameters.scheduled_sampling,
+        )
+        found = torch.cuda.is_available()
+        if parameters.device == "cuda" and not found:
+            raise UsageError(
+                f"parameter 'device' of {name} is 'cuda', expected auto or cpu, since torch finds "
+                "no CUDA device here"
+            )
+        self.device = ("cuda" if found else "cpu") if parameters.device == "auto" else (
+            parameters.device
+        )  # fmt: skip
+        self.network_: Ensemble
+        self.history_: list[list[float]]
+        self._forecaster: Forecaster
 
-        Raises
-        ------
-        TrajectoryError
-            When there is no transition, or trajectories differ in their number of sensors.
-        """
-        s = self.settings
+    def score(self, trajectory: Trajectory) -> NDArray[np.float64]:
+        """Return one score per observation, NaN for t < horizon."""
+        return self.score_many([trajectory])[0]
+
+    def score_many(self, trajectories: Sequence[Trajectory]) -> list[NDArray[np.float64]]:
+        """Return the scores of several trajectories, computed in batches of similar length."""
+        scale = self._scale()
+        rows = [scale(x) for x in trajectories]
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
+        scores: list[NDArray[np.float64]] = [np.zeros(0)] * len(rows)
+        for start in range(0, len(order), BATCH):
+            batch = order[start : start + BATCH]
+            errors = self._forecaster.errors([rows[i] for i in batch])
+            for i, error in zip(batch, errors, strict=True):
+                scores[i] = anomaly_scores(rows[i], error, self.horizon)
+        return scores
+
+    def reset(self) -> None:
+        """Begin a new live episode."""
+        super().reset()
+        self._memory: Tensor | None = None
+
+    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         scale = FeatureScale.fit(nominal)
         episodes = [scale(x) for x in nominal if x.transitions]
         order = np.random.default_rng([self.seed, 0]).permutation(len(episodes))
         held = min(max(1, round(HELD_OUT * len(episodes))), MOST_HELD_OUT)
         held_out = [episodes[i] for i in order[:held]]
         training = [episodes[i] for i in order[held:]] or held_out
-        states = [np.random.SeedSequence([self.seed, i]) for i in range(s.members)]
-        generators = [
-            torch.Generator().manual_seed(int(state.generate_state(1)[0])) for state in states
-        ]
-        architecture = Architecture(features=nominal[0].observation_dim, **s.architecture)
-        network = Ensemble(architecture, generators, change_scale(training)).to(s.place)
-        rngs = [np.random.default_rng([self.seed, 1, i]) for i in range(s.members)]
-        history = train(network, training, held_out, s.schedule, rngs)
-        self._take(Fit(network.requires_grad_(requires_grad=False), scale, history))
-        return self
+        members = range(self.parameters.members)
+        seeds = [np.random.SeedSequence([self.seed, i]).generate_state(1)[0] for i in members]
+        generators = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
+        architecture = Architecture(features=nominal[0].observation_dim, **self.architecture)
+        network = Ensemble(architecture, generators, change_scale(training)).to(self.device)
+        rngs = [np.random.default_rng([self.seed, 1, i]) for i in members]
+        history = train(network, training, held_out, self.schedule, rngs)
+        self._take(network, history)
+        return scale
 
-    def save(self, directory: Path) -> None:
-        """Write the fit into a directory: weights in safetensors, the rest in JSON.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        """
-        save_fit(directory, self._fitted()[0])
-
-    def load(self, directory: Path) -> None:
-        """Take over a fit that `save` wrote; horizon, samples and device may be others.
-
-        Raises
-        ------
-        FittedStateError
-            When the files are missing, damaged, or of networks of another kind.
-        """
-        s = self.settings
-        self._take(load_fit(directory, members=s.members, expected=s.architecture, device=s.place))
-
-    def score(self, trajectory: Trajectory) -> NDArray[np.float64]:
-        """Return one score per observation, NaN for t < horizon.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        TrajectoryError
-            When the trajectory has another number of sensors than those of `fit`.
-        """
-        return self.score_many([trajectory])[0]
-
-    def score_many(self, trajectories: Sequence[Trajectory]) -> list[NDArray[np.float64]]:
-        """Return the scores of several trajectories, computed in batches of similar length."""
-        fit, forecaster = self._fitted()
-        rows = [fit.scale(x) for x in trajectories]
-        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
-        scores: list[NDArray[np.float64]] = [np.zeros(0)] * len(rows)
-        for start in range(0, len(order), BATCH):
-            batch = order[start : start + BATCH]
-            errors = forecaster.errors([rows[i] for i in batch])
-            for i, error in zip(batch, errors, strict=True):
-                scores[i] = anomaly_scores(rows[i], error, self.horizon)
-        return scores
-
-    def reset(self) -> None:
-        """Begin a new live episode.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        """
-        self._stream = self._begin()
-
-    @torch.no_grad()
-    def update(
-        self,
-        observation: NDArray[np.float32],
-        action: NDArray[np.float32] | None = None,  # noqa: ARG002  the contract's name
-    ) -> float:
-        """Return the score of the next observation of a live episode, NaN for t < horizon.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        TrajectoryError
-            When the observation has another number of sensors than those of `fit`, or a value that
-            is not finite.
-        """
-        fit, forecaster = self._fitted()
-        row = fit.scale.row(observation)
-        stream = self._stream = self._stream or self._begin()
-        score = float("nan")
-        if len(stream.awaited) == self.horizon:
-            error = (torch.from_numpy(row).to(fit.network.device) - stream.awaited.popleft()).abs()
-            score = float(error.mean(dtype=torch.float64))
-        if not stream.now:
-            stream.latest.extend([row] * (fit.network.architecture.window - 1))
-        stream.latest.appendleft(row)
-        x = torch.from_numpy(np.concatenate(stream.latest)).to(fit.network.device)
-        due = stream.now + self.horizon
-        samples, stream.memory = forecaster.forecast(
-            x.expand(fit.network.members, 1, 1, -1), stream.memory, range(due, due + 1)
-        )
-        stream.awaited.append(samples[:, 0, 0])  # (E, M, D)
-        stream.now += 1
-        return score
-
-    @property
-    def network_(self) -> Ensemble:
-        """The trained networks."""
-        return self._fitted()[0].network
-
-    @property
-    def scale_(self) -> FeatureScale:
-        """Mean and standard deviation of every sensor in training."""
-        return self._fitted()[0].scale
-
-    @property
-    def history_(self) -> list[list[float]]:
-        """Held-out losses of all networks, one list per evaluation."""
-        return self._fitted()[0].history
-
-    def _take(self, fit: Fit) -> None:
-        s = self.settings
-        self.fit_, self._stream = fit, None
-        self._forecaster = Forecaster.of(
-            fit.network,
+    def _take(self, network: Ensemble, history: list[list[float]]) -> None:
+        self.network_, self.history_ = network.requires_grad_(requires_grad=False), history
+        self._forecaster = Forecaster(
+            network,
             horizon=self.horizon,
-            samples=s.samples if s.quantiles else 1,
-            mean_sampling=s.mean_sampling,
+            samples=self.samples,
+            mean_sampling=self.mean_sampling,
             seed=self.seed,
         )
 
-    def _begin(self) -> Stream:
-        network = self._fitted()[0].network
-        return Stream(network.start(1), deque(maxlen=network.architecture.window))
+    @torch.no_grad()
+    def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
+        network = self.network_
+        memory = network.start(1) if self._memory is None else self._memory
+        x = torch.from_numpy(window.reshape(-1)).to(network.device)
+        x = x.expand(network.members, 1, 1, -1)
+        samples, self._memory = self._forecaster.forecast(x, memory, range(t, t + 1))
+        error = (torch.from_numpy(now).to(network.device) - samples).abs()  # (E, 1, 1, M, D)
+        return float(error.mean(dtype=torch.float64))
 
-    def _fitted(self) -> tuple[Fit, Forecaster]:
-        if self.fit_ is None or self._forecaster is None:
-            raise NotFittedError(
-                f"detector {self.name!r} was asked for scores before fit: fit it on nominal "
-                "trajectories"
-            )
-        return self.fit_, self._forecaster
+    def save(self, directory: Path) -> None:
+        """Write the fit into a directory: weights in safetensors, arrays and JSON."""
+        super().save(directory)
+        weights = {n: t.cpu().contiguous() for n, t in self.network_.state_dict().items()}
+        save_file(weights, directory / WEIGHTS)
+
+    def _saved_with(self) -> dict[str, Any]:
+        return {"members": self.parameters.members, **self.architecture}
+
+    def _arrays(self) -> Arrays:
+        return {"history": np.array(self.history_)}
+
+    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:
+        generators = [torch.Generator() for _ in range(self.parameters.members)]
+        architecture = Architecture(features=sensors, **self.architecture)
+        network = Ensemble(architecture, generators, np.ones(sensors, np.float32))
+        try:
+            network.load_state_dict(load_file(directory / WEIGHTS))
+        except (OSError, RuntimeError, SafetensorError) as error:
+            raise FittedStateError(
+                f"{str(directory / WEIGHTS)!r} cannot be read as weights of this detector: {error}"
+            ) from None
+        self._take(network.to(self.device), arrays.get("history", np.zeros((0, 0))).tolist())

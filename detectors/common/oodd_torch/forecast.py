@@ -10,15 +10,13 @@ R rollouts of a time.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodd_eval.plugins.forecasting import quantile_levels
-from oodd_torch.network import Ensemble
+from oodd_torch.network import GRID, Ensemble
 from oodd_torch.training import arrange, predict
 
 ROWS = 4096
@@ -28,44 +26,25 @@ ROLLOUTS = 1024
 """The same at larger horizons, where arrays that fit the processor's cache are quicker."""
 
 
-@dataclass(frozen=True, slots=True)
 class Forecaster:
-    """How forecasts are made: horizon h, samples M, mean sampling, and the seed of the levels."""
+    """Forecasts at horizon h by M samples, with or without mean sampling; the seed keys levels."""
 
-    network: Ensemble
-    horizon: int
-    samples: int
-    mean_sampling: bool
-    seed: int
-    table: Tensor | None
-
-    @classmethod
-    def of(
-        cls, network: Ensemble, *, horizon: int, samples: int, mean_sampling: bool, seed: int
-    ) -> Forecaster:
-        """Tabulate the embeddings of the quantile levels, which depend on nothing else."""
-        with torch.no_grad():
-            table = network.table() if network.architecture.quantiles else None
-        return cls(network, horizon, samples, mean_sampling, seed, table)
-
-    @property
-    def width(self) -> int:
+    @torch.no_grad()
+    def __init__(
+        self, network: Ensemble, *, horizon: int, samples: int, mean_sampling: bool, seed: int
+    ) -> None:
+        self.network, self.horizon, self.samples, self.seed = network, horizon, samples, seed
+        # Embeddings of the quantile levels depend on nothing else.
+        self.table = network.table() if network.architecture.quantiles else None
+        alone = mean_sampling or horizon == 1 or self.table is None
+        self.width = 1 if alone else samples
         """Rollouts of every time, R."""
-        alone = self.mean_sampling or self.horizon == 1 or self.table is None
-        return 1 if alone else self.samples
 
     @torch.no_grad()
     def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
         """Return mean absolute errors of the forecasts of every ``o_t``, ``t >= horizon``.
 
-        Parameters
-        ----------
-        rows : list of float32 arrays of shape (T + 1, D)
-            Standardized observations.
-
-        Returns
-        -------
-        list of float64 arrays of shape (max(T + 1 - h, 0),)
+        From standardized observations of shape (T + 1, D) to errors of shape (max(T + 1 - h, 0),).
         """
         network, horizon = self.network, self.horizon
         longest = max(len(r) for r in rows)
@@ -95,22 +74,10 @@ class Forecaster:
 
     @torch.no_grad()
     def forecast(self, x: Tensor, memory: Tensor, times: range) -> tuple[Tensor, Tensor]:
-        """Forecast the observations of the given times from those h steps before.
+        """Forecast the observations of C times, which key the levels, from those h steps before.
 
-        Parameters
-        ----------
-        x : (E, C, B, W * D)
-            Inputs up to the last true observation of each forecast.
-        memory : (K, B, H)
-            Memory before the chunk.
-        times
-            The C times that are forecast; they key the quantile levels.
-
-        Returns
-        -------
-        samples : (E, C, B, M, D)
-        memory : (K, B, H)
-            Memory after the chunk.
+        From inputs (E, C, B, W * D) and the memory before them, (K, B, H), to samples
+        (E, C, B, M, D) and the memory after them.
         """
         levels = self._levels(times)
         network = self.network
@@ -169,16 +136,31 @@ def rollouts(
     a = network.architecture
     e, c, b, _ = x.shape
     d = a.features
-    f = network.inputs(x.reshape(e, c * b, -1)).reshape(-1, c, b, a.units)  # (K, C, B, H)
-    state = f
-    if a.recurrent:
-        state, memory = network.run(f, memory)
+
+    def sample(window: Tensor, f: Tensor, state: Tensor, step: int) -> Tensor:
+        """Draw the next observation of every rollout, (E, C, B, M, D)."""
+        z = network.trunk(f, state)
+        k, p = len(z), a.outputs
+        if levels is None or table is None:
+            change = torch.bmm(z, network.out).reshape(k, c, width, b, p).transpose(2, 3)
+        else:
+            # R = M: a rollout has the level of its own sample; R = 1: M levels in one product.
+            heads = network.heads_from(levels[step].reshape(e, c * width, -1, d), table)
+            change = torch.matmul(z.reshape(k, c * width, b, -1), heads)  # (K, C R, B, M / R P)
+            change = change.reshape(k, c, width, b, -1, p).transpose(2, 3).flatten(3, 4)
+        change = network.gather(change + network.out_bias[:, None, None])
+        newest = window[..., :d].reshape(-1, c, width, b, d).transpose(2, 3)  # (E, C, B, R, D)
+        return newest + network.unit * change
 
     def repeat(tensor: Tensor) -> Tensor:
         return tensor[:, :, None].expand(-1, -1, width, -1, -1).flatten(1, 3)
 
+    f = network.inputs(x.reshape(e, c * b, -1)).reshape(-1, c, b, a.units)  # (K, C, B, H)
+    state = f
+    if a.recurrent:
+        state, memory = network.run(f, memory)
     window, f, state = repeat(x), repeat(f), repeat(state)  # (E or K, C * R * B, ...)
-    samples = _sample(network, window, f, state, levels, 0, table, (c, width, b))
+    samples = sample(window, f, state, 0)
     cell = network.cell() if a.recurrent and horizon > 1 else None
     for step in range(1, horizon):
         fed = samples if width > 1 else samples.mean(3, keepdim=True)  # (E, C, B, R, D)
@@ -186,32 +168,34 @@ def rollouts(
         window = torch.cat([newest, window[..., :-d]], dim=2)
         f = network.inputs(window)
         state = f if cell is None else cell(f, state)
-        samples = _sample(network, window, f, state, levels, step, table, (c, width, b))
+        samples = sample(window, f, state, step)
     return samples, memory
 
 
-def _sample(
-    network: Ensemble,
-    window: Tensor,
-    f: Tensor,
-    state: Tensor,
-    levels: Tensor | None,
-    step: int,
-    table: Tensor | None,
-    shape: tuple[int, int, int],
-) -> Tensor:
-    """Draw the next observation of every rollout: (E, C, B, M, D) from states (K, C * R * B, H)."""
-    c, width, b = shape
-    d = network.architecture.features
-    z = network.trunk(f, state)
-    k, p = len(z), network.architecture.outputs
-    if levels is None or table is None:
-        change = torch.bmm(z, network.out).reshape(k, c, width, b, p).transpose(2, 3)
-    else:
-        # R = M: every rollout has the level of its own sample; R = 1: M levels in one product.
-        heads = network.heads_from(levels[step].reshape(network.members, c * width, -1, d), table)
-        change = torch.matmul(z.reshape(k, c * width, b, -1), heads)  # (K, C * R, B, M / R * P)
-        change = change.reshape(k, c, width, b, -1, p).transpose(2, 3).flatten(3, 4)
-    change = network.gather(change + network.out_bias[:, None, None])
-    newest = window[..., :d].reshape(-1, c, width, b, d).transpose(2, 3)  # (E, C, B, R, D)
-    return newest + network.unit * change
+def quantile_levels(
+    seed: int, times: range, steps: int, members: int, samples: int, features: int
+) -> NDArray[np.int64]:
+    """Draw quantile levels keyed by seed and time, as indices into the grid of midpoints.
+
+    The levels for time t depend on nothing but the seed and t, so that scores do not depend on
+    what is scored before, beside or after.
+
+    Parameters
+    ----------
+    seed
+        Seed of the detector.
+    times
+        Times t whose observation is predicted.
+    steps
+        Prediction horizon h: levels for every step of the rollout that ends at t.
+    members, samples, features
+        Ensemble members E, samples M, sensors D.
+
+    Returns
+    -------
+    int64 array of shape (len(times), steps, E, M, D)
+        Level ``(k + 0.5) / GRID`` for index k.
+    """
+    shape = (steps, members, samples, features)
+    drawn = [np.random.default_rng([seed, t]).integers(GRID, size=shape) for t in times]
+    return np.array(drawn, dtype=np.int64).reshape(len(times), *shape)

@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from oodd_eval.plugins.forecasting import GRID
+GRID: Final = 4096
+"""Sampled quantile levels are the midpoints of this many equal parts of (0, 1).
+
+Finer than any quantile that can be learned, and coarse enough for embeddings to be tabulated.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
-    """What the members look like.
+    """Shape of the ensemble's members.
 
     Attributes
     ----------
@@ -58,7 +63,7 @@ class Architecture:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class GruCell:
     """A GRU's weights for many single steps: one product for both gates, two for the candidate.
 
     Everything else works in place. A rollout's step is bound by passes over arrays larger than the
@@ -129,7 +134,7 @@ class Ensemble(torch.nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return self.first.device
 
     def start(self, rows: int) -> Tensor:
@@ -154,10 +159,10 @@ class Ensemble(torch.nn.Module):
         """First layer: (E, B, W * D) to (K, B, H)."""
         return torch.relu(torch.baddbmm(self.first_bias, self.spread(x), self.first))
 
-    def cell(self) -> Cell:
+    def cell(self) -> GruCell:
         """Return the GRU laid out for rollouts; without gradients."""
         h = self.architecture.units
-        return Cell(
+        return GruCell(
             gates=torch.cat([self.gru_in[..., : 2 * h], self.gru[..., : 2 * h]], 1),
             gates_bias=(self.gru_in_bias + self.gru_bias)[..., : 2 * h],
             new=self.gru_in[..., 2 * h :].contiguous(),

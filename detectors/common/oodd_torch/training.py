@@ -15,10 +15,10 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from oodd_common.windows import windows
 from torch import Tensor
 
-from oodd_eval.plugins.forecasting import GRID
-from oodd_torch.network import Ensemble
+from oodd_torch.network import GRID, Ensemble
 
 BETAS: Final = (0.9, 0.999)
 EPSILON: Final = 1e-8
@@ -29,7 +29,7 @@ CLIP: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how a training goes.
+    """Length and settings of a training.
 
     Attributes
     ----------
@@ -69,16 +69,8 @@ def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> T
     """Quantile Huber loss of Dabney et al. (2018), elementwise.
 
     ``rho = |tau - [u < 0]| L(u) / kappa``, ``L(u) = u^2 / 2`` for ``|u| <= kappa``, else
-    ``kappa (|u| - kappa / 2)``, with ``u = target - prediction`` and the level that was sampled.
-
-    Parameters
-    ----------
-    error : tensor
-        ``u``, target minus prediction.
-    tau : tensor
-        Level at which each prediction was made, broadcast against `error`.
-    kappa : tensor or float
-        Width of the quadratic part, broadcast against `error`.
+    ``kappa (|u| - kappa / 2)``, with the error ``u = target - prediction``, the level tau that was
+    sampled, and kappa, the width of the quadratic part; all are broadcast.
     """
     size = error.abs()
     huber = torch.where(size <= kappa, 0.5 * error * error, kappa * (size - 0.5 * kappa))
@@ -110,51 +102,37 @@ class Adam:
             p.grad = None
 
 
-class Batches:
-    """Chunks of episodes for every member, memory carried along.
+def batches(
+    episodes: Sequence[NDArray[np.float32]],
+    rngs: Sequence[np.random.Generator],
+    window: int,
+    schedule: Schedule,
+) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
+    """Yield chunks of episodes without end: inputs, targets and mask of `arrange`, whether new.
 
-    Parameters
-    ----------
-    episodes : list of float32 arrays of shape (T + 1, D)
-        Standardized observations.
-    rngs
-        One generator per member, for its order of episodes.
+    Every member has a generator of its own for its order of episodes. Chunks of the same episodes
+    follow each other, so that the memory can be carried along; the first one is new.
     """
-
-    def __init__(
-        self,
-        episodes: Sequence[NDArray[np.float32]],
-        rngs: Sequence[np.random.Generator],
-        window: int,
-        schedule: Schedule,
-    ) -> None:
-        self.episodes = [e for e in episodes if len(e) > 1]
-        self.rngs, self.window, self.schedule = rngs, window, schedule
-
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
-        """Yield inputs (E, T, B, W * D), targets (E, T, B, D), mask (E, T, B), whether new."""
-        size = min(self.schedule.batch, len(self.episodes))
-        while True:
-            orders = np.stack([rng.permutation(len(self.episodes)) for rng in self.rngs])
-            for start in range(0, len(self.episodes) - size + 1, size):
-                yield from self._chunks(orders[:, start : start + size])
-
-    def _chunks(self, chosen: NDArray[np.int64]) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
-        picked = [[self.episodes[i] for i in row] for row in chosen]
-        x, y, mask = arrange(picked, self.window)
-        for start in range(0, x.shape[1], self.schedule.chunk):
-            part = slice(start, start + self.schedule.chunk)
-            if mask[:, part].any():
-                yield x[:, part], y[:, part], mask[:, part], start == 0
+    usable = [e for e in episodes if len(e) > 1]
+    size = min(schedule.batch, len(usable))
+    while True:
+        orders = np.stack([rng.permutation(len(usable)) for rng in rngs])
+        for first in range(0, len(usable) - size + 1, size):
+            chosen = orders[:, first : first + size]
+            x, y, mask = arrange([[usable[i] for i in row] for row in chosen], window)
+            for start in range(0, x.shape[1], schedule.chunk):
+                part = slice(start, start + schedule.chunk)
+                if mask[:, part].any():
+                    yield x[:, part], y[:, part], mask[:, part], start == 0
 
 
 def arrange(
     picked: Sequence[Sequence[NDArray[np.float32]]], window: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lay out episodes of every member: inputs, targets and mask, time before batch.
+    """Lay out episodes of every member, time before batch.
 
-    Inputs hold the newest observation first; windows that reach before an episode's beginning
-    repeat its first observation.
+    Returns inputs (E, T, B, W * D), newest observation first, targets (E, T, B, D) and mask
+    (E, T, B).
     """
     members, size = len(picked), len(picked[0])
     longest = max(len(e) for row in picked for e in row) - 1
@@ -165,8 +143,7 @@ def arrange(
     for e, row in enumerate(picked):
         for b, episode in enumerate(row):
             steps = len(episode) - 1
-            lags = np.maximum(np.arange(steps)[:, None] - np.arange(window), 0)
-            x[e, :steps, b] = episode[lags].reshape(steps, -1)
+            x[e, :steps, b] = windows(episode, np.arange(steps), window).reshape(steps, -1)
             y[e, :steps, b] = episode[1:]
             mask[e, :steps, b] = True
     return torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(mask)
@@ -207,10 +184,7 @@ def predict(
 
 
 def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> Tensor:
-    """Return the derivative of `quantile_huber` by the error.
-
-    ``|tau - [u < 0]| clip(u / kappa, -1, 1)``
-    """
+    """Return ``|tau - [u < 0]| clip(u / kappa, -1, 1)``, the derivative of `quantile_huber`."""
     return torch.where(error < 0, 1 - tau, tau) * (error / kappa).clamp_(-1, 1)
 
 
@@ -232,10 +206,10 @@ def descend(
     """Add the gradients of every network's mean loss; return the last memory.
 
     The loss is the mean over masked steps, levels and the network's sensors. ``kappa`` has shape
-    (E,); ``tau`` (E, N) holds the levels of
-    this update, shared by all steps, episodes and sensors, so that their embeddings cost next to
-    nothing. The slope of the loss is handed to the backward pass directly: the loss itself, a
-    dozen passes over the largest array of a training step, is only needed when it is looked at.
+    (E,); ``tau`` (E, N) holds the levels of this update, shared by all steps, episodes and sensors,
+    so that their embeddings cost next to nothing. The slope of the loss is handed to the backward
+    pass directly: the loss itself, a dozen passes over the largest array of a training step, is
+    only needed when it is looked at.
     """
     heads = None if tau is None else network.heads_at(tau)
     change, memory = predict(network, x, memory, heads)
@@ -288,9 +262,7 @@ def train(
 ) -> list[list[float]]:
     """Train all members in place; each ends at its own best held-out loss.
 
-    Returns
-    -------
-    Held-out losses, one list of K values per evaluation.
+    Returns held-out losses, one list of K values per evaluation.
     """
     a, device = network.architecture, network.device
     optimiser = Adam(list(network.parameters()))
@@ -301,9 +273,9 @@ def train(
     kept = [p.detach().clone() for p in network.parameters()]
     history: list[list[float]] = []
     stale, memory = 0, torch.zeros(0)
-    batches = iter(Batches(episodes, rngs, a.window, schedule))
+    chunks = batches(episodes, rngs, a.window, schedule)
     for update in range(1, schedule.updates + 1):
-        x, y, mask, new = next(batches)
+        x, y, mask, new = next(chunks)
         x, y, mask = x.to(device), y.to(device), mask.to(device)
         memory = network.start(x.shape[2]) if new else memory.detach()
         tau = _stratified(rngs, schedule.levels).to(device) if a.quantiles else None

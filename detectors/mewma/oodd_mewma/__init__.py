@@ -1,38 +1,50 @@
-"""Vector autoregression watched by a multivariate EWMA chart: the plug-ins' rival from statistics.
+"""Vector autoregression watched by a multivariate EWMA chart: the rival from process control.
 
 Two detectors, which differ in what they look at: `mewma` at observations alone, `mewma-a` at the
 commanded actions too.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 from oodd_eval import Detector, DetectorSpec, hookimpl
+from oodd_eval.plugins.parameters import checked, parameter
 
 _REFERENCE = "Lowry, Woodall, Champ & Rigdon (1992)"
 
 
-def _parameters() -> dict[str, Any]:
-    return {
-        "order": 3,
-        "ridge": 1e-4,
-        "clip": 3.0,
-        "shrinkage": 0.05,
-        "weights": [0.3, 0.1, 0.03],
-    }
+@dataclass(frozen=True, slots=True)
+class MewmaParameters:
+    """Parameters of `mewma` and `mewma-a`."""
+
+    order: int = parameter(3, low=1, help="latest observations that a forecast uses")
+    ridge: float = parameter(
+        1e-4, above=0, help="penalty, relative to the mean squared error of standardized sensors"
+    )
+    clip: float = parameter(3.0, above=0, help="limit of a residual, in root mean squares")
+    shrinkage: float = parameter(
+        0.05, above=0, high=1, help="share of the identity in every covariance"
+    )
+    weights: list[float] = parameter(  # noqa: RUF009  it is copied
+        [0.3, 0.1, 0.03], above=0, high=1, help="weights of the newest residual, one per chart"
+    )
 
 
 def make_mewma(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return an unfitted `MewmaDetector` that looks at observations."""
-    from oodd_mewma.detector import MewmaDetector  # noqa: PLC0415  keeps the listing quick
-
-    return MewmaDetector(seed=seed, horizon=horizon, **parameters)
+    return _make("mewma", seed, horizon, parameters, actions=False)
 
 
 def make_mewma_a(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return an unfitted `MewmaDetector` that looks at observations and actions."""
+    return _make("mewma-a", seed, horizon, parameters, actions=True)
+
+
+def _make(name: str, seed: int, horizon: int, given: dict[str, Any], *, actions: bool) -> Detector:
     from oodd_mewma.detector import MewmaDetector  # noqa: PLC0415  keeps the listing quick
 
-    return MewmaDetector(seed=seed, horizon=horizon, actions=True, **parameters)
+    parameters = checked(MewmaParameters, name, given)
+    return MewmaDetector(name, parameters, seed=seed, horizon=horizon, actions=actions)
 
 
 @hookimpl
@@ -44,7 +56,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             factory=make_mewma,
             summary="linear forecast, residuals accumulated with their sign",
             reference=_REFERENCE,
-            parameters=_parameters(),
+            parameters=MewmaParameters,
         ),
         DetectorSpec(
             name="mewma-a",
@@ -52,6 +64,6 @@ def oodd_detectors() -> list[DetectorSpec]:
             summary="mewma whose forecast uses the commanded actions too",
             reference=_REFERENCE,
             inputs="observations+actions",
-            parameters=_parameters(),
+            parameters=MewmaParameters,
         ),
     ]

@@ -21,16 +21,8 @@ def smooth(residuals: Floats, weights: Sequence[float]) -> Floats:
     The divisor is exact from the first step on: for residuals :math:`u` without autocorrelation
     :math:`\tilde z_n` has the covariance of :math:`u` at every n, so the start needs no warm-up.
 
-    Parameters
-    ----------
-    residuals : array of shape (N, D)
-        In the order of time.
-    weights
-        W values of the weight, in (0, 1]: small ones have a long memory, of about 1 / weight steps.
-
-    Returns
-    -------
-    array of shape (W, N, D)
+    From (N, D), in the order of time, to (W, N, D) for W weights in (0, 1]. Small ones have a long
+    memory, of about 1 / weight steps.
 
     Examples
     --------
@@ -41,15 +33,7 @@ def smooth(residuals: Floats, weights: Sequence[float]) -> Floats:
 
 
 class Smoother:
-    """`smooth` in parts: what is passed goes on where the last call ended.
-
-    Parameters
-    ----------
-    weights
-        W values of the weight.
-    sensors
-        Sensors, D.
-    """
+    """`smooth` in parts: each call continues where the last one ended."""
 
     def __init__(self, weights: Sequence[float], sensors: int) -> None:
         self._weight = np.asarray(weights, dtype=np.float64)[:, None]  # (W, 1)
@@ -76,17 +60,8 @@ def whitening(covariance: Floats, shrinkage: float) -> Floats:
     """Return the matrix M such that ``|x M|`` is the Mahalanobis length of the row x.
 
     The covariance is shrunk towards the identity, which bounds what a combination of sensors that
-    hardly varies in nominal operation, or a constant sensor, can contribute.
-
-    Parameters
-    ----------
-    covariance : array of shape (D, D)
-    shrinkage
-        Share of the identity, in (0, 1].
-
-    Returns
-    -------
-    array of shape (D, D)
+    hardly varies in nominal operation, or a constant sensor, can contribute. The shrinkage is the
+    identity's share, in (0, 1].
     """
     shrunk = (1.0 - shrinkage) * covariance + shrinkage * np.eye(len(covariance))
     root: Floats = np.linalg.inv(np.linalg.cholesky(shrunk)).T

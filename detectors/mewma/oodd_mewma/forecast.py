@@ -14,29 +14,13 @@ BLOCK: Final = 64
 """Rows that are multiplied by a matrix at once."""
 
 
-def first_forecast(*, order: int, horizon: int) -> int:
-    """Return the first time t that has all of its regressors: ``horizon + order - 1``."""
-    return horizon + order - 1
-
-
 def regressors(observations: Floats, actions: Floats | None, *, order: int, horizon: int) -> Floats:
     """Return what the forecasts of ``o_f .. o_T`` may use, one row per forecast.
 
-    f is the first time that has all regressors, `first_forecast`. The row of time t holds
+    f is the first time that has all regressors, ``horizon + order - 1``. The row of time t holds
     ``o_{t-h} .. o_{t-h-order+1}``, then the actions of the same times if there are any, then 1.
 
-    Parameters
-    ----------
-    observations : array of shape (T + 1, D)
-    actions : array of shape (T, A), or None
-    order
-        Latest times that a forecast looks at.
-    horizon
-        Steps from the newest of them to the forecast, h.
-
-    Returns
-    -------
-    array of shape (max(T + 1 - f, 0), order * (D + A) + 1)
+    From (T + 1, D) and (T, A) to (max(T + 1 - f, 0), order * (D + A) + 1).
 
     Examples
     --------
@@ -55,18 +39,10 @@ def regressors(observations: Floats, actions: Floats | None, *, order: int, hori
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Sums that decide a least-squares fit; those of two sets of rows add up.
+    """Sums that decide a least-squares fit of Y by X; those of two sets of rows add up."""
 
-    Attributes
-    ----------
-    gram : array of shape (K, K)
-        X'X of the regressors.
-    cross : array of shape (K, D)
-        X'Y of regressors and targets.
-    """
-
-    gram: Floats
-    cross: Floats
+    gram: Floats  # (K, K): X'X
+    cross: Floats  # (K, D): X'Y
 
     @classmethod
     def of(cls, x: Floats, y: Floats) -> Moments:
@@ -95,14 +71,7 @@ def product(rows: Floats, matrix: Floats) -> Floats:
     A matrix product picks its order of summation by the shapes. Blocks of one fixed shape, the last
     one filled up with zeros, make the scores of a prefix the prefix of the scores exactly.
 
-    Parameters
-    ----------
-    rows : array of shape (N, K)
-    matrix : array of shape (K, M)
-
-    Returns
-    -------
-    array of shape (N, M)
+    From (N, K) and (K, M) to (N, M).
     """
     n = len(rows)
     blocks = np.zeros((-(-n // BLOCK), BLOCK, rows.shape[1]))

@@ -1,29 +1,26 @@
-"""Non-probabilistic recurrent networks as a detector plug-in."""
+"""Non-probabilistic recurrent networks as a detector plug-in.
+
+A network forecasts one value of each sensor instead of a distribution, and is trained on squared
+errors; the score is the mean absolute error of the ensemble's forecasts.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from oodd_eval import DetectorSpec, hookimpl
+from oodd_torch.parameters import NetworkParameters
 
-PARAMETERS: dict[str, Any] = {
-    "members": 5,
-    "updates": 600,
-    "batch": 16,
-    "chunk": 100,
-    "scheduled_sampling": 0.0,
-    "trunk": "shared",
-    "device": "cpu",
-}
+from oodd_eval import Detector, DetectorSpec, hookimpl
+from oodd_eval.plugins.parameters import checked
 
 
-def npn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Any:
-    """Return a `oodd_torch.ForecastDetector` of recurrent networks with squared error."""
+def npn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+    """Return an `oodd_torch.detector.NetworkDetector` of networks without quantiles."""
     # torch takes a second to import, and listing detectors should not.
-    from oodd_torch import ForecastDetector, Settings  # noqa: PLC0415
+    from oodd_torch.detector import NetworkDetector  # noqa: PLC0415
 
-    settings = Settings(**(PARAMETERS | parameters), quantiles=False, samples=1)
-    return ForecastDetector("npn", settings, seed=seed, horizon=horizon)
+    given = checked(NetworkParameters, "npn", parameters)
+    return NetworkDetector("npn", given, seed=seed, horizon=horizon, quantiles=False)
 
 
 @hookimpl
@@ -35,9 +32,9 @@ def oodd_detectors() -> list[DetectorSpec]:
             factory=npn,
             summary="recurrent networks without quantiles, one forecast each",
             reference="Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
-            parameters=dict(PARAMETERS),
+            parameters=NetworkParameters,
             requires=("torch", "safetensors"),
             extra="oodd-eval[reference]",
-            fit_ignores=("horizon", "device"),
+            horizon_decides_fit=False,
         )
     ]

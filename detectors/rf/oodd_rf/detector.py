@@ -1,33 +1,34 @@
-"""An ensemble of random forests whose prediction failure is the anomaly score."""
+"""An ensemble of random forests whose prediction failure is the anomaly score.
+
+The score of an observation is the mean absolute difference between it and the forests' forecasts,
+over forests and sensors, in training standard deviations of the sensor.
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_common.windows import StorableWindowDetector
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import NotFittedError, UsageError
 from oodd_eval.plugins.forecasting import FeatureScale
-from oodd_eval.plugins.state import load_state, save_state, take
+from oodd_eval.plugins.state import Arrays
+from oodd_rf import ForestParameters
 from oodd_rf.forest import Forest
-from oodd_rf.windows import Floats, Indices, Rows
-
-KIND: Final = "rf/1"
-"""What is saved, and the version of its layout."""
+from oodd_rf.windows import Floats, Rows
 
 BATCH: Final = 8192
 """Windows that are rolled out together: bounds the memory of scoring."""
 
-SETTINGS: Final = ((1 / 3, 2), (1 / 3, 1), (1 / 2, 2), (2 / 3, 3), (1 / 4, 1))
+MEMBERS: Final = ((1 / 3, 2), (1 / 3, 1), (1 / 2, 2), (2 / 3, 3), (1 / 4, 1))
 """``max_features`` and ``min_samples_leaf`` of the members, repeated after the last."""
 
 
-class RandomForestDetector:
+class RandomForestDetector(StorableWindowDetector):
     r"""Random forests that predict the next observation from a window of recent ones.
 
     .. math:: s_t = \frac{1}{e D} \sum_{i=1}^{e} \sum_{d=1}^{D}
@@ -40,153 +41,31 @@ class RandomForestDetector:
 
     A forest predicts the difference from the newest observation: averages of training rows cannot
     follow a sensor beyond them, and the error on held-out nominal trajectories is a third lower.
+    Members use windows of W, W - 1, ..., 1, W observations and so on. Whatever the horizon, they
+    learn one-step transitions, each from a random subset of its own.
 
     Parameters
     ----------
-    seed
-        Decides rows, bootstrap samples and features of every tree.
-    horizon
-        Steps between the last observation that a forecast uses and the one it predicts, h.
-    members
-        Forests, e. They differ in seed, training rows, window, ``max_features`` and
-        ``min_samples_leaf``.
-    window
-        Observations in the longest window, W; members use W, W - 1, ..., 1, W and so on.
-    trees
-        Trees in a forest.
-    leaves
-        Leaves of a tree, at most; together with `trees` this bounds the memory of a fitted
-        detector to about ``members * trees * 2 * leaves * (64 + 8 * D)`` bytes.
-    rows
-        Transitions that a forest is trained on, at most: a random subset of all.
-    draws
-        Size of the bootstrap sample of a tree, at most `rows`.
-
-    Raises
-    ------
-    UsageError
-        When a parameter is not an integer in its range.
+    name, seed, horizon
+        See `WindowDetector`. The seed decides rows, bootstrap samples and features of every tree.
+    parameters
+        `members`, `trees` and `leaves` bound the memory of a fitted detector to about
+        ``members * trees * 2 * leaves * (64 + 8 * D)`` bytes.
 
     Notes
     -----
     Source: Danesh & Fern (2021), section 3; Breiman, "Random forests", Machine Learning 45 (2001).
     """
 
-    def __init__(
-        self,
-        *,
-        seed: int = 0,
-        horizon: int = 1,
-        members: int = 5,
-        window: int = 4,
-        trees: int = 10,
-        leaves: int = 2000,
-        rows: int = 20_000,
-        draws: int = 6000,
-    ) -> None:
-        self.seed = _integer("seed", seed, 0)
-        self.horizon = _integer("horizon", horizon, 1)
-        self.members = _integer("members", members, 1)
-        self.window = _integer("window", window, 1)
-        self.trees = _integer("trees", trees, 1)
-        self.leaves = _integer("leaves", leaves, 2)
-        self.rows = _integer("rows", rows, 1)
-        self.draws = _integer("draws", draws, 1)
+    kind: ClassVar[str] = "rf/1"
+
+    def __init__(self, name: str, parameters: ForestParameters, *, seed: int, horizon: int) -> None:
+        super().__init__(name, seed=seed, horizon=horizon, window=parameters.window)
+        self.parameters = parameters
         self.members_: list[Forest] = []
-        self.scale_: FeatureScale
-        self.reset()
-
-    def fit(self, nominal: Sequence[Trajectory]) -> RandomForestDetector:
-        """Fit the forests to one-step transitions of nominal trajectories, whatever the horizon.
-
-        Raises
-        ------
-        TrajectoryError
-            When there is no transition, or the trajectories differ in their number of sensors.
-        """
-        self.scale_ = FeatureScale.fit(nominal)
-        stacked = Rows.stack(nominal, self.scale_)
-        self.members_ = [self._fit_member(stacked, i) for i in range(self.members)]
-        self.reset()
-        return self
-
-    def save(self, directory: Path) -> None:
-        """Write the forests into a directory, as plain arrays and JSON.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        """
-        self._check_fitted()
-        arrays = {"mean": self.scale_.mean, "std": self.scale_.std}
-        for i, member in enumerate(self.members_):
-            arrays |= {f"{i}.{name}": array for name, array in member.arrays().items()}
-        save_state(directory, kind=KIND, settings=self._settings, arrays=arrays)
-
-    def load(self, directory: Path) -> None:
-        """Take over forests that `save` wrote; the horizon may be another.
-
-        Raises
-        ------
-        FittedStateError
-            When the files are missing, damaged, or of other forests.
-        """
-        arrays = load_state(directory, kind=KIND, settings=self._settings)
-        mean = take(arrays, "mean", (None,))
-        self.scale_ = FeatureScale(mean, take(arrays, "std", mean.shape))
-        self.members_ = [
-            Forest.of(
-                {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"{i}.")},
-                self._window_of(i),
-                len(mean),
-            )
-            for i in range(self.members)
-        ]
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new live episode."""
-        self._latest: deque[NDArray[np.float32]] = deque(maxlen=self.window)
-        self._awaited: deque[Floats] = deque()
-
-    def update(
-        self,
-        observation: NDArray[np.float32],
-        action: NDArray[np.float32] | None = None,  # noqa: ARG002  the contract's name
-    ) -> float:
-        """Return the score of the next observation of a live episode, NaN for t < horizon.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        TrajectoryError
-            When the observation has another number of sensors, or a value that is not finite.
-        """
-        self._check_fitted()
-        row = self.scale_.row(observation)
-        score = float("nan")
-        if len(self._awaited) == self.horizon:
-            score = float(np.abs(row - self._awaited.popleft()).mean(axis=1).mean())
-        if not self._latest:
-            self._latest.extend([row] * self.window)
-        self._latest.appendleft(row)
-        history = np.stack(self._latest)[None]  # (1, W, D)
-        forecasts = [m.forecast(history[:, : m.window], self.horizon) for m in self.members_]
-        self._awaited.append(np.concatenate(forecasts))  # (e, D)
-        return score
 
     def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation, NaN for t < horizon.
-
-        Raises
-        ------
-        NotFittedError
-            Before `fit`.
-        TrajectoryError
-            When the trajectory has another number of sensors than those of `fit`.
-        """
+        """Return one score per observation, NaN for t < horizon."""
         return self.score_many([trajectory])[0]
 
     def score_many(self, trajectories: Sequence[Trajectory]) -> list[Floats]:
@@ -194,47 +73,42 @@ class RandomForestDetector:
 
         Every window is predicted on its own, so the scores are those of `score`, bit for bit.
         """
-        self._check_fitted()
+        scale = self._scale()
         if not trajectories:
             return []
-        stacked = Rows.stack(trajectories, self.scale_)
+        stacked = Rows.stack(trajectories, scale)
         scores = np.full(len(stacked.values), np.nan)
         defined = stacked.with_history(self.horizon)
         for start in range(0, len(defined), BATCH):
             batch = defined[start : start + BATCH]
-            scores[batch] = self._errors(stacked, batch)
+            history = stacked.window(batch - self.horizon, self.window)
+            scores[batch] = self._errors(history, stacked.values[batch])
         return np.split(scores, np.cumsum([len(x) for x in trajectories])[:-1])
 
-    def _check_fitted(self) -> None:
-        if not self.members_:
-            raise NotFittedError(
-                "detector 'rf' was asked for scores before fit: fit it on nominal trajectories"
-            )
-
-    @property
-    def _settings(self) -> dict[str, Any]:
-        return {"members": self.members, "window": self.window}
-
-    def _window_of(self, i: int) -> int:
-        return self.window - i % self.window
+    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
+        scale = FeatureScale.fit(nominal)
+        stacked = Rows.stack(nominal, scale)
+        self.members_ = [self._fit_member(stacked, i) for i in range(self.parameters.members)]
+        return scale
 
     def _fit_member(self, stacked: Rows, i: int) -> Forest:
         from sklearn.ensemble import RandomForestRegressor  # noqa: PLC0415  an optional extra
 
+        p = self.parameters
         rng = np.random.default_rng([self.seed, i])
         rows = stacked.with_history(1)
-        if len(rows) > self.rows:
-            rows = np.sort(rng.choice(rows, self.rows, replace=False))
+        if len(rows) > p.rows:
+            rows = np.sort(rng.choice(rows, p.rows, replace=False))
         window = self._window_of(i)
-        max_features, min_samples_leaf = SETTINGS[i % len(SETTINGS)]
+        max_features, min_samples_leaf = MEMBERS[i % len(MEMBERS)]
         history = stacked.window(rows - 1, window)  # (N, W, D)
         difference = stacked.values[rows].astype(np.float64) - history[:, 0]  # (N, D)
         forest = RandomForestRegressor(
-            n_estimators=self.trees,
+            n_estimators=p.trees,
             max_features=max_features,
             min_samples_leaf=min_samples_leaf,
-            max_leaf_nodes=self.leaves,
-            max_samples=min(self.draws, len(rows)),
+            max_leaf_nodes=p.leaves,
+            max_samples=min(p.draws, len(rows)),
             random_state=int(rng.integers(2**31)),
             n_jobs=1,
         )
@@ -243,20 +117,36 @@ class RandomForestDetector:
         forest.fit(history.reshape(len(rows), -1), target)
         return Forest([tree.tree_ for tree in forest.estimators_], window)
 
-    def _errors(self, stacked: Rows, batch: Indices) -> Floats:
-        """Return the mean absolute error of the members' forecasts of the rows of a batch."""
-        total = np.zeros(len(batch))
+    def _window_of(self, i: int) -> int:
+        return self.window - i % self.window
+
+    def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:  # noqa: ARG002
+        return float(self._errors(window[None], now[None])[0])
+
+    def _errors(self, history: NDArray[np.float32], now: NDArray[np.float32]) -> Floats:
+        """Return the mean absolute errors, (B,), of forecasts of (B, D) from (B, W, D)."""
+        total = np.zeros(len(now))
         for member in self.members_:
-            history = stacked.window(batch - self.horizon, member.window)
-            predicted = member.forecast(history, self.horizon)
-            total += np.abs(stacked.values[batch] - predicted).mean(axis=1)
+            predicted = member.forecast(history[:, : member.window], self.horizon)
+            total += np.abs(now - predicted).mean(axis=1)
         return total / len(self.members_)
 
+    def _saved_with(self) -> dict[str, Any]:
+        return {"members": self.parameters.members, "window": self.window}
 
-def _integer(name: str, value: object, least: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise UsageError(
-            f"parameter {name} of detector 'rf': expected an integer of at least {least}, "
-            f"got {value!r}"
-        )
-    return value
+    def _arrays(self) -> Arrays:
+        return {
+            f"{i}.{name}": array
+            for i, member in enumerate(self.members_)
+            for name, array in member.arrays().items()
+        }
+
+    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
+        self.members_ = [
+            Forest.of(
+                {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"{i}.")},
+                self._window_of(i),
+                sensors,
+            )
+            for i in range(self.parameters.members)
+        ]

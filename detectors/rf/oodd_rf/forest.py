@@ -1,4 +1,4 @@
-"""A fitted forest as plain arrays: what predicts, and what is saved."""
+"""A fitted forest, which predicts, and its trees as plain arrays, which are saved."""
 
 from __future__ import annotations
 
@@ -42,17 +42,7 @@ class Forest:
     def forecast(self, history: NDArray[np.float32], horizon: int) -> Floats:
         """Roll the forest out, each prediction being the newest observation of the next window.
 
-        Parameters
-        ----------
-        history : float32 array of shape (B, W, D)
-            Standardized observations, newest first.
-        horizon
-            Steps to predict ahead, h.
-
-        Returns
-        -------
-        float64 array of shape (B, D)
-            The observation h steps after the newest one.
+        From standardized observations (B, W, D), newest first, to those h steps after, (B, D).
         """
         predicted: Floats = history[:, 0].astype(np.float64)
         for _ in range(horizon):
@@ -78,14 +68,7 @@ class Forest:
 
     @classmethod
     def of(cls, arrays: Arrays, window: int, features: int) -> Forest:
-        """Put a forest together again; the inverse of `arrays`.
-
-        Parameters
-        ----------
-        arrays
-            By the names of `arrays`.
-        window, features
-            W and D.
+        """Put a forest of windows of W observations of D sensors together; inverse of `arrays`.
 
         Raises
         ------
@@ -102,47 +85,37 @@ class Forest:
         leaves = take(arrays, "leaves", (int(leaf.sum()), features))
         values = np.zeros((total, features, 1))
         values[leaf, :, 0] = leaves
-        trees, start = [], 0
         if not len(counts) or len(depths) != len(counts):
             raise FittedStateError(f"a saved forest has {len(counts)} trees, expected at least 1")
-        for count, depth in zip(counts.tolist(), depths.tolist(), strict=True):
-            part = slice(start, start + count)
-            trees.append(
-                _tree(
-                    left[part], right[part], feature[part], threshold[part], values[part],
-                    depth, window * features,
-                )
-            )  # fmt: skip
-            start += count
+        ends = np.cumsum(counts).tolist()
+        parts = [slice(end - count, end) for end, count in zip(ends, counts.tolist(), strict=True)]
+        nodes = {
+            "left_child": left, "right_child": right, "feature": feature, "threshold": threshold,
+        }  # fmt: skip
+        trees = [
+            _tree({n: a[p] for n, a in nodes.items()}, values[p], depth, window * features)
+            for p, depth in zip(parts, depths.tolist(), strict=True)
+        ]
         return cls(trees, window)
 
 
-def _tree(
-    left: NDArray[Any],
-    right: NDArray[Any],
-    feature: NDArray[Any],
-    threshold: NDArray[Any],
-    values: Floats,
-    depth: int,
-    inputs: int,
-) -> Tree:
+def _tree(nodes: Arrays, values: Floats, depth: int, inputs: int) -> Tree:
     """Return a tree of scikit-learn's from arrays whose every step leads to a later node."""
     # The class has no public name, and no other way in than the state that it gives out itself.
     from sklearn.tree._tree import Tree  # noqa: PLC0415  an optional extra
 
-    own, count = np.arange(len(left)), len(left)
-    leaf = left < 0
-    inner = ~leaf
+    left, right, feature = nodes["left_child"], nodes["right_child"], nodes["feature"]
+    own, count, leaf = np.arange(len(left)), len(left), left < 0
     follows = (left > own) & (right > own) & (left < count) & (right < count)
     splits = (feature >= 0) & (feature < inputs)
-    if not (follows & splits)[inner].all() or (right[leaf] >= 0).any() or not leaf[-1]:
+    if not (follows & splits)[~leaf].all() or (right[leaf] >= 0).any() or not leaf[-1]:
         raise FittedStateError(
             "a saved tree has children or sensors that do not exist: expected children after their "
             f"parent among {count} nodes, and inputs below {inputs}"
         )
     tree = Tree(inputs, np.ones(values.shape[1], np.intp), values.shape[1])
-    nodes = np.zeros(count, dtype=tree.__getstate__()["nodes"].dtype)
-    nodes["left_child"], nodes["right_child"] = left, right
-    nodes["feature"], nodes["threshold"] = feature, threshold
-    tree.__setstate__({"max_depth": depth, "node_count": count, "nodes": nodes, "values": values})
+    packed = np.zeros(count, dtype=tree.__getstate__()["nodes"].dtype)
+    for name, array in nodes.items():
+        packed[name] = array
+    tree.__setstate__({"max_depth": depth, "node_count": count, "nodes": packed, "values": values})
     return tree

@@ -1,4 +1,4 @@
-"""History windows of standardized observations, gathered from many trajectories at once."""
+"""Windows of standardized observations, gathered from many trajectories at once."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_common.windows import windows
 
 from oodd_eval import Trajectory
 from oodd_eval.plugins.forecasting import FeatureScale
@@ -43,27 +44,5 @@ class Rows:
         return rows[rows - self.first >= horizon]
 
     def window(self, last: Indices, length: int) -> NDArray[np.float32]:
-        """Return the windows that end in the given rows, newest first.
-
-        Before a trajectory begins, its first observation is repeated.
-
-        Parameters
-        ----------
-        last : int64 array of shape (B,)
-            Row number of the newest observation of each window.
-        length
-            Observations in a window, W.
-
-        Returns
-        -------
-        float32 array of shape (B, W, D)
-
-        Examples
-        --------
-        >>> rows = Rows(np.array([[0.0], [1.0], [2.0]], np.float32), np.array([0, 0, 0]))
-        >>> rows.window(np.array([0, 2]), 2)[..., 0].tolist()
-        [[0.0, 0.0], [2.0, 1.0]]
-        """
-        lags = last[:, None] - np.arange(length)
-        windows: NDArray[np.float32] = self.values[np.maximum(lags, self.first[last][:, None])]
-        return windows
+        """Return the windows that end in the rows of these numbers: (B, W, D), newest first."""
+        return windows(self.values, last, length, self.first[last])

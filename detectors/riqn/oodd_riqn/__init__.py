@@ -1,66 +1,76 @@
-"""Recurrent implicit quantile networks as detector plug-ins: riqn, riqn-ms and n-riqn."""
+"""Recurrent implicit quantile networks as detector plug-ins: riqn, riqn-ms and n-riqn.
+
+A network forecasts the distribution of each sensor's next value through its quantile function; the
+score is the mean absolute distance between an observation and samples of its forecasts.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from oodd_eval import DetectorSpec, hookimpl
+from oodd_torch.parameters import NetworkParameters
 
-REFERENCE = "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3"
-
-PARAMETERS: dict[str, Any] = {
-    "members": 5,
-    "samples": 8,
-    "updates": 600,
-    "batch": 16,
-    "chunk": 100,
-    "levels": 8,
-    "scheduled_sampling": 0.0,
-    "trunk": "shared",
-    "device": "cpu",
-}
+from oodd_eval import Detector, DetectorSpec, hookimpl
+from oodd_eval.plugins.parameters import checked, parameter
 
 
-def riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Any:
-    """Return a `oodd_torch.ForecastDetector` of recurrent quantile networks."""
-    # torch takes a second to import, and listing detectors should not.
-    from oodd_torch import ForecastDetector, Settings  # noqa: PLC0415
+@dataclass(frozen=True)
+class RiqnParameters(NetworkParameters):
+    """Parameters of `riqn` and `riqn-ms`."""
 
-    settings = Settings(**(PARAMETERS | parameters))
-    return ForecastDetector("riqn", settings, seed=seed, horizon=horizon)
+    samples: int = parameter(8, low=1, decides="scores", help="samples of each network, M")
+    levels: int = parameter(8, low=1, help="quantile levels of an update, one per equal part")
 
 
-def riqn_ms(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Any:
+@dataclass(frozen=True)
+class WindowRiqnParameters(RiqnParameters):
+    """Parameters of `n-riqn`."""
+
+    window: int = parameter(4, low=1, help="observations in the input, W")
+
+
+def riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+    """Return an `oodd_torch.detector.NetworkDetector` of recurrent quantile networks."""
+    return _make("riqn", checked(RiqnParameters, "riqn", parameters), seed, horizon)
+
+
+def riqn_ms(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return the same with mean sampling: rollouts are fed the mean of M samples."""
-    from oodd_torch import ForecastDetector, Settings  # noqa: PLC0415
-
-    settings = Settings(**(PARAMETERS | parameters), mean_sampling=True)
-    return ForecastDetector("riqn-ms", settings, seed=seed, horizon=horizon)
+    given = checked(RiqnParameters, "riqn-ms", parameters)
+    return _make("riqn-ms", given, seed, horizon, mean_sampling=True)
 
 
-def n_riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Any:
+def n_riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return the same without memory: a window of observations instead of the GRU."""
-    from oodd_torch import ForecastDetector, Settings  # noqa: PLC0415
+    given = checked(WindowRiqnParameters, "n-riqn", parameters)
+    return _make("n-riqn", given, seed, horizon, window=given.window, recurrent=False)
 
-    settings = Settings(**({"window": 4} | PARAMETERS | parameters), recurrent=False)
-    return ForecastDetector("n-riqn", settings, seed=seed, horizon=horizon)
+
+def _make(name: str, given: RiqnParameters, seed: int, horizon: int, **kind: Any) -> Detector:
+    # torch takes a second to import, and listing detectors should not.
+    from oodd_torch.detector import NetworkDetector  # noqa: PLC0415
+
+    return NetworkDetector(
+        name, given, seed=seed, horizon=horizon, samples=given.samples, levels=given.levels, **kind
+    )
 
 
 @hookimpl
 def oodd_detectors() -> list[DetectorSpec]:
     """Offer the three detectors of this package."""
     common: dict[str, Any] = {
-        "reference": REFERENCE,
+        "reference": "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
         "requires": ("torch", "safetensors"),
         "extra": "oodd-eval[reference]",
-        "fit_ignores": ("horizon", "samples", "device"),
+        "horizon_decides_fit": False,
     }
     return [
         DetectorSpec(
             name="riqn",
             factory=riqn,
             summary="recurrent implicit quantile networks, sampled forecasts",
-            parameters=dict(PARAMETERS),
+            parameters=RiqnParameters,
             fit_name="riqn",
             **common,
         ),
@@ -68,7 +78,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             name="riqn-ms",
             factory=riqn_ms,
             summary="RIQN whose rollouts feed back the mean of M samples",
-            parameters=dict(PARAMETERS),
+            parameters=RiqnParameters,
             fit_name="riqn",
             **common,
         ),
@@ -76,7 +86,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             name="n-riqn",
             factory=n_riqn,
             summary="RIQN without memory: a window instead of the GRU",
-            parameters={"window": 4} | PARAMETERS,
+            parameters=WindowRiqnParameters,
             **common,
         ),
     ]

@@ -1,0 +1,197 @@
+"""Windows of observations, and bases of detectors that judge an observation by one.
+
+A subclass says how it learns and how it scores. Its base checks seed and horizon, refuses to score
+before `fit`, keeps the latest observations of a live episode, and saves and loads the fit.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import NotFittedError
+from oodd_eval.plugins.contract import Scores
+from oodd_eval.plugins.forecasting import FeatureScale
+from oodd_eval.plugins.parameters import checked, parameter
+from oodd_eval.plugins.state import Arrays, load_state, save_state
+
+Row = NDArray[np.float32]
+
+
+def windows(
+    rows: NDArray[np.float32], last: NDArray[np.int64], length: int, first: ArrayLike = 0
+) -> NDArray[np.float32]:
+    """Return the windows that end in the given rows, newest first.
+
+    Before the beginning, the first observation is repeated. A window holds nothing after its end.
+
+    Parameters
+    ----------
+    rows : array of shape (N, D)
+        Observations in the order of time.
+    last : int64 array of shape (B,)
+        Row number of the newest observation of each window.
+    length
+        Observations in a window, W.
+    first : int64 array of shape (B,) or number
+        Row number of the first observation of the episode of each window.
+
+    Returns
+    -------
+    array of shape (B, W, D)
+
+    Examples
+    --------
+    >>> o = np.array([[0.0], [1.0], [2.0]], np.float32)
+    >>> windows(o, np.array([0, 2]), 2)[..., 0].tolist()
+    [[0.0, 0.0], [2.0, 1.0]]
+    """
+    lags = last[:, None] - np.arange(length)
+    taken: NDArray[np.float32] = rows[np.maximum(lags, np.reshape(first, (-1, 1)))]
+    return taken
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """Arguments that the harness gives to every factory."""
+
+    seed: int = parameter(0, low=0)
+    horizon: int = parameter(1, low=1)
+
+
+class WindowDetector(ABC):
+    """A detector that judges ``o_t`` by the observations ``o_{t-lag} .. o_{t-lag-window+1}``.
+
+    Before the beginning of an episode, its first observation is repeated. Scores are undefined
+    (NaN) for t < lag.
+
+    Parameters
+    ----------
+    name
+        Name for messages.
+    seed
+        Decides every random draw; at least 0.
+    horizon
+        Prediction horizon in steps, h; at least 1.
+    window
+        Observations that a judgement looks at, W.
+    lag
+        Steps from the newest of them to the observation that is judged; default the horizon.
+
+    Raises
+    ------
+    UsageError
+        When seed or horizon is no whole number or too small.
+    """
+
+    def __init__(
+        self, name: str, *, seed: int, horizon: int, window: int = 1, lag: int | None = None
+    ) -> None:
+        checked(_Given, name, {"seed": seed, "horizon": horizon})
+        self.name, self.seed, self.horizon = name, seed, horizon
+        self.window, self.lag = window, horizon if lag is None else lag
+        self.scale_: FeatureScale | None = None
+        self.reset()
+
+    def fit(self, nominal: Sequence[Trajectory]) -> Self:
+        """Learn from nominal trajectories, forgetting any earlier fit.
+
+        Raises `TrajectoryError` when they cannot be learned from: no transition, say.
+        """
+        self.scale_ = None
+        self.scale_ = self._learn(nominal)
+        self.reset()
+        return self
+
+    @abstractmethod
+    def score(self, trajectory: Trajectory) -> Scores:
+        """Return one score per observation.
+
+        Raises `NotFittedError` before `fit`, and `TrajectoryError` when the trajectory has another
+        number of sensors than those of `fit`.
+        """
+
+    def reset(self) -> None:
+        """Begin a new live episode."""
+        self._rows: deque[NDArray[Any]] = deque(maxlen=self.window + self.lag)
+        self._now = 0
+
+    def update(self, observation: Row, action: Row | None = None) -> float:  # noqa: ARG002
+        """Return the score of the next observation of a live episode, NaN for t < lag.
+
+        Raises as `score` does, and `TrajectoryError` for values that are not finite.
+        """
+        row = self._row(observation)
+        if not self._rows:
+            self._rows.extend([row] * (self.window + self.lag))
+        self._rows.appendleft(row)
+        t, self._now = self._now, self._now + 1
+        if t < self.lag:
+            return float("nan")
+        return self._judge(np.stack(list(self._rows)[self.lag :]), row, t)
+
+    def _row(self, observation: Row) -> NDArray[Any]:
+        """Return an observation as windows hold it: standardized."""
+        return self._scale().row(observation)
+
+    def _scale(self) -> FeatureScale:
+        """Return the scale of the fit, or raise `NotFittedError`."""
+        if self.scale_ is None:
+            raise NotFittedError(
+                f"detector {self.name!r} was asked for scores before fit: fit it on nominal "
+                "trajectories"
+            )
+        return self.scale_
+
+    @abstractmethod
+    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
+        """Learn everything; return the scale of the sensors."""
+
+    @abstractmethod
+    def _judge(self, window: NDArray[Any], now: NDArray[Any], t: int) -> float:
+        """Return the score of the observation of time t, (D,), by the window (W, D) before it."""
+
+
+class StorableWindowDetector(WindowDetector):
+    """A `WindowDetector` whose fit can be saved as plain files."""
+
+    kind: ClassVar[str]
+    """Name of the saved state, with the version of its layout: ``"rf/1"``."""
+
+    def save(self, directory: Path) -> None:
+        """Write the fit into a directory, as plain arrays and JSON."""
+        arrays = {**self._scale().arrays(), **self._arrays()}
+        save_state(directory, kind=self.kind, settings=self._saved_with(), arrays=arrays)
+
+    def load(self, directory: Path) -> None:
+        """Take over a fit that `save` wrote.
+
+        Raises `FittedStateError` when the files are missing or damaged, or of a detector with other
+        parameters.
+        """
+        arrays = load_state(directory, kind=self.kind, settings=self._saved_with())
+        scale = FeatureScale.of(arrays)
+        self.scale_ = None
+        self._restore(arrays, len(scale.mean), directory)
+        self.scale_ = scale
+        self.reset()
+
+    @abstractmethod
+    def _saved_with(self) -> dict[str, Any]:
+        """Return the parameters that a detector must share with a fit to load it; JSON values."""
+
+    @abstractmethod
+    def _arrays(self) -> Arrays:
+        """Return the fit as arrays of numbers, by name; the scale is not among them."""
+
+    @abstractmethod
+    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:
+        """Take over the fit from the arrays that `save` wrote into the directory."""

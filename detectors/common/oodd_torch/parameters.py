@@ -1,0 +1,29 @@
+"""Parameters that all detectors of trained networks share."""
+
+from dataclasses import dataclass
+
+from oodd_eval.plugins.parameters import parameter
+
+
+@dataclass(frozen=True)
+class NetworkParameters:
+    """Parameters of every detector of this family; subclasses add their own."""
+
+    members: int = parameter(5, low=1, help="networks in the ensemble, e")
+    updates: int = parameter(600, low=1, help="gradient steps of each member, at most")
+    batch: int = parameter(16, low=1, help="episodes in a batch")
+    chunk: int = parameter(100, low=1, help="steps through which gradients flow")
+    scheduled_sampling: float = parameter(
+        0.0, low=0, high=1, help="share of inputs that are own samples at the end of training"
+    )
+    trunk: str = parameter(
+        "shared",
+        choices=("shared", "per-feature"),
+        help="one network with a head per sensor, or a network per sensor, D times as dear",
+    )
+    device: str = parameter(
+        "cpu",
+        choices=("auto", "cpu", "cuda"),
+        decides="nothing",
+        help="where torch computes; auto: cuda where there is one",
+    )
