@@ -3,7 +3,7 @@
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES
-from oodd_eval.metrics.auc import METRICS
+from oodd_eval.metrics.catalogue import RATIOS
 from oodd_eval.results.record import Metric, Record
 
 
@@ -14,7 +14,7 @@ def make_record(
     """One record; `values` gives numerators per metric over two trajectories (default 0.5)."""
     plugin = plugin or ("trivial" if detector in ("clock", "persistence", "random") else detector)
     given = values or {}
-    numbers = {name: list(given.get(name, [0.5, 0.5])) for name in METRICS}
+    numbers = {name: list(given.get(name, [0.5, 0.5])) for name in RATIOS}
     per_trajectory = {
         name: ([0.0 if v is None else float(v) for v in column],
                [0.0 if v is None else 1.0 for v in column])
@@ -27,17 +27,14 @@ def make_record(
             float(np.mean(defined)) if defined else float("nan"), n=len(defined)
         )  # fmt: skip
     ok = status == "ok"
-    settings = ",".join(f"{k}={v}" for k, v in {"h": horizon, "seed": seed, **(overrides or {})}
-                        .items())  # fmt: skip
     return Record(
-        cell=f"mini/{environment}/{anomaly}::{detector}[{settings}]",
         detector=detector, detector_version="1.0", plugin=f"oodd-eval:{plugin}",
         parameters=overrides or {}, environment=environment, anomaly=anomaly,
         group=ANOMALIES[anomaly].group, horizon=horizon, seed=seed, split="mini",
         split_digest=digest, status=status, protocol=1, reason=reason,
         metrics=metrics if ok else {}, counts={"test": 2},
         per_trajectory=per_trajectory if ok else {},
-        provenance={"limit": limit, "overrides": overrides or {}},
+        limit=limit, overrides=overrides or {},
     )  # fmt: skip
 
 

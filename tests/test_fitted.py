@@ -1,7 +1,6 @@
 """Fitted detectors are kept by content key: scoring again never fits again."""
 
 import json
-import threading
 
 import pytest
 from helpers_plugins import install
@@ -9,21 +8,30 @@ from helpers_plugins import install
 from oodd_eval.data.split import load_split
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.supervisor import Limits
-from oodd_eval.results.directory import ResultsDirectory, fit_key
-from oodd_eval.results.fits import FittedStore
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import Settings, run
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.fits import FitStore
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.runner import run
 
 PLUGIN = """
 import json, os
 from pathlib import Path
 import numpy as np
+from dataclasses import dataclass
 from oodd_eval import DetectorSpec, hookimpl
+from oodd_eval.plugins.parameters import parameter
+
+@dataclass(frozen=True)
+class Parameters:
+    scale: float = parameter(1.0)
+    factor: float = parameter(1.0, decides="scores")
+    device: str = parameter("cpu", decides="nothing")
 
 LOG = Path({log!r})
 
 class Mean:
-    def __init__(self, seed=0, horizon=1, scale=1.0, factor=1.0):
+    def __init__(self, seed=0, horizon=1, scale=1.0, factor=1.0, device="cpu"):
         self.horizon, self.factor = horizon, factor
 
     def fit(self, nominal):
@@ -53,8 +61,7 @@ class Forgets(Mean):
 
 @hookimpl
 def oodd_detectors():
-    known = {{"scale": 1.0, "factor": 1.0}}
-    common = dict(parameters=known, fit_ignores=("horizon", "factor"))
+    common = dict(parameters=Parameters, horizon_decides_fit=False)
     return [
         DetectorSpec("mean", Mean, "mean", **common),
         DetectorSpec("mean-too", Mean, "same fit", fit_name="mean", **common),
@@ -83,7 +90,7 @@ def go(directory, out, detectors=("mean",), *, fresh=False, jobs=1, **settings):
         discover(), split=split.name, split_digest=split.digest, detectors=detectors,
         environments=split.environments[:1], **settings,
     )  # fmt: skip
-    made = Settings(jobs=jobs, limits=Limits(60, None), fresh=fresh)
+    made = RunSettings(jobs=jobs, limits=Limits(60, None), fresh=fresh)
     return plan, run(plan, split, discover(), made, ResultsDirectory(out))
 
 
@@ -139,7 +146,7 @@ def test_fresh_fits_once_what_the_units_of_a_run_share(tiny_split, log, tmp_path
 @pytest.mark.parametrize("damage", ["bytes", "index", "gone"])
 def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path, damage):
     plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
-    key = fit_key(plan, plan.units[0], discover().offer("mean"))
+    key = plan.units[0].fit_key
     place = tmp_path / "out" / "fitted" / key
     match damage:
         case "bytes":
@@ -176,39 +183,21 @@ def test_a_fit_of_the_same_run_that_cannot_be_loaded_is_made_again(tiny_split, l
 
 def test_the_key_tells_nothing_of_the_environment(tiny_split, log, tmp_path):
     plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
-    key = fit_key(plan, plan.units[0], discover().offer("mean"))
+    key = plan.units[0].fit_key
     assert not any(c not in "0123456789abcdef" for c in key)
 
 
 def test_a_store_keeps_whole_directories_only(tmp_path):
-    store = FittedStore(tmp_path / "fitted")
+    store = FitStore(tmp_path / "fitted")
     assert store.find("k") is None
-    with store.room() as room:
+    with store.filling() as room:
         (room / "a").write_text("1")
         store.keep("k", room, 2.5)
     found = store.find("k")
     assert found is not None
     assert found.seconds_fit == 2.5
     assert json.loads((found.path / "fitted.json").read_text())["files"].keys() == {"a"}
-    with store.room() as room:
+    with store.filling() as room:
         store.keep("empty", room, 1.0)
     assert store.find("empty") is None
     assert [p.name for p in store.path.iterdir()] == ["k"]
-
-
-def test_one_thread_at_a_time_fits_for_a_key(tmp_path):
-    store, inside, most = FittedStore(tmp_path), [0], [0]
-
-    def work():
-        with store.alone("k"):
-            inside[0] += 1
-            most[0] = max(most[0], inside[0])
-            threading.Event().wait(0.01)
-            inside[0] -= 1
-
-    threads = [threading.Thread(target=work) for _ in range(5)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most == [1]

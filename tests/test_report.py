@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.cli.terminal import TerminalReporter, summary
-from oodd_eval.metrics.bootstrap import bootstrap_weights, mean_interval
+from oodd_eval.metrics.bootstrap import percentiles, samples
+from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results.record import Metric
-from oodd_eval.results.tables import markdown, tables
+from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import Board, boards, contribution
-from oodd_eval.results.tables.tables import Table
+from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables.rendering import report
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -29,7 +31,7 @@ GOLDEN = Path(__file__).parent / "golden"
     ],
 )
 def test_markdown_is_the_golden_file(name, records, intervals):
-    text = markdown.render(records, intervals=intervals)
+    text = report(records, intervals=intervals)
     file = GOLDEN / f"{name}.md"
     if "OODD_EVAL_WRITE_GOLDEN" in os.environ:
         file.write_text(text, encoding="utf-8")
@@ -37,7 +39,7 @@ def test_markdown_is_the_golden_file(name, records, intervals):
 
 
 def test_no_records_are_said_so():
-    assert "No records" in markdown.render([])
+    assert "No records" in report([])
 
 
 def cells(table, row):
@@ -45,7 +47,7 @@ def cells(table, row):
 
 
 def test_ranking_is_by_mean_matched_auc_with_failures_last():
-    ranked = tables.ranking(Board(example()))
+    ranked = layout.by_environment(Board(example()))
     assert [row[0] for row in ranked.rows] == ["riqn", "persistence", "clock", "rf"]
     # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
     assert cells(ranked, 0) == {
@@ -58,7 +60,7 @@ def test_ranking_is_by_mean_matched_auc_with_failures_last():
 
 
 def test_table_five_has_the_papers_layout():
-    table = tables.anomaly_groups(Board(example()), 1)
+    table = layout.anomaly_groups(Board(example()), 1)
     detectors = ["riqn", "rf", "persistence", "clock", "AVG"]
     assert table.header == [
         "Environment", "Result",
@@ -71,16 +73,30 @@ def test_table_five_has_the_papers_layout():
 
 
 def test_average_is_over_detectors_without_trivial_rows():
-    row = cells(tables.anomaly_groups(Board(example()), 1), 3)
+    row = cells(layout.anomaly_groups(Board(example()), 1), 3)
     # Hopper, sensor, AUC: riqn 90, rf 80; persistence and clock do not count.
     assert row["sensor: AVG"] == "85.0"
-    row = cells(tables.anomaly_groups(Board(example()), 1), 0)
+    row = cells(layout.anomaly_groups(Board(example()), 1), 0)
     assert row["sensor: rf"] == "timeout"
     assert row["sensor: AVG"] == "90.0*"
 
 
+def test_a_table_says_which_rows_its_average_leaves_out():
+    board = Board(example())
+    note = layout.anomaly_groups(board, 1).note
+    assert note == "AVG is the mean without the trivial rows: persistence, clock."
+    only = Board([r for r in example() if r.detector in ("riqn", "rf")])
+    assert not layout.anomaly_groups(only, 1).note
+    trivial = Board([r for r in example() if r.detector == "clock"])
+    assert not layout.anomaly_groups(trivial, 1).note
+    one = reporter()
+    one.tables(example())
+    assert printed(one).count(note) == 2
+    assert report(example()).count(note) == 1
+
+
 def test_delay_is_over_trajectories_with_an_alarm():
-    assert cells(tables.anomaly_groups(Board(example()), 1), 4)["dynamics: riqn"] == "4.0"
+    assert cells(layout.anomaly_groups(Board(example()), 1), 4)["dynamics: riqn"] == "4.0"
 
 
 def test_undefined_is_a_dash_and_not_run_is_empty():
@@ -89,7 +105,7 @@ def test_undefined_is_a_dash_and_not_run_is_empty():
         make_record("riqn", values=values),
         make_record("rf", anomaly="gravity"),
     ])  # fmt: skip
-    row = cells(tables.anomaly_groups(board, 1), 1)
+    row = cells(layout.anomaly_groups(board, 1), 1)
     assert row["sensor: riqn"] == "\N{EN DASH}"
     assert row["sensor: rf"] == ""
 
@@ -98,7 +114,10 @@ def test_a_mean_over_fewer_cells_is_marked():
     board = Board([
         make_record("riqn"), make_record("riqn", anomaly="drift"), make_record("rf"),
     ])  # fmt: skip
-    assert {row[0]: row[1] for row in tables.ranking(board).rows} == {"riqn": "50.0", "rf": "50.0*"}
+    assert {row[0]: row[1] for row in layout.by_environment(board).rows} == {
+        "riqn": "50.0",
+        "rf": "50.0*",
+    }
 
 
 def test_seeds_are_averaged_into_one_row():
@@ -106,7 +125,7 @@ def test_seeds_are_averaged_into_one_row():
         make_record(seed=0, values={"auc_matched": [0.4, 0.4]}),
         make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
     ])  # fmt: skip
-    assert [row[:2] for row in tables.ranking(board).rows] == [["riqn", "60.0"]]
+    assert [row[:2] for row in layout.by_environment(board).rows] == [["riqn", "60.0"]]
     # Trajectories agree within each seed, so that the interval is the seeds' alone.
     value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
     assert (value.low, value.high) == (0.4, 0.8)
@@ -120,8 +139,9 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     board = Board(records)
     value = board.mean(board.entries[0], ["hopper"], ["iid", "drift"], "auc_matched",
                        intervals=True)  # fmt: skip
-    weights = bootstrap_weights(2, key="hopper")
-    expected = mean_interval([contribution(r, "auc_matched") for r in records], [weights, weights])
+    expected = percentiles(
+        samples([("hopper", 0, contribution(r, "auc_matched")) for r in records])
+    )
     assert (value.low, value.high) == pytest.approx(expected)
     assert value.value == pytest.approx((0.5 + 0.4) / 2)
 
@@ -130,9 +150,9 @@ def test_settings_and_horizons_are_rows_of_their_own():
     board = Board([
         make_record(), make_record(horizon=10), make_record(overrides={"members": 1}),
     ])  # fmt: skip
-    assert [e.label for e in board.entries] == ["riqn", "riqn[h=10]", "riqn[members=1]"]
+    assert [str(e) for e in board.entries] == ["riqn", "riqn[h=10]", "riqn[members=1]"]
     assert board.horizons == [1, 10]
-    assert tables.anomaly_groups(board, 10).header[2:] == ["riqn", "AVG"]
+    assert layout.anomaly_groups(board, 10).header[2:] == ["riqn", "AVG"]
 
 
 def test_no_table_mixes_digests_protocols_or_limits():
@@ -141,7 +161,7 @@ def test_no_table_mixes_digests_protocols_or_limits():
 
 
 def test_a_simple_row_that_wins_is_named():
-    assert tables.findings(Board(example())) == [
+    assert layout.findings(Board(example())) == [
         "rf beats riqn in mean matched AUC: 72.5 against 67.5 over 2 cells."
     ]
 
@@ -151,7 +171,7 @@ def test_persistence_that_wins_is_named_for_both_metrics():
         make_record("riqn", values={"auc": [0.5, 0.5], "auc_matched": [0.5, 0.5]}),
         make_record("persistence", values={"auc": [0.6, 0.6], "auc_matched": [0.7, 0.7]}),
     ])  # fmt: skip
-    assert tables.findings(board) == [
+    assert layout.findings(board) == [
         "persistence beats riqn in mean matched AUC: 70.0 against 50.0 over 1 cell.",
         "persistence beats riqn in mean AUC: 60.0 against 50.0 over 1 cell.",
     ]
@@ -162,7 +182,7 @@ def test_the_clocks_auc_is_no_finding():
         make_record("riqn", values={"auc": [0.5, 0.5]}),
         make_record("clock", values={"auc": [1.0, 1.0]}),
     ])  # fmt: skip
-    assert tables.findings(board) == []
+    assert layout.findings(board) == []
 
 
 def test_comparison_is_over_common_cells_only():
@@ -171,11 +191,11 @@ def test_comparison_is_over_common_cells_only():
         make_record("riqn", anomaly="drift", values={"auc_matched": [0.1, 0.1]}),
         make_record("persistence", values={"auc_matched": [0.5, 0.5]}),
     ])  # fmt: skip
-    assert tables.findings(board) == []
+    assert layout.findings(board) == []
 
 
 def test_notes_name_split_digest_protocol_and_what_is_missing():
-    notes = " ".join(tables.notes(Board([make_record(limit=3)])))
+    notes = " ".join(layout.notes(Board([make_record(limit=3)])))
     assert "Split mini, digest abababababab, protocol 1, test seeds per environment: 2." in notes
     assert "first 3 trajectories" in notes
     assert "Means over sensor anomalies are without calibration, drift, shutdown." in notes
@@ -184,8 +204,7 @@ def test_notes_name_split_digest_protocol_and_what_is_missing():
 @given(st.text(max_size=60))
 def test_no_text_breaks_a_markdown_table(text):
     record = make_record(status="error", reason=text)
-    report = markdown.render([record])
-    (section,) = [s for s in report.split("### ") if s.startswith("Failures")]
+    (section,) = [s for s in report([record]).split("### ") if s.startswith("Failures")]
     rows = [line for line in section.splitlines() if line.startswith("|")]
     assert len(rows) == 3
     unescaped = rows[2].replace("\\\\", "").replace("\\|", "")
@@ -197,10 +216,11 @@ def test_pooled_metrics_are_a_table_of_their_own_and_no_part_of_a_report():
     one, two = make_record("riqn", anomaly="iid"), make_record("riqn", anomaly="drift")
     for record, value in ((one, 0.25), (two, 0.5)):
         record.metrics.update(auc_pooled=Metric(value), fpr95=Metric(float("nan")))
-    table = tables.pooled(Board([one, two]))
-    assert table.header == ["detector", "pooled AUC", "AP", "FPR95"]
-    assert table.rows == [["riqn", "37.5", tables.UNDEFINED, tables.UNDEFINED]]
-    assert "pooled" not in markdown.render([one, two])
+    table = layout.pooled(Board([one, two]))
+    assert table.header == ["detector", "pooled AUC", "FPR95"]
+    assert table.rows == [["riqn", "37.5", UNDEFINED]]
+    assert layout.pooled(Board(example())) is None
+    assert "pooled" not in report([one, two])
 
 
 def test_a_transposed_table_exchanges_rows_and_columns():

@@ -1,27 +1,29 @@
-"""The file ``curves.json``: how it is laid out, written, and read with every field checked.
+"""The file ``curves.json``: made from stored scores, written, and read with every field checked.
 
-::
-
-    {"schema": 1, "units": [{
-        "cell", "detector", "horizon", "seed", "overrides", "environment", "anomaly",
-        "roc": {"fpr", "tpr"},
-        "delay_far": {"threshold", "far", "delay_censored", "missed", "null_censored"},
-        "example": {"index", "auc_matched", "onset", "length", "start",
-                    "scores", "twin", "cusum", "twin_cusum", "alarms", "twin_alarms"}}, ...]}
-
-What the fields mean is said where they are computed, in `oodd_eval.results.curves`.
+`_layout` has its fields; `oodd_eval.metrics.curves` computes them and says what they mean.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
-from oodd_eval.data import files as stored_files
+from oodd_eval.data import files
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData
+from oodd_eval.data.split import Split
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.auc import AlarmRule
+from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.evaluate import stored_scores
+from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1
 """Version of the layout; a reader refuses others."""
@@ -30,50 +32,64 @@ LONGEST: Final = 1000
 """Most numbers in any list: a file has to stay small enough to be embedded in a page."""
 
 LARGEST: Final = 1e15
-"""No number is larger; NaN is not in any range."""
+"""No number is larger."""
 
-UNIT: Final[Mapping[str, type]] = {
-    **dict.fromkeys(("cell", "detector", "environment", "anomaly"), str),
-    **dict.fromkeys(("horizon", "seed"), int),
-    **dict.fromkeys(("overrides", "roc", "delay_far", "example"), dict),
-}
-"""Fields of a cell's curves and their types."""
 
-ROC: Final = ("fpr", "tpr")
-DELAY_FAR: Final = ("threshold", "far", "delay_censored", "missed", "null_censored")
-NUMBERS: Final = ("index", "onset", "length", "start")
-SERIES: Final = ("scores", "twin", "cusum", "twin_cusum")
-ALARMS: Final = {"alarms": "cusum", "twin_alarms": "twin_cusum"}
+def make_curves(
+    records: Iterable[Record], results: ResultsDirectory, split: Split
+) -> dict[str, Any]:
+    """Compute the content of ``curves.json`` from the stored scores of all evaluated cells.
+
+    ResultsError: the split is not the one that the records are of, or scores are missing.
+    """
+    units = []
+    data: dict[str, EnvironmentData] = {}
+    fitted: dict[str, tuple[Sweep, AlarmRule]] = {}
+    with ExitStack() as stack:
+        for record in records:
+            if not record.ok:
+                continue
+            if record.split_digest != split.digest:
+                raise ResultsError(
+                    f"{record.cell} is of a split with digest {record.split_digest[:12]}, but "
+                    f"split {split.name!r} here has {split.digest[:12]}: curves need the split "
+                    "that the scores are of"
+                )
+            if record.environment not in data:
+                data[record.environment] = split.environment(record.environment)
+                stack.callback(data[record.environment].close)
+            environment = data[record.environment]
+            scores = stored_scores([record], results, environment).parts
+            if record.scores not in fitted:
+                rule = AlarmRule(Standardization.fit(scores[CALIBRATION]))
+                at = thresholds(scores[TWINS], rule)
+                fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
+            sweep, rule = fitted[record.scores]
+            anomalous = scores[f"test/{record.anomaly}"]
+            onsets = environment.anomalous(record.anomaly).onsets[: len(anomalous)].tolist()
+            curves = cell_curves(sweep, rule, anomalous, onsets)
+            units.append({"cell": str(record.cell), **identity(record), **curves})
+    return {"schema": SCHEMA, "units": units}
+
+
+def identity(record: Record) -> dict[str, Any]:
+    """Return the fields of a cell's curves that its record has, too."""
+    names = ("detector", "horizon", "seed", "overrides", "environment", "anomaly")
+    return {name: getattr(record, name) for name in names}
 
 
 def write_curves(curves: Mapping[str, Any], path: Path) -> None:
-    """Write curves as JSON without spaces, one cell a line.
-
-    Raises
-    ------
-    OutputError
-        When the file cannot be written.
-    """
-    lines = ",\n".join(
-        json.dumps(unit, separators=(",", ":"), allow_nan=False) for unit in curves["units"]
-    )
-    try:
-        path.write_text(f'{{"schema":{SCHEMA},"units":[\n{lines}\n]}}\n', encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{str(path)!r} cannot be written: {error}") from None
+    """Write curves as JSON without spaces, one cell a line."""
+    units = [json.dumps(u, separators=(",", ":"), allow_nan=False) for u in curves["units"]]
+    lines = ",\n".join(units)
+    files.write_text(path, f'{{"schema":{SCHEMA},"units":[\n{lines}\n]}}\n')
 
 
 def read_curves(path: Path | str) -> dict[str, Any]:
-    """Read ``curves.json`` and check every field: types, lengths, ranges, finite numbers.
-
-    Raises
-    ------
-    ResultsError
-        Naming the field that is not as the layout has it.
-    """
+    """Read ``curves.json``; ResultsError names the field that is not as the layout has it."""
     path = Path(path)
     try:
-        plain = json.loads(stored_files.read_text(path))
+        plain = json.loads(files.read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
     return check_curves(plain, path.name)
@@ -81,103 +97,101 @@ def read_curves(path: Path | str) -> dict[str, Any]:
 
 def check_curves(plain: Any, where: str) -> dict[str, Any]:
     """Return a JSON value if it is the content of ``curves.json``; see `read_curves`."""
-    whole = _fields(plain, {"schema": int, "units": list}, where)
-    if whole["schema"] != SCHEMA:
-        raise ResultsError(
-            f"{where}: schema is {whole['schema']}, expected {SCHEMA}: it was written by another "
-            "version of oodd-eval"
+    from pydantic import ValidationError  # noqa: PLC0415  only where curves are read
+
+    try:
+        _layout().validate_python(plain)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        # A field that does not belong there may have any name.
+        place = "".join(
+            f"[{p}]" if isinstance(p, int) else f".{ascii(p)[1:-1]:.60}" for p in first["loc"]
         )
+        raise _wrong(f"{where}: {place.removeprefix('.')}", first["input"], first["msg"]) from None
+    whole: dict[str, Any] = plain
+    if whole["schema"] != SCHEMA:
+        problem = f"expected {SCHEMA}: it was written by another version of oodd-eval"
+        raise _wrong(f"{where}: schema", whole["schema"], problem)
     seen: set[str] = set()
-    for i, item in enumerate(whole["units"]):
+    for i, unit in enumerate(whole["units"]):
         name = f"{where}: units[{i}]"
-        unit = _fields(item, UNIT, name)
-        for field, known in (("environment", ENVIRONMENTS), ("anomaly", ANOMALIES)):
-            if unit[field] not in known:
-                raise _wrong(f"{name}.{field}", unit[field], f"one of {', '.join(known)}")
         if unit["cell"] in seen:
-            raise _wrong(f"{name}.cell", unit["cell"], "a cell that did not occur before")
+            raise _wrong(f"{name}.cell", unit["cell"], "a cell that occurs before")
         seen.add(unit["cell"])
-        _check_lists(unit["roc"], ROC, f"{name}.roc", rates=set(ROC))
-        _check_lists(unit["delay_far"], DELAY_FAR, f"{name}.delay_far", rates={"far", "missed"})
+        for part in ("roc", "delay_far"):
+            _check_points(unit[part], f"{name}.{part}")
         _check_example(unit["example"], f"{name}.example")
     return whole
 
 
-def _check_lists(value: Any, names: tuple[str, ...], where: str, *, rates: set[str]) -> None:
-    """Equally long lists of non-negative numbers, the first of them ascending."""
-    lists = _fields(value, dict.fromkeys(names, list), where)
-    first = lists[names[0]]
-    for name, numbers in lists.items():
-        _check_length(numbers, len(first), f"{where}.{name}")
-        for i, number in enumerate(numbers):
-            _check_number(number, f"{where}.{name}[{i}]", 0.0, 1.0 if name in rates else LARGEST)
-    for i in range(1, len(first)):
-        if first[i] < first[i - 1]:
-            raise _wrong(f"{where}.{names[0]}[{i}]", first[i], f"at least {first[i - 1]}")
+@functools.cache
+def _layout() -> Any:
+    """Return the reader of the layout: fields, types and ranges of single values."""
+    from pydantic import ConfigDict, Field, TypeAdapter, conlist, create_model  # noqa: PLC0415
+
+    strict = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    def part(**types: Any) -> Any:
+        fields: dict[str, Any] = {name: (kind, ...) for name, kind in types.items()}
+        return create_model("Part", __config__=strict, **fields)
+
+    def numbers(item: Any) -> Any:
+        return conlist(item, max_length=LONGEST)
+
+    row = Annotated[int, Field(ge=0, le=10**9)]
+    rate = Annotated[float, Field(ge=0, le=1)]
+    rates = numbers(rate)
+    amounts = numbers(Annotated[float, Field(ge=0, le=LARGEST)])
+    scores = numbers(Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None)
+    # fmt: off
+    unit = part(
+        cell=str, detector=str, horizon=int, seed=int, overrides=dict[str, Any],
+        environment=Literal[*ENVIRONMENTS], anomaly=Literal[*ANOMALIES],
+        roc=part(fpr=rates, tpr=rates),
+        delay_far=part(threshold=amounts, far=rates, delay_censored=amounts, missed=rates,
+            null_censored=amounts),
+        example=part(index=row, auc_matched=rate | None, onset=row, length=row, start=row,
+            scores=scores, twin=scores, cusum=amounts, twin_cusum=amounts,
+            alarms=numbers(row), twin_alarms=numbers(row)),
+    )
+    # fmt: on
+    # `schema` is a name that pydantic's models have taken.
+    version = Annotated[int, Field(alias="schema")]
+    return TypeAdapter(part(version=version, units=conlist(unit)))
 
 
-def _check_example(value: Any, where: str) -> None:
-    kinds: dict[str, type] = {
-        **dict.fromkeys(NUMBERS, int),
-        "auc_matched": object,
-        **dict.fromkeys((*SERIES, *ALARMS), list),
-    }
-    example = _fields(value, kinds, where)
-    for name in NUMBERS:
-        _check_number(example[name], f"{where}.{name}", 0.0, 1e9)
-    if example["auc_matched"] is not None:
-        _check_number(example["auc_matched"], f"{where}.auc_matched", 0.0, 1.0)
-    start, onset = example["start"], example["onset"]
-    if onset >= example["length"]:
-        raise _wrong(f"{where}.onset", onset, f"less than length, {example['length']}")
+def _check_points(lists: Mapping[str, Sequence[float]], where: str) -> None:
+    """Check that the lists are equally long and that the first does not fall."""
+    (first_name, first), *others = lists.items()
+    for name, values in others:
+        _check_length(values, first, f"{where}.{name}")
+    for i, (before, value) in enumerate(itertools.pairwise(first), start=1):
+        if value < before:
+            raise _wrong(f"{where}.{first_name}[{i}]", value, f"below {before} before it")
+
+
+def _check_example(example: Mapping[str, Any], where: str) -> None:
+    start, onset, length = example["start"], example["onset"], example["length"]
+    if onset >= length:
+        raise _wrong(f"{where}.onset", onset, f"expected less than length, {length}")
     if start > onset:
-        raise _wrong(f"{where}.start", start, f"at most onset, {onset}")
-    for statistic, scores in (("cusum", "scores"), ("twin_cusum", "twin")):
-        _check_length(example[scores], len(example[statistic]), f"{where}.{scores}")
-        for name, low in ((statistic, 0.0), (scores, -LARGEST)):
-            for i, number in enumerate(example[name]):
-                # A score may be undefined, a statistic is not.
-                if number is not None or name == statistic:
-                    _check_number(number, f"{where}.{name}[{i}]", low, LARGEST)
-    if len(example["scores"]) > example["length"] - start:
-        raise _wrong(
-            f"{where}.scores", f"{len(example['scores'])} numbers",
-            f"at most length - start, {example['length'] - start}",
-        )  # fmt: skip
-    for alarms, statistic in ALARMS.items():
-        stop = start + len(example[statistic])
-        for i, row in enumerate(example[alarms]):
-            if type(row) is not int or not start <= row < stop:
-                raise _wrong(f"{where}.{alarms}[{i}]", row, f"a row in {start} ... {stop - 1}")
+        raise _wrong(f"{where}.start", start, f"expected at most onset, {onset}")
+    for prefix, scores in (("", "scores"), ("twin_", "twin")):
+        rows = range(start, start + len(example[f"{prefix}cusum"]))
+        _check_length(example[scores], rows, f"{where}.{scores}")
+        for i, row in enumerate(example[f"{prefix}alarms"]):
+            if row not in rows:
+                problem = f"no row in {start} ... {rows.stop - 1}"
+                raise _wrong(f"{where}.{prefix}alarms[{i}]", row, problem)
+    if len(example["scores"]) > length - start:
+        found = f"{len(example['scores'])} numbers"
+        raise _wrong(f"{where}.scores", found, f"expected at most length - start, {length - start}")
 
 
-def _fields(value: Any, kinds: Mapping[str, type], where: str) -> dict[str, Any]:
-    """Return an object with exactly these fields of these types."""
-    if not isinstance(value, dict):
-        raise _wrong(where, type(value).__name__, "a JSON object")
-    if value.keys() != kinds.keys():
-        raise ResultsError(
-            f"{where} has other fields than expected: missing {sorted(kinds.keys() - value)}, "
-            f"unknown {sorted(value.keys() - kinds)!s:.200}"
-        )
-    for name, kind in kinds.items():
-        # bool is an int to isinstance, and never meant here.
-        if not isinstance(value[name], kind) or isinstance(value[name], bool):
-            raise _wrong(f"{where}.{name}", value[name], kind.__name__)
-    return value
+def _check_length(values: Sequence[Any], like: Sequence[Any], where: str) -> None:
+    if len(values) != len(like):
+        raise _wrong(where, f"{len(values)} numbers", f"expected {len(like)}")
 
 
-def _check_length(numbers: list[Any], expected: int, where: str) -> None:
-    if len(numbers) > LONGEST:
-        raise _wrong(where, f"{len(numbers)} numbers", f"at most {LONGEST}")
-    if len(numbers) != expected:
-        raise _wrong(where, f"{len(numbers)} numbers", f"{expected}")
-
-
-def _check_number(value: Any, where: str, low: float, high: float) -> None:
-    if type(value) not in (int, float) or not low <= value <= high:
-        raise _wrong(where, value, f"a number in [{low:g}, {high:g}]")
-
-
-def _wrong(where: str, found: Any, expected: str) -> ResultsError:
-    return ResultsError(f"{where} is {found!r:.80}, expected {expected}")
+def _wrong(where: str, found: Any, problem: str) -> ResultsError:
+    return ResultsError(f"{where} is {found!r:.80}: {problem}")

@@ -5,107 +5,35 @@
     records.jsonl      one record a line
     scores/<key>.h5    all scores of one unit; also the cache from which a later run resumes
     fitted/<key>/      a fitted detector that could save itself, see `oodd_eval.results.fits`
-    logs/<key>.txt     what a failing detector printed, with its traceback
+    logs/<key>.txt     the end of the output of a failing detector, with its traceback
     report.md
 
-Every file is written beside its place and then moved there, so that it is whole or absent.
+Every file is whole or absent, see `oodd_eval.data.files`.
 """
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
-import json
-import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from oodd_eval.data import files as stored_files
-from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.data import files
 from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.plugins.contract import Scores
-from oodd_eval.plugins.discovery import Offer
-from oodd_eval.results.fits import FittedStore
-from oodd_eval.results.provenance import source_digest
+from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.plan import Plan, Unit
 
-RECORDS = "records.jsonl"
-REPORT = "report.md"
+RECORDS: Final = "records.jsonl"
+REPORT: Final = "report.md"
 
-
-@dataclass(frozen=True, slots=True)
-class UnitKey:
-    """Everything that decides the scores of a unit; equal keys mean equal scores.
-
-    Attributes
-    ----------
-    distribution, version, source
-        Of the plug-in; `source` is the digest of its code.
-    detector, parameters, seed, horizon, environment, split_digest, limit
-        Of the unit.
-    protocol
-        Version of the benchmark's rules.
-    """
-
-    distribution: str
-    version: str
-    source: str
-    detector: str
-    parameters: dict[str, Any]
-    seed: int
-    horizon: int
-    environment: str
-    split_digest: str
-    limit: int | None
-    protocol: int = PROTOCOL
-
-    @property
-    def text(self) -> str:
-        """Return the key as a short file name: detector, environment and a digest of it all."""
-        canonical = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"), default=str)
-        digest = hashlib.sha256(canonical.encode()).hexdigest()
-        # Some file systems take no colons, and some do not tell capitals.
-        detector = self.detector.lower().replace(":", "-")
-        return f"{detector}-{self.environment}-{digest[:20]}"
-
-
-def fit_key(plan: Plan, unit: Unit, offer: Offer) -> str:
-    """Return the key of a unit's fit: of all that decides the fitted detector, and nothing else.
-
-    It tells nothing of the environment, since the worker sees it.
-    """
-    spec = offer.spec
-    whole = asdict(unit_key(plan, unit, offer)) | {"detector": spec.fit_name or spec.name}
-    del whole["protocol"]
-    for name in spec.fit_ignores:
-        whole.pop(name, None)
-        whole["parameters"].pop(name, None)
-    canonical = json.dumps(whole, sort_keys=True, separators=(",", ":"), default=str)
-    return hashlib.sha256(canonical.encode()).hexdigest()[:32]
-
-
-def unit_key(plan: Plan, unit: Unit, offer: Offer) -> UnitKey:
-    """Return the key of a unit of a plan."""
-    return UnitKey(
-        distribution=offer.distribution,
-        version=offer.version,
-        source=source_digest(offer.module),
-        detector=unit.detector,
-        parameters=dict(unit.parameters),
-        seed=unit.seed,
-        horizon=unit.horizon,
-        environment=unit.environment,
-        split_digest=plan.split_digest,
-        limit=plan.limit,
-    )
+WRITING_SHARE: Final = 0.05
+"""Records are written again once the last writing took less than this share of the time since."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +44,7 @@ class ScoreFile:
     ``steps_scored``, the number of observations that ``seconds_score`` is for.
     """
 
-    parts: dict[str, list[Scores]]
+    parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
 
 
@@ -131,10 +59,12 @@ class ResultsDirectory:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.fitted = FittedStore(self.path / "fitted")
+        self.fits = FitStore(self.path / "fitted")
 
     def prepare(self) -> None:
-        """Make the directory and find out, before any work is done, whether it can be used.
+        """Make the directory, and find out before any work is done whether it can be used.
+
+        What a killed run left half written is removed.
 
         Raises
         ------
@@ -155,33 +85,31 @@ class ResultsDirectory:
             ) from None
         if (self.path / RECORDS).exists():
             self.records()
+        for directory in (self.path, self.path / "scores", self.path / "logs"):
+            files.remove_abandoned(directory)
+        self.fits.remove_abandoned()
 
     def records(self) -> list[Record]:
-        """Read all records; those of a large entry of the leaderboard are packed, in ``.gz``.
+        """Read all records; those of a large entry of the leaderboard are compressed, in ``.gz``.
 
         Raises
         ------
         ResultsError
             When there are none, or one cannot be read.
         """
-        file = stored_files.find_file(self.path / RECORDS) or self.path / RECORDS
-        try:
-            lines = stored_files.read_text(file).splitlines()
-        except FileNotFoundError:
+        file = files.find_file(self.path / RECORDS) or self.path / RECORDS
+        if not file.exists():
             raise ResultsError(
                 f"no results in {str(self.path)!r}: expected a file {RECORDS}, written by "
                 "oodd-eval run"
-            ) from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
-        return [
-            Record.from_json(line, f"{file}:{number}")
-            for number, line in enumerate(lines, start=1)
-            if line.strip()
-        ]
+            )
+        return read_records(file)
 
     def merge_records(self, records: Iterable[Record]) -> list[Record]:
         """Write records into the directory; newer ones replace those of the same cell.
+
+        A failed one is also replaced by one of the same cell with other parameters, or of a
+        version of the detector that has other parameters.
 
         Returns
         -------
@@ -189,26 +117,31 @@ class ResultsDirectory:
         of cells that are replaced are filled in the order of `records`, so that the end is the same
         whether records come at once or one by one.
         """
-        with _alone(self.path):
+        with files.lock(self.path):
             earlier = self.records() if (self.path / RECORDS).exists() else []
             merged = _merged(earlier, records)
             text = "".join(record.to_json() + "\n" for record in merged)
-            self._write_text(self.path / RECORDS, text)
+            files.write_text(self.path / RECORDS, text)
         return merged
 
     def write_report(self, text: str) -> Path:
         """Write ``report.md`` and return its path."""
-        self._write_text(self.path / REPORT, text)
+        files.write_text(self.path / REPORT, text)
         return self.path / REPORT
 
     def write_log(self, key: str, text: str) -> None:
-        """Keep what a failing detector printed."""
-        self._write_text(self.path / "logs" / f"{key}.txt", text)
+        """Keep the end of the output of a failing detector."""
+        files.write_text(self.log_path(key), text)
+
+    def log_path(self, key: str) -> Path:
+        """Return the place of the log of a failed unit."""
+        return self.path / "logs" / f"{key}.txt"
 
     def write_scores(self, key: str, scores: ScoreFile) -> None:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
         parts = {**self._all_parts(key), **scores.parts}
-        with _replacing(self.path / "scores" / f"{key}.h5") as path, h5py.File(path, "w") as file:
+        place = self.path / "scores" / f"{key}.h5"
+        with files.replacing(place) as path, h5py.File(path, "w") as file:
             file.attrs.update(scores.cost)
             for part, sequences in sorted(parts.items()):
                 group = file.create_group(part)
@@ -244,8 +177,8 @@ class ResultsDirectory:
             return None
         return ScoreFile(parts, cost)
 
-    def _all_parts(self, key: str) -> dict[str, list[Scores]]:
-        parts: dict[str, list[Scores]] = {}
+    def _all_parts(self, key: str) -> dict[str, list[NDArray[np.float64]]]:
+        parts: dict[str, list[NDArray[np.float64]]] = {}
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
@@ -258,40 +191,76 @@ class ResultsDirectory:
             return {}
         return parts
 
-    @staticmethod
-    def _write_text(path: Path, text: str) -> None:
-        with _replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+
+class RecordWriter:
+    """Collects the records of one run and writes them from time to time.
+
+    Scores are kept the moment a unit is finished, and records can be made from them again. Writing
+    records is of the whole file, so that it waits until it costs little of the run's time. Without
+    `results`, records are in memory only.
+    """
+
+    def __init__(self, results: ResultsDirectory | None) -> None:
+        self._results = results
+        self._finished: dict[int, list[Record]] = {}
+        self._unwritten = False
+        self._due = 0.0
+
+    def add(self, index: int, records: list[Record]) -> None:
+        """Take the records of the unit that is `index`-th in the plan; write all if it is time."""
+        self._finished[index] = records
+        self._unwritten = True
+        if time.monotonic() >= self._due:
+            self.write()
+
+    def write(self) -> None:
+        """Write all records so far, unless none is new."""
+        if not (self._results and self._unwritten):
+            return
+        start = time.monotonic()
+        self._results.merge_records(self.records)
+        self._unwritten = False
+        now = time.monotonic()
+        self._due = now + (now - start) / WRITING_SHARE
+
+    @property
+    def records(self) -> list[Record]:
+        """All records so far, in the order of the plan."""
+        return [record for index in sorted(self._finished) for record in self._finished[index]]
+
+
+def read_records(file: Path) -> list[Record]:
+    """Read a file of records, compressed or not.
+
+    Raises
+    ------
+    ResultsError
+        When it cannot be read, naming the line.
+    """
+    try:
+        lines = files.read_text(file).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
+    return [
+        Record.from_json(line, f"{file}:{number}")
+        for number, line in enumerate(lines, start=1)
+        if line.strip()
+    ]
 
 
 def _merged(earlier: Sequence[Record], records: Iterable[Record]) -> list[Record]:
     newer = {record.identity: record for record in records}
+    tried = {_attempt(record) for record in newer.values()}
     rest = iter(newer.values())
-    merged = {r.identity: next(rest) if r.identity in newer else r for r in earlier}
+    merged = {
+        r.identity: next(rest) if r.identity in newer else r
+        for r in earlier
+        if r.ok or r.identity in newer or _attempt(r) not in tried
+    }
     return [*merged.values(), *rest]
 
 
-@contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Keep other runs that write to the same directory waiting."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        # Not every file system has locks; without them two runs at a time are not supported.
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Give a file to write, which then takes the place of `path` in one step."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{str(path)!r} cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+def _attempt(record: Record) -> tuple[object, ...]:
+    """Return the identity of a cell without parameters: a later attempt replaces a failed one."""
+    cell = replace(record.cell, setting=replace(record.cell.setting, parameters=()))
+    return cell, record.split_digest, record.limit

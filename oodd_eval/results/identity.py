@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from oodd_eval.errors import UsageError
@@ -69,6 +69,19 @@ class Setting:
         horizon = {"h": self.horizon} if self.horizon != 1 else {}
         return _bracketed(self.detector, horizon | self.overrides)
 
+    @classmethod
+    def parse(cls, text: str) -> Setting:
+        """Read what `str` writes; a text of another form raises `UsageError`.
+
+        >>> Setting.parse("riqn[h=5,updates=2400]") == Setting.of("riqn", 5, {"updates": 2400})
+        True
+        """
+        match = re.fullmatch(r"([^\[]+)(?:\[(.*)\])?", text)
+        given = _read_settings(match[2] or "") if match else None
+        if match is None or given is None:
+            raise UsageError(f"{text!r} is no setting: expected DETECTOR[h=N,NAME=VALUE,...]")
+        return cls.of(match[1], given.pop("h", 1), given)
+
     def label(self, seed: int) -> str:
         """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
         return _bracketed(self.detector, {"h": self.horizon, "seed": seed, **self.overrides})
@@ -116,19 +129,9 @@ class Cell:
         """Setting and seed, such as ``riqn[h=1,seed=0]``."""
         return self.setting.label(self.seed)
 
-    def on(self, environment: str, anomaly: str) -> Cell:
-        """Return the same setting and seed on another environment and anomaly."""
-        return replace(self, environment=environment, anomaly=anomaly)
-
     @classmethod
     def parse(cls, text: str) -> Cell:
-        """Read what `str` writes.
-
-        Raises
-        ------
-        UsageError
-            When the text has another form.
-        """
+        """Read what `str` writes; a text of another form raises `UsageError`."""
         match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+)(?:@([^/:]+))?::([^\[]+)\[(.*)\]", text)
         settings = _read_settings(match[6]) if match else None
         if match is None or settings is None or not {"h", "seed"} <= settings.keys():

@@ -31,7 +31,7 @@ class _NullIsNan:
     """Tells pydantic to read null as NaN; it is imported only when records are read."""
 
     @staticmethod
-    def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:  # noqa: PLW3201
+    def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema  # noqa: PLC0415
 
         number = core_schema.float_schema(strict=True)
@@ -124,7 +124,7 @@ class Record:
 
     @property
     def ok(self) -> bool:
-        """Whether the cell has metrics."""
+        """True if the cell has metrics."""
         return self.status == "ok"
 
     @property

@@ -1,1 +1,320 @@
-"""Regression checks: results against a reference, with tolerances per metric."""
+"""Regression checks: every figure of some results with the same figure of a reference.
+
+A tolerance is written ``METRIC:[+-]NUMBER[%]``. The sign says which way is worse: ``auc:-0.01``
+fails where the AUC fell by more than 0.01, ``delay:+10%`` where the delay rose by more than 10 % of
+the reference. Without a sign the metric's own worse side is meant; both for one that has none.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
+from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.results.identity import Cell
+from oodd_eval.results.record import NAN, Record
+from oodd_eval.results.regression.reference import Conditions, RecordSet
+from oodd_eval.results.tables.board import nan_mean
+
+By = Literal["cell", "group", "mean"]
+Side = Literal["+", "-", "±"]
+_Place = tuple[str, str, str]
+"""Split, place and detector of a difference."""
+
+Verdict = Literal[
+    "same", "within", "better", "worse", "undefined", "failed", "missing", "recovered", "new"
+]
+
+MEANINGS: Final[dict[Verdict, str]] = {
+    "same": "no difference",
+    "within": "a difference within the tolerance",
+    "better": "beyond the tolerance, to the better side",
+    "worse": "beyond the tolerance, to the worse side",
+    "undefined": "a number on one side only",
+    "failed": "the cell fails now",
+    "missing": "the cell is not there now",
+    "recovered": "the cell failed in the reference",
+    "new": "the cell is not in the reference",
+}
+"""Possible results of the comparison of one figure."""
+
+RESOLUTION: Final = 1e-6
+"""Differences up to this are none: sums may be taken in another order on another processor."""
+
+
+class NothingInCommonError(ResultsError):
+    """Two sets of records of which no two can be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """The largest change to the worse side: in the metric's unit, or in percent of the reference.
+
+    `worse` is ``"+"`` where a rise is worse, ``"-"`` where a fall is, ``"±"`` where either is.
+    """
+
+    metric: str
+    worse: Side
+    amount: float
+    percent: bool = False
+
+    @property
+    def text(self) -> str:
+        """Sign and number, such as ``-0.01`` or ``+10%``."""
+        return f"{self.worse}{self.amount:g}{'%' if self.percent else ''}"
+
+    def allowed(self, reference: float) -> float:
+        """Return the largest change that passes, in the metric's unit."""
+        return self.amount / 100 * abs(reference) if self.percent else self.amount
+
+
+def worse_side(metric: str) -> Side:
+    """Return the direction in which a metric gets worse; "±" for those that have none.
+
+    Those are null values, the placebo, thresholds, and metrics that this version does not know.
+    """
+    sides: dict[str, Side] = {"higher": "-", "lower": "+", "": "±"}
+    return sides[metric_info(metric).better] if metric in NAMES else "±"
+
+
+def parse_tolerance(text: str, known: Collection[str] = NAMES) -> Tolerance:
+    """Read a tolerance for one of the known metrics, such as ``delay:+10%``.
+
+    UnknownNameError: there is no such metric. UsageError: the text has another form, or its sign is
+    the metric's better side.
+    """
+    match = re.fullmatch(r"([^:\s]+):([+-]?)(\d+(?:\.\d*)?|\.\d+)(%?)", text.strip())
+    if not match:
+        raise UsageError(
+            f"tolerance {text!r}, expected METRIC:[+-]NUMBER[%] such as 'auc:-0.01' (fell by more "
+            "than 0.01) or 'delay:+10%' (rose by more than 10 %)"
+        )
+    metric, sign, number, percent = match.groups()
+    if metric not in known:
+        raise UnknownNameError("metric", metric, known)
+    worse = worse_side(metric)
+    if sign and worse not in (sign, "±"):
+        better = "higher" if worse == "-" else "lower"
+        raise UsageError(
+            f"tolerance {text!r}: of {metric}, {better} is better, so the sign that counts as "
+            f"worse is {worse!r}: write '{metric}:{worse}{number}{percent}', and --two-sided to "
+            "have improvements fail too"
+        )
+    side: Side = "+" if sign == "+" else "-" if sign == "-" else worse
+    return Tolerance(metric, side, float(number), bool(percent))
+
+
+def parse_tolerances(texts: Sequence[str], known: Collection[str] = NAMES) -> list[Tolerance]:
+    """Read several tolerances as `parse_tolerance`; UsageError: two of one metric."""
+    found: dict[str, Tolerance] = {}
+    for tolerance in (parse_tolerance(text, known) for text in texts):
+        if found.setdefault(tolerance.metric, tolerance) is not tolerance:
+            raise UsageError(f"two tolerances for {tolerance.metric}, expected one")
+    return list(found.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One figure now against the reference, NaN where undefined or where there is no such figure.
+
+    The place is such as ``"hopper/iid"``, of a mean ``"hopper/sensor"`` or ``"mean"``. `outside`
+    says that the figure is missing with its whole environment or detector.
+    """
+
+    split: str
+    place: str
+    detector: str
+    tolerance: Tolerance
+    reference: float
+    now: float
+    verdict: Verdict
+    fails: bool = False
+    reason: str = ""
+    outside: bool = False
+
+    @property
+    def metric(self) -> str:
+        """Name of the metric."""
+        return self.tolerance.metric
+
+    def __str__(self) -> str:
+        return f"{self.split}/{self.place}::{self.detector}"
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All differences in the order of the reference, new cells last, and under which conditions.
+
+    The notes say what was left out, or is missing as a whole.
+    """
+
+    differences: list[Difference]
+    by: By
+    conditions: list[Conditions]
+    notes: list[str]
+
+    @property
+    def failures(self) -> list[Difference]:
+        """Return the differences for which the comparison fails."""
+        return [d for d in self.differences if d.fails]
+
+
+def compare(
+    now: RecordSet,
+    reference: RecordSet,
+    tolerances: Sequence[Tolerance] = (),
+    *,
+    by: By = "cell",
+    two_sided: bool = False,
+) -> Comparison:
+    """Compare records with a reference, cells under equal conditions only.
+
+    Means are over the reference's cells: of a group of anomalies in one environment, or all of a
+    detector. Without tolerances, all metrics of the reference that have a worse side are compared,
+    with tolerance 0. If `two_sided`, what is better by more than the tolerance fails as well.
+
+    A cell of the reference that is missing now, or fails now, fails the comparison; one that failed
+    in the reference already does not. A number against NaN is a difference that no tolerance
+    covers; NaN against NaN is none.
+
+    NothingInCommonError: no cell is in both under the same conditions. UsageError: a metric is not
+    in the reference.
+    """
+    common = [c for c in reference.boards if c in now.boards]
+    _require_common(now, reference, common)
+    # Of a reference in which every cell failed, nothing can be asked but whether they still do.
+    known = reference.metrics() or NAMES
+    for tolerance in tolerances:
+        if tolerance.metric not in known:
+            raise UsageError(
+                f"metric {tolerance.metric!r} is not in {reference.where}, expected one of "
+                f"{', '.join(known)}: write the reference again, or leave the metric out"
+            )
+    sided = [m for m in NAMES if m in known and worse_side(m) != "±"]
+    used = list(tolerances) or [Tolerance(m, worse_side(m), 0.0) for m in sided]
+    differences: list[Difference] = []
+    new: list[Difference] = []
+    notes = []
+    for conditions in common:
+        cells, own = reference.boards[conditions], now.boards[conditions]
+        if outside := _outside(cells, own):
+            environments = sorted({cell.environment for cell in outside})
+            detectors = sorted({cell.setting.detector for cell in outside})
+            notes.append(
+                f"Missing in {now.where}: {len(outside)} cells of the reference (split "
+                f"{conditions.split}; environments {', '.join(environments)}; detectors "
+                f"{', '.join(detectors)}), whose environment or detector was not run at all. "
+                "Choose cells to compare with -k."
+            )
+        for place, ids in _units(cells, by).items():
+            pairs = [(cells[i], own.get(i)) for i in ids]
+            found = _compare_unit(place, pairs, used, two_sided=two_sided)
+            whole = outside.issuperset(ids)
+            differences += [replace(d, outside=whole) for d in found]
+        for cell in own.keys() - cells.keys():
+            new += [Difference(*_parts(cell), t, NAN, own[cell].value(t.metric), "new")
+                    for t in used]  # fmt: skip
+    new.sort(key=lambda d: (d.split, d.detector, d.place))
+    notes += [
+        f"Not compared: {c}, which is only in {one.where}."
+        for one, other in ((reference, now), (now, reference))
+        for c in one.boards
+        if c not in other.boards
+    ]
+    return Comparison([*differences, *new], by, common, notes)
+
+
+def _require_common(now: RecordSet, reference: RecordSet, common: Sequence[Conditions]) -> None:
+    if empty := [one.where for one in (reference, now) if not one.boards]:
+        why = f"no cell is selected in {empty[0]}"
+    elif not common:
+        theirs, own = ("; ".join(map(str, one.boards)) for one in (reference, now))
+        why = (
+            "results of different splits, protocols or limits are not compared; "
+            f"{reference.where} has {theirs}; {now.where} has {own}"
+        )
+    elif not any(reference.boards[c].keys() & now.boards[c].keys() for c in common):
+        theirs, own = (str(one.records[0].cell) for one in (reference, now))
+        why = f"no cell of {reference.where} (such as {theirs}) is in {now.where} (which has {own})"
+    else:
+        return
+    raise NothingInCommonError(f"nothing in common: {why}")
+
+
+def _outside(cells: Iterable[Cell], own: Iterable[Cell]) -> set[Cell]:
+    """Return the cells of environments, or of settings and seeds, of which nothing is there now."""
+    environments = {cell.environment for cell in own}
+    rows = {(cell.setting, cell.seed) for cell in own}
+    return {
+        c for c in cells if c.environment not in environments or (c.setting, c.seed) not in rows
+    }
+
+
+def _parts(cell: Cell) -> _Place:
+    strength = f"@{cell.strength}" if cell.strength else ""
+    return cell.split, f"{cell.environment}/{cell.anomaly}{strength}", cell.label
+
+
+def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Place, list[Cell]]:
+    """Sort cells into what is compared as one figure."""
+    units: dict[_Place, list[Cell]] = {}
+    for cell, record in cells.items():
+        split, place, detector = _parts(cell)
+        places = {"cell": place, "group": f"{cell.environment}/{record.group}", "mean": "mean"}
+        units.setdefault((split, places[by], detector), []).append(cell)
+    return units
+
+
+def _compare_unit(
+    place: _Place,
+    pairs: Sequence[tuple[Record, Record | None]],
+    tolerances: Sequence[Tolerance],
+    *,
+    two_sided: bool,
+) -> list[Difference]:
+    """Compare one cell, or the mean over several, in every metric."""
+    present = [(r, n) for r, n in pairs if n is not None]
+    failed = [n for r, n in present if r.ok and not n.ok]
+    both = [(r, n) for r, n in present if r.ok and n.ok]
+    recovered = [r.status for r, n in present if n.ok and not r.ok]
+    of = f"{{}} of {len(pairs)} cells: " if len(pairs) > 1 else ""
+    verdict: Verdict = "same"
+    if lost := len(pairs) - len(present):
+        verdict, reason, fails = "missing", of.format(lost) + "not there now", True
+    elif failed:
+        why = ": ".join(filter(None, (failed[0].status, failed[0].reason)))
+        verdict, reason, fails = "failed", of.format(len(failed)) + why, True
+    elif both:
+        return [_compare_metric(place, both, t, two_sided=two_sided) for t in tolerances]
+    elif recovered:
+        verdict, reason, fails = "recovered", f"was {recovered[0]}", two_sided
+    else:
+        reason, fails = f"fails in both: {present[0][1].status}", False
+    means = [nan_mean(r.value(t.metric) for r, _ in pairs) for t in tolerances]
+    return [
+        Difference(*place, t, mean, NAN, verdict, fails, reason)
+        for t, mean in zip(tolerances, means, strict=True)
+    ]
+
+
+def _compare_metric(
+    place: _Place, both: Sequence[tuple[Record, Record]], tolerance: Tolerance, *, two_sided: bool
+) -> Difference:
+    values = [(r.value(tolerance.metric), n.value(tolerance.metric)) for r, n in both]
+    reference, now = nan_mean(r for r, _ in values), nan_mean(n for _, n in values)
+    figure = *place, tolerance, reference, now
+    if turned := [r for r, n in values if math.isnan(r) != math.isnan(n)]:
+        where = "reference" if math.isnan(turned[0]) else "results"
+        of = f" in {len(turned)} of {len(both)} cells" if len(both) > 1 else ""
+        return Difference(*figure, "undefined", True, f"no value in the {where}{of}")
+    change = 0.0 if math.isnan(reference) else now - reference
+    if abs(change) <= RESOLUTION:
+        return Difference(*figure, "same")
+    if abs(change) <= tolerance.allowed(reference) + RESOLUTION:
+        return Difference(*figure, "within")
+    worse = tolerance.worse in ("±", "+" if change > 0 else "-")
+    return Difference(*figure, "worse" if worse else "better", worse or two_sided)

@@ -1,1 +1,1 @@
-"""What people read: tables, Markdown and the terminal, all of them functions of records."""
+"""Boards and their tables: functions of records."""

@@ -1,37 +1,31 @@
-"""Records arranged for comparison: rows of detectors, means over cells with paired intervals."""
+"""Records arranged for comparison: rows of detectors with means over cells, and their ranking."""
 
 from __future__ import annotations
 
-import functools
+import itertools
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import bootstrap_weights, mean_value, percentiles, resampled_mean
+from oodd_eval.metrics.bootstrap import mean_value, percentiles, samples
+from oodd_eval.metrics.catalogue import RANKING
+from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-
-_weights = functools.lru_cache(maxsize=32)(bootstrap_weights)
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A mean over cells, or why there is none.
+    """A mean over some cells and its interval, NaN where undefined or not asked for.
 
-    Attributes
-    ----------
-    value, low, high
-        NaN where undefined; the interval is NaN, too, where none was asked for.
-    state
-        Status of the first failed cell; then there is no value.
-    cells
-        Number of cells it is over.
-    partial
-        Whether other rows have cells here that this one lacks.
+    `state` is the status of the first failed cell, without which there is a value; `partial` says
+    that other rows have cells here that this one lacks.
     """
 
     value: float = NAN
@@ -43,13 +37,7 @@ class Value:
 
 
 class Board:
-    """Records of one split digest, protocol and limit.
-
-    Parameters
-    ----------
-    records
-        All of one board, see `boards`.
-    """
+    """Records of one split digest, protocol and limit, see `boards`."""
 
     def __init__(self, records: Sequence[Record]) -> None:
         self.records = list(records)
@@ -57,19 +45,15 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells: dict[tuple[Setting, str, str], list[Record]] = {}
-        for record in self.records:
-            key = record.setting, record.environment, record.anomaly
-            self._cells.setdefault(key, []).append(record)
-        self.entries = list(dict.fromkeys(entry for entry, _, _ in self._cells))
-        found = {environment for _, environment, _ in self._cells}
-        self.environments = [e for e in ENVIRONMENTS if e in found]
-        found = {anomaly for _, _, anomaly in self._cells}
-        self.anomalies = [a for a in ANOMALIES if a in found]
-
-    @property
-    def horizons(self) -> list[int]:
-        """Prediction horizons, ascending."""
-        return sorted({entry.horizon for entry in self.entries})
+        self._plugins: dict[Setting, str] = {}
+        for r in self.records:
+            setting = r.setting
+            self._cells.setdefault((setting, r.environment, r.anomaly), []).append(r)
+            self._plugins.setdefault(setting, r.plugin)
+        self.entries = list(self._plugins)
+        self.environments = [e for e in ENVIRONMENTS if any(e == own for _, own, _ in self._cells)]
+        self.anomalies = [a for a in ANOMALIES if any(a == own for _, _, own in self._cells)]
+        self.horizons = sorted({entry.horizon for entry in self.entries})
 
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
@@ -80,9 +64,8 @@ class Board:
         return sorted({r.counts["test"] for r in self.records if "test" in r.counts})
 
     def is_trivial(self, entry: Setting) -> bool:
-        """Whether an entry is one of the harness's own trivial rows."""
-        plugins = (r.plugin for (e, _, _), cell in self._cells.items() if e == entry for r in cell)
-        return next(plugins, "").endswith(":trivial")
+        """Return whether an entry is one of the harness's own trivial rows."""
+        return self._plugins[entry].endswith(":trivial")
 
     def mean(
         self,
@@ -98,32 +81,26 @@ class Board:
         The interval resamples test trajectories, the same ones for all cells of an environment,
         and detector seeds where there are several.
         """
-        wanted = [(e, a) for e in environments for a in anomalies]
-        cells = {w: self._cells[entry, *w] for w in wanted if (entry, *w) in self._cells}
-        others = {w for w in wanted if any((x, *w) in self._cells for x in self.entries)}
-        records = [record for cell in cells.values() for record in cell]
-        partial = 0 < len(cells) < len(others)
+        places = itertools.product(environments, anomalies)
+        wanted = [p for p in places if any((x, *p) in self._cells for x in self.entries)]
+        cells = [self._cells[entry, *p] for p in wanted if (entry, *p) in self._cells]
+        records = [record for cell in cells for record in cell]
+        partial = 0 < len(cells) < len(wanted)
         if failed := next((r for r in records if not r.ok), None):
             return Value(state=failed.status, cells=len(records), partial=partial)
-        with_metric = [r for r in records if metric in r.per_trajectory]
-        value = _mean(records, metric)
-        low, high = _interval(with_metric, metric) if intervals else (NAN, NAN)
-        return Value(value, low, high, cells=len(records), partial=partial)
+        terms = [r for r in records if intervals and metric in r.per_trajectory]
+        ratios = [(r.environment, r.seed, contribution(r, metric)) for r in terms]
+        low, high = percentiles(samples(ratios)) if ratios else (NAN, NAN)
+        return Value(_mean(records, metric), low, high, cells=len(records), partial=partial)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
-        common = [
-            (self._cells[first, e, a], self._cells[second, e, a])
-            for e in self.environments
-            for a in self.anomalies
-            if (first, e, a) in self._cells and (second, e, a) in self._cells
-        ]
-        pairs = [
-            (_seed_mean(one, metric), _seed_mean(two, metric))
-            for one, two in common
-            if all(r.ok for r in (*one, *two))
-        ]
-        pairs = [p for p in pairs if not any(map(math.isnan, p))]
+        pairs = []
+        for place in itertools.product(self.environments, self.anomalies):
+            cells = [self._cells.get((entry, *place), []) for entry in (first, second)]
+            if all(cells) and all(r.ok for cell in cells for r in cell):
+                pairs.append([_mean(cell, metric) for cell in cells])
+        pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
         if not pairs:
             return NAN, NAN, 0
         one, two = np.mean(pairs, axis=0).tolist()
@@ -145,6 +122,12 @@ def boards(records: Sequence[Record]) -> list[Board]:
     return [Board(group) for group in groups.values()]
 
 
+def nan_mean(values: Iterable[float]) -> float:
+    """Return the mean of the values that are not NaN; NaN without any."""
+    defined = [v for v in values if not math.isnan(v)]
+    return math.fsum(defined) / len(defined) if defined else NAN
+
+
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
     numerators, denominators = record.per_trajectory[metric]
@@ -152,34 +135,131 @@ def contribution(record: Record, metric: str) -> Contribution:
 
 
 def _mean(records: Sequence[Record], metric: str) -> float:
-    """Mean over cells where it is defined."""
-    if any(metric in r.per_trajectory for r in records):
-        return _seed_mean(records, metric)
-    # One number of all trajectories of a cell, such as a pooled AUC.
-    defined = [v for v in (r.value(metric) for r in records) if not math.isnan(v)]
-    return sum(defined) / len(defined) if defined else NAN
+    """Return the mean over the cells where a metric is defined."""
+    found = [contribution(r, metric) for r in records if metric in r.per_trajectory]
+    # Pooled metrics and thresholds are no ratios of sums.
+    return mean_value(found) if found else nan_mean(r.value(metric) for r in records)
 
 
-def _seed_mean(cell: Sequence[Record], metric: str) -> float:
-    return mean_value([contribution(r, metric) for r in cell if metric in r.per_trajectory])
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Mean seconds of a row's fits, microseconds per scored step, and most memory in MB."""
+
+    fit: float = NAN
+    step: float = NAN
+    peak: float = NAN
 
 
-def _interval(records: Sequence[Record], metric: str) -> tuple[float, float]:
-    """Bootstrap over test trajectories and, where there are several, over detector seeds."""
-    if not records:
-        return NAN, NAN
-    by_seed: dict[int, list[Record]] = {}
-    for record in records:
-        by_seed.setdefault(record.seed, []).append(record)
-    resampled = np.array(
-        [
-            resampled_mean(
-                [contribution(r, metric) for r in group],
-                [_weights(len(r.per_trajectory[metric][0]), key=r.environment) for r in group],
-            )
-            for group in by_seed.values()
-        ]
-    )  # (seeds, resamples)
-    seeds, resamples = resampled.shape
-    drawn = np.random.default_rng(0).integers(seeds, size=(seeds, resamples))
-    return percentiles(np.take_along_axis(resampled, drawn, axis=0).mean(axis=0))
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """One row of a board with its place.
+
+    `rank` is None, and `state` says why, for a row that is not ranked. `ties` are the letters of
+    its tie groups, `wins` is the mean of its win rates against the other ranked rows, and `inputs`
+    is empty where no record names the detector's inputs.
+    """
+
+    entry: Setting
+    records: list[Record]
+    trivial: bool
+    rank: int | None
+    ties: str
+    state: str
+    wins: float
+    inputs: str
+    cost: Cost
+
+    @property
+    def seeds(self) -> int:
+        """The number of detector seeds."""
+        return len({r.seed for r in self.records})
+
+
+@dataclass(frozen=True, slots=True)
+class RankedBoard:
+    """A board with its ranking and win rates, both by the labels of the ranked rows.
+
+    All have the order of the standings: ranked rows by rank and mean, then the others by name.
+    """
+
+    board: Board
+    standings: list[Standing]
+    ranking: Ranking
+    rates: dict[tuple[str, str], float]
+
+
+def ranked(records: Sequence[Record]) -> RankedBoard:
+    """Rank the rows of one board that have a value in every cell, with all their detector seeds.
+
+    ResultsError: such rows differ in their numbers of test trajectories, or two rows have one name.
+    """
+    by_row: dict[Setting, list[Record]] = {}
+    for r in sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly)):
+        by_row.setdefault(r.setting, []).append(r)
+    labels = Counter(map(str, by_row))
+    if twice := [label for label, n in labels.items() if n > 1]:
+        raise ResultsError(
+            f"two rows of a board are both called {twice[0]!r}, expected names and settings that "
+            "tell rows apart: give one of the detectors another name"
+        )
+    cells = {(r.environment, r.anomaly) for r in records}
+    states = {entry: _state(own, len(cells)) for entry, own in by_row.items()}
+    rows: dict[str, dict[int, dict[Place, Contribution]]] = {}
+    for entry in (e for e, state in states.items() if not state):
+        row = rows.setdefault(str(entry), {})
+        for r in by_row[entry]:
+            row.setdefault(r.seed, {})[r.environment, r.anomaly] = contribution(r, RANKING)
+    ranking = rank(rows)
+    rates = win_rates({
+        label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}
+        for label in ranking.ranks
+    })  # fmt: skip
+    place = {label: i for i, label in enumerate(ranking.ranks)}
+    order = sorted(by_row, key=lambda e: (place.get(str(e), len(place)), _name(e)))
+    board = Board([record for entry in order for record in by_row[entry]])
+    standings = [
+        Standing(
+            entry=entry,
+            records=by_row[entry],
+            trivial=board.is_trivial(entry),
+            rank=ranking.ranks.get(str(entry)),
+            ties=ranking.letters(str(entry)),
+            state=states[entry],
+            wins=nan_mean(rate for (one, _), rate in rates.items() if one == str(entry)),
+            inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
+            cost=cost_of(by_row[entry]),
+        )
+        for entry in order
+    ]
+    return RankedBoard(board, standings, ranking, rates)
+
+
+def cost_of(records: Iterable[Record]) -> Cost:
+    """Return what the fits behind some records cost; records of one fit share its cost."""
+    fits = list({(r.environment, r.seed): r for r in records if r.ok}.values())
+    timed = [(r.seconds_score, r.steps_scored) for r in fits if not math.isnan(r.seconds_score)]
+    steps = [(seconds, n) for seconds, n in timed if n and n > 0]
+    seconds = math.fsum(s for s, _ in steps)
+    return Cost(
+        nan_mean(r.seconds_fit for r in fits),
+        1e6 * seconds / sum(n for _, n in steps) if steps else NAN,
+        max((r.peak_rss_mb for r in fits if not math.isnan(r.peak_rss_mb)), default=NAN),
+    )
+
+
+def _state(records: Sequence[Record], cells: int) -> str:
+    """Return why a row is not ranked; empty if it is."""
+    expected = cells * len({r.seed for r in records})
+    failed = Counter(r.status for r in records if not r.ok)
+    reasons = [f"{status} in {n} of {expected} cells" for status, n in failed.items()]
+    if len(records) < expected:
+        reasons.append(f"{expected - len(records)} of {expected} cells missing")
+    stored = [contribution(r, RANKING) for r in records if r.ok and RANKING in r.per_trajectory]
+    defined = sum(not math.isnan(c.value) for c in stored)
+    if undefined := sum(r.ok for r in records) - defined:
+        reasons.append(f"undefined in {undefined} of {expected} cells")
+    return ", ".join(reasons)
+
+
+def _name(entry: Setting) -> tuple[str, int, str]:
+    return entry.detector, entry.horizon, entry.overrides_json

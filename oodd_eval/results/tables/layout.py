@@ -1,0 +1,325 @@
+"""The tables of a board, as texts in cells; renderers set them for a terminal or as Markdown."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
+from oodd_eval.metrics.catalogue import POOLED, RANKING, RATIOS, TARGETS, UNDEFINED, metric_info
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.tables.board import Board, RankedBoard, Standing, Value
+
+_SIMPLE: Final = ("random", "persistence", "clock", "rf")
+"""Rows that a detector with a learned model of the dynamics should beat."""
+
+_FEW: Final = 30
+"""Test seeds per environment below which a board says that its comparisons are weak."""
+
+_ALARMS: Final = {
+    "delay_censored_at_1pct": "delay censored at 1 %",
+    "missed_at_1pct": "missed at 1 %",
+    "far_twin_at_1pct": "FAR twin at 1 %",
+    "delay": "delay",
+    "delay_null": "delay null",
+    "missed": "missed",
+    "far_twin": "FAR twin",
+}
+"""Columns of a ranking's table of alarms."""
+
+_LABELS: Final = ("rank", "detector", "settings")
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A titled table of texts, the first `labels` columns set to the left, with a note below it."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    labels: int = 1
+    note: str = ""
+
+    @property
+    def alignment(self) -> tuple[str, ...]:
+        """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
+        return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
+
+    def columns(self, indices: Sequence[int]) -> Table:
+        """Return the table with these columns only."""
+        rows = [[row[i] for i in indices] for row in self.rows]
+        return replace(self, header=[self.header[i] for i in indices], rows=rows)
+
+    def transposed(self) -> Table:
+        """Return the table with rows and columns exchanged."""
+        whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
+        return replace(self, header=whole[0], rows=whole[1:], labels=1)
+
+
+def show_value(value: Value, metric: str) -> str:
+    """Return a mean as printed: percent or number, a dash where undefined, a failure's state.
+
+    A star marks a mean over fewer cells than other rows have; an empty text, no cell at all.
+    """
+    if not value.cells:
+        return ""
+    number = metric_info(metric).text
+    text = value.state or number(value.value)
+    if not math.isnan(value.low):
+        text += f" [{number(value.low)}, {number(value.high)}]"
+    return text + "*" * value.partial
+
+
+class _Mean(NamedTuple):
+    """A column: the mean of a metric over some of a board's cells."""
+
+    title: str
+    metric: str
+    environments: Sequence[str]
+    anomalies: Sequence[str]
+    intervals: bool = False
+
+
+def _texts(board: Board, entry: Setting, columns: Iterable[_Mean]) -> list[str]:
+    return [
+        show_value(board.mean(entry, environments, anomalies, metric, intervals=intervals), metric)
+        for _, metric, environments, anomalies, intervals in columns
+    ]
+
+
+def _by_group(board: Board, title: str, *, intervals: bool) -> list[_Mean]:
+    """Return matched AUC over all cells, and over each group of anomalies."""
+    chosen = {title: board.anomalies} | {g: board.in_group(g) for g in GROUPS if board.in_group(g)}
+    return [_Mean(t, RANKING, board.environments, a, intervals) for t, a in chosen.items()]
+
+
+def _overall(board: Board, names: Iterable[str], intervals: Collection[str] = ()) -> list[_Mean]:
+    """Return metrics over all cells."""
+    over = board.environments, board.anomalies
+    return [_Mean(metric_info(n).title, n, *over, n in intervals) for n in names]
+
+
+def by_environment(board: Board, *, intervals: bool = False) -> Table:
+    """Return matched AUC by anomaly group and by environment, the best mean first."""
+    columns = _by_group(board, "mean", intervals=intervals)
+    columns += [_Mean(e, RANKING, [e], board.anomalies, intervals) for e in board.environments]
+    over = board.environments, board.anomalies, RANKING
+    means = {entry: board.mean(entry, *over).value for entry in board.entries}
+    order = sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
+    rows = [[str(entry), *_texts(board, entry, columns)] for entry in order]
+    title = "Matched AUC (%), higher is better. The leaderboard ranks by this."
+    return Table(title, ["detector", *(c.title for c in columns)], rows)
+
+
+def anomaly_groups(
+    board: Board, horizon: int, groups: Sequence[str] = GROUPS, *, intervals: bool = False
+) -> Table:
+    """Return AUC, delay and false-alarm rate by environment and anomaly group: the paper's Table 5.
+
+    The columns AVG are means over the detectors, trivial ones left out where there are others.
+    """
+    entries = [e for e in board.entries if e.horizon == horizon]
+    averaged = [e for e in entries if not board.is_trivial(e)] or entries
+    groups = [g for g in groups if board.in_group(g)]
+    # The title says the horizon.
+    labels = [*(str(replace(e, horizon=1)) for e in entries), "AVG"]
+    header = ["Environment", "Result"]
+    for group in groups:
+        header += [f"{group}: {label}" if len(groups) > 1 else label for label in labels]
+    rows = []
+    for environment, metric in itertools.product(board.environments, ("auc", "delay", "far")):
+        row = [ENVIRONMENTS[environment].title, metric_info(metric).title]
+        for group in groups:
+            over = [environment], board.in_group(group), metric
+            means = {e: board.mean(e, *over, intervals=intervals) for e in entries}
+            several = [means[e] for e in averaged]
+            defined = [v.value for v in several if not math.isnan(v.value)]
+            mean = sum(defined) / len(defined) if defined else math.nan
+            average = Value(mean, cells=1, partial=any(v.state or v.partial for v in several))
+            row += [show_value(v, metric) for v in [*means.values(), average]]
+        rows.append(row)
+    of = f"{groups[0]}-injected anomalies" if len(groups) == 1 else "by anomaly group"
+    title = f"AUC (%), delay (steps), false-alarm rate, {of}, Δ = {horizon}"
+    left_out = [str(e) for e in entries if e not in averaged]
+    note = f"AVG is the mean without the trivial rows: {', '.join(left_out)}." if left_out else ""
+    return Table(title, header, rows, labels=2, note=note)
+
+
+def all_metrics(board: Board, *, intervals: bool = False) -> Table:
+    """Return every metric by detector, mean over all cells, with the null and placebo columns."""
+    columns = _overall(board, RATIOS, RATIOS if intervals else ())
+    return _by_metric(board, "All metrics, mean over cells", columns)
+
+
+def calibrated(board: Board, *, intervals: bool = False) -> Table | None:
+    """Return alarms under calibrated thresholds; None when no record has them."""
+    bases = ("far_twin", "far", "delay", "delay_censored", "missed")
+    names = _present(board, (f"{name}_{suffix}" for suffix in TARGETS for name in bases))
+    title = "Alarms at a false-alarm rate calibrated to 1 % (and 0.1 %), mean over cells"
+    columns = _overall(board, names, names if intervals else ())
+    return _by_metric(board, title, columns) if names else None
+
+
+def pooled(board: Board, standings: Sequence[Standing] = ()) -> Table | None:
+    """Return pooled AUC, average precision and FPR95; None when no record has them."""
+    columns = _overall(board, _present(board, POOLED))
+    title = "Pooled over steps (%), not for ranking"
+    return _by_metric(board, title, columns, standings) if columns else None
+
+
+def by_anomaly(
+    board: Board, entry: Setting, metric: str = RANKING, *, intervals: bool = False
+) -> Table:
+    """Return one detector's metric by environment and anomaly."""
+    rows = []
+    for e in board.environments:
+        columns = [_Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
+        rows.append([ENVIRONMENTS[e].title, *_texts(board, entry, columns)])
+    info = metric_info(metric)
+    unit = " (%)" if info.unit == "percent" else ""
+    title = f"{entry}: {info.title}{unit} by anomaly"
+    return Table(title, ["Environment", *board.anomalies], rows)
+
+
+def failures(board: Board) -> Table | None:
+    """Return why fits failed; None when none did."""
+    rows = [[r.environment, r.label, r.status, r.reason] for r in board.failures()]
+    header = ["environment", "detector", "state", "reason"]
+    return Table("Failures", header, rows, labels=4) if rows else None
+
+
+def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
+    """Return ranks by matched AUC, with what a reader needs to judge them; trust is by row."""
+    columns = _by_group(ranks.board, metric_info(RANKING).title, intervals=True)
+    columns += _overall(ranks.board, ("auc", "auc_placebo"))
+    rows = []
+    for one in ranks.standings:
+        rank, detector, settings = _labels(one)
+        inputs = one.inputs.replace("observations+actions", "+actions") or UNDEFINED
+        rows.append([rank, one.ties or UNDEFINED, detector, settings, inputs,
+                     trust.get(one.entry, UNDEFINED), *_texts(ranks.board, one.entry, columns),
+                     _percent(one.wins)])  # fmt: skip
+    header = ["rank", "ties", "detector", "settings", "inputs", "trust",
+              *(c.title for c in columns), "win rate"]  # fmt: skip
+    return Table("Ranking by matched AUC (%)", header, rows, labels=6)
+
+
+def alarms(ranks: RankedBoard) -> Table:
+    """Return alarms at a calibrated false-alarm rate of 1 %, and with the paper's threshold."""
+    names = _present(ranks.board, _ALARMS)
+    columns = _overall(ranks.board, names, [n for n in names if n.endswith("_at_1pct")])
+    columns = [c._replace(title=_ALARMS[c.metric]) for c in columns]
+    return _by_metric(ranks.board, "Alarms", columns, ranks.standings)
+
+
+def cost(ranks: RankedBoard) -> Table:
+    """Return seconds per fit, microseconds per scored step and peak memory."""
+    rows = [
+        [*_labels(s), *map(_digits, (s.cost.fit, s.cost.step, s.cost.peak))]
+        for s in ranks.standings
+    ]
+    header = [*_LABELS, "fit (s)", "score (µs per step)", "peak memory (MB)"]
+    return Table("Cost", header, rows, labels=3)
+
+
+def wins(ranks: RankedBoard) -> Table | None:
+    """Return in which share of cells the row beats the column; None with fewer than two rows."""
+    labels = list(ranks.ranking.ranks)
+    rates = {pair: _percent(rate) for pair, rate in ranks.rates.items()}
+    rows = [[row, *(rates.get((row, other), "") for other in labels)] for row in labels]
+    title = "Win rates: share of cells (%) in which the row's matched AUC is above the column's"
+    return Table(title, ["detector", *labels], rows) if len(labels) > 1 else None
+
+
+def findings(board: Board) -> list[str]:
+    """Return a sentence for every detector that a simple row beats, in matched AUC or AUC.
+
+    The clock's AUC is left out: it is 1 by construction.
+    """
+    sentences = []
+    for entry, simple in itertools.product(board.entries, board.entries):
+        own_kind = board.is_trivial(entry) or simple.detector == entry.detector
+        if simple.detector not in _SIMPLE or simple.horizon != entry.horizon or own_kind:
+            continue
+        names = ("auc_matched",) if simple.detector == "clock" else ("auc_matched", "auc")
+        for info in map(metric_info, names):
+            theirs, own, cells = board.compare(simple, entry, info.name)
+            if theirs > own:
+                sentences.append(
+                    f"{simple} beats {entry} in mean {info.title}: {info.text(theirs)} against "
+                    f"{info.text(own)} over {cells} cell{'s' if cells != 1 else ''}."
+                )
+    return sentences
+
+
+def notes(board: Board) -> list[str]:
+    """Return what has to stand below the tables of a board."""
+    seeds = ", ".join(map(str, board.test_seeds()))
+    facts = f"digest {board.digest[:12]}, protocol {board.protocol}"
+    lines = [f"Split {board.split}, {facts}, test seeds per environment: {seeds}."]
+    if board.limit is not None:
+        lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
+    for group in filter(board.in_group, GROUPS):
+        own = [a.id for a in ANOMALIES.values() if a.group == group]
+        if missing := [a for a in own if a not in board.anomalies]:
+            lines.append(f"Means over {group} anomalies are without {', '.join(missing)}.")
+    lines.append(
+        f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
+        "* marks a mean over fewer cells than other rows have. A failure is shown as its state."
+    )
+    return lines
+
+
+def ranking_notes(ranks: RankedBoard) -> list[str]:
+    """Return what has to stand below a ranking."""
+    lines = [f"Not ranked: {one.entry}, {one.state}." for one in ranks.standings if one.state]
+    seeds = ranks.board.test_seeds()
+    if seeds and seeds[0] < _FEW and len(ranks.ranking.ranks) > 1:
+        lines.append(
+            f"With {seeds[0]} test seeds per environment small differences stay hidden: rows that "
+            "share a letter may well differ."
+        )
+    return lines
+
+
+def _by_metric(
+    board: Board, title: str, columns: Sequence[_Mean], standings: Sequence[Standing] = ()
+) -> Table:
+    """Return columns with a row per detector, or per standing with its place."""
+    labels = {one.entry: _labels(one) for one in standings} or {e: [str(e)] for e in board.entries}
+    rows = [[*label, *_texts(board, entry, columns)] for entry, label in labels.items()]
+    first = _LABELS if standings else ("detector",)
+    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first))
+
+
+def _present(board: Board, names: Iterable[str]) -> list[str]:
+    """Return the metrics that any record has."""
+    found = {name for record in board.records for name in record.metrics}
+    return [name for name in names if name in found]
+
+
+def _labels(one: Standing) -> list[str]:
+    """Return rank, detector (marked where it is trivial), and settings with the number of seeds."""
+    overrides = [f"{k}={v}" for k, v in one.entry.overrides.items()]
+    several = [f"{one.seeds} seeds"] if one.seeds > 1 else []
+    return [
+        UNDEFINED if one.rank is None else str(one.rank),
+        f"{one.entry.detector} (trivial)" if one.trivial else one.entry.detector,
+        ", ".join([f"Δ={one.entry.horizon}", *overrides, *several]),
+    ]
+
+
+def _percent(rate: float) -> str:
+    return UNDEFINED if math.isnan(rate) else f"{100 * rate:.0f}"
+
+
+def _digits(value: float) -> str:
+    """Return two significant digits, or the whole part of what is larger; at least 0.001."""
+    if math.isnan(value):
+        return UNDEFINED
+    if 0 < value < 0.001:
+        return "< 0.001"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
