@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -13,14 +14,15 @@ from helpers_plugins import install
 from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
 
 from oodd_eval import load_split
-from oodd_eval.errors import ExecutorError, SplitError, UsageError
+from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import Orders, opener, remote
-from oodd_eval.scoring.executors.local import LocalExecutor
-from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.executors import LocalExecutor, RunSettings, open_executor
+from oodd_eval.scoring.planning import make_plan
 from oodd_eval.scoring.unit import UnitJob
+
+remote = pytest.importorskip("oodd_eval.scoring.executors.dask", reason="needs the extra dask")
 
 VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
 NEVER = threading.Event()
@@ -46,8 +48,13 @@ def closed_files():
     remote._environment.cache_clear()
 
 
-def order(job, tiny_split, **changes):
-    return {**remote.order_of(job, load_split(tiny_split), Limits()), **changes}
+def ordered(job, tiny_split, limits=Limits(), stop=NEVER, **changes):  # noqa: B008
+    """Send an order through JSON, as to another machine, and return what comes back."""
+    order = json.loads(json.dumps(remote.order_of(job, load_split(tiny_split), limits)))
+    for place, value in changes.items():
+        part, _, name = place.partition("__")
+        order[part] = {**order[part], name: value} if name else value
+    return remote.run_order(order, stop)
 
 
 @pytest.mark.parametrize(
@@ -55,61 +62,47 @@ def order(job, tiny_split, **changes):
 )
 def test_an_executor_that_does_not_exist_is_refused(name):
     with pytest.raises(UsageError, match="expected 'local' or 'dask://HOST:PORT'"):
-        opener(name)
+        open_executor(RunSettings(executor=name), None, None)
 
 
-def test_the_local_executor_uses_all_cores_unless_told(tiny_split):
-    orders = Orders(load_split(tiny_split), Limits(), None, fresh=False)
-    assert opener("local")(orders, 3).jobs == 3
-    assert opener("local")(orders, None).jobs == len(os.sched_getaffinity(0))
+def test_the_local_executor_uses_all_cores_unless_told():
+    assert open_executor(RunSettings(jobs=3), None, None).jobs == 3
+    assert open_executor(RunSettings(), None, None).jobs == len(os.sched_getaffinity(0))
 
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
-    sent = json.loads(json.dumps(order(job, tiny_split)))
-    there = remote.scored_of(remote.carry_out(sent, NEVER))
-    here = LocalExecutor(1, Limits(), None, NEVER)(job)
-    assert there.status == here.status == "ok"
-    assert {k: [s.tolist() for s in v] for k, v in there.file.parts.items()} == {
+    there = ordered(job, tiny_split)
+    here = LocalExecutor(RunSettings(jobs=1), None, NEVER)(job)
+    assert there["status"] == here.status == "ok"
+    assert {k: [s.tolist() for s in v] for k, v in there["parts"].items()} == {
         k: [s.tolist() for s in v] for k, v in here.file.parts.items()
     }
 
 
 def test_limits_travel_with_the_order(job, tiny_split):
-    sent = remote.order_of(job, load_split(tiny_split), Limits(seconds=0.001, memory=10**10))
-    scored = remote.scored_of(remote.carry_out(sent, NEVER))
-    assert (scored.status, scored.reason) == ("timeout", "not done after 0.001 s (--timeout)")
+    found = ordered(job, tiny_split, Limits(seconds=0.001, memory=10**10))
+    assert (found["status"], found["reason"]) == ("timeout", "not done after 0.001 s (--timeout)")
 
 
 def test_work_that_nobody_waits_for_is_given_up(job, tiny_split):
     stop = threading.Event()
     stop.set()
-    scored = remote.scored_of(remote.carry_out(order(job, tiny_split), stop))
-    assert (scored.status, scored.reason) == ("error", "interrupted")
+    found = ordered(job, tiny_split, stop=stop)
+    assert (found["status"], found["reason"]) == ("error", "interrupted")
 
 
-def test_another_version_of_the_package_is_refused(job, tiny_split):
-    with pytest.raises(ExecutorError, match=r"it has oodd-eval \S+, expected 99 as on this side"):
-        remote.scored_of(remote.carry_out(order(job, tiny_split, version="99"), NEVER))
-
-
-def test_other_code_of_a_plugin_is_refused(job, tiny_split):
-    sent = order(job, tiny_split)
-    sent["key"] = {**sent["key"], "source": "0" * 64}
-    with pytest.raises(ExecutorError, match=r"plug-in 'trivial' has the source .* expected '0000"):
-        remote.scored_of(remote.carry_out(sent, NEVER))
-
-
-def test_a_missing_plugin_is_refused(job, tiny_split):
-    with pytest.raises(ExecutorError, match="no-such"):
-        remote.scored_of(remote.carry_out(order(job, tiny_split, plugin="no-such"), NEVER))
-
-
-def test_a_split_with_another_digest_is_refused_with_the_places_looked_at(job, tiny_split):
-    sent = order(job, tiny_split)
-    sent["plan"] = {**sent["plan"], "split_digest": "f" * 64}
-    sent["key"] = {**sent["key"], "split_digest": "f" * 64}
-    with pytest.raises(ExecutorError, match=r"digest ffffffffffff is not there \(.*tiny has the"):
-        remote.scored_of(remote.carry_out(sent, NEVER))
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": "99"}, r"it has oodd-eval \S+, expected 99 as on this side"),
+        ({"unit__source": "0" * 64}, r"plug-in 'trivial' has the source .* expected '0000"),
+        ({"unit__version": "9.9"}, r"plug-in 'trivial' has the version .* expected '9.9'"),
+        ({"unit__plugin": "no-such"}, "no-such"),
+        ({"plan__split_digest": "f" * 64}, r"digest ffffffffffff is not there \(.*tiny has the"),
+    ],
+)
+def test_what_differs_on_the_other_machine_is_refused(job, tiny_split, change, message):
+    assert re.search(message, ordered(job, tiny_split, **change)["refused"])
 
 
 def test_a_split_that_lies_elsewhere_is_found_by_its_name(tiny_split, tmp_path, monkeypatch):
@@ -123,15 +116,6 @@ def test_a_split_that_lies_elsewhere_is_found_by_its_name(tiny_split, tmp_path, 
 
 
 # On a cluster
-
-
-dask = pytest.mark.skipif(
-    subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", "import distributed"], check=False,
-        capture_output=True,
-    ).returncode != 0,
-    reason="needs the extra dask",
-)  # fmt: skip
 
 
 class Cluster:
@@ -178,13 +162,12 @@ def stable(path):
     return [{k: v for k, v in p.items() if k not in VOLATILE} for p in plain]
 
 
-@dask
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
 def test_a_cluster_that_loses_a_worker_gives_the_same_records(tiny_split, monkeypatch, tmp_path):
     plugin, log = tmp_path / "plugin", tmp_path / "fits"
     install(monkeypatch, plugin, "slow", SLOW)
     variables = environment(plugin, log, RUN=str(tmp_path))
-    marker = f"RUN={tmp_path}".encode()
+    marker = f"RUN={tmp_path}"
     with oodd_eval(*command(tiny_split, tmp_path / "here"), env=variables) as here:
         output, _ = here.communicate(timeout=300)
     assert here.returncode == 0, output
@@ -232,7 +215,6 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_records(tiny_split, monkey
         assert "has no workers: start some with `dask worker tcp://127.0.0.1:" in output
 
 
-@dask
 def test_an_address_where_nobody_answers_is_named(tiny_split, tmp_path):
     code = (
         "import oodd_eval.scoring.executors.dask as d, sys; d.CONNECT_SECONDS = 0.2;"

@@ -4,7 +4,9 @@ import dataclasses
 import json
 import os
 import re
+import textwrap
 import time
+from types import SimpleNamespace
 
 import pytest
 from helpers_plugins import install
@@ -12,16 +14,18 @@ from helpers_plugins import install
 from oodd_eval import evaluate, load_split
 from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
 from oodd_eval.names import expression, memory_bytes, seconds, select, whole_numbers
+from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.baselines import Clock
-from oodd_eval.plugins.causality import PROBES
+from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.hooks import hookimpl
-from oodd_eval.plugins.isolation.supervisor import Limits, Request, _Sender
+from oodd_eval.plugins.isolation import Channel
+from oodd_eval.plugins.isolation.supervisor import Limits, Request, _send
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
-from oodd_eval.results.provenance import source_digest
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import Settings, run
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.keys import source_digest
+from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.runner import run
 
 HOSTILE = """
 class WrongLength(Good):
@@ -144,14 +148,13 @@ def run_tiny(split, detectors=("clock",), output=None, *, environments=("cartpol
              anomalies=("iid",), plugins=None, limit=None, observer=None, **settings):  # fmt: skip
     opened = load_split(split)
     plugins = plugins or discover()
-    if observer:
-        plugins.observe(observer, "observer")
     plan = make_plan(
         plugins, split=opened.name, split_digest=opened.digest, detectors=list(detectors),
         environments=list(environments), anomalies=list(anomalies), limit=limit,
     )  # fmt: skip
     results = ResultsDirectory(output) if output else None
-    return run(plan, opened, plugins, Settings(**settings), results)
+    watching = [observer] if observer else []
+    return run(plan, opened, plugins, RunSettings(**settings), results, watching)
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +187,7 @@ def test_no_detector_is_left_out_and_the_order_is_the_plans(hostile):
 
 def test_what_a_failing_detector_printed_is_kept(hostile):
     records, output = hostile
-    log = output / "logs" / f"{records['raisesinfit'].provenance['scores']}.txt"
+    log = output / "logs" / f"{records['raisesinfit'].scores}.txt"
     assert "Traceback" in log.read_text()
     assert "no mood" in log.read_text()
 
@@ -365,7 +368,7 @@ def test_earlier_records_that_cannot_be_read_are_found_before_any_work(
     tiny_split, tmp_path, counting
 ):
     (tmp_path / "records.jsonl").write_text("{")
-    with pytest.raises(ResultsError, match=r"records\.jsonl:1 is not JSON"):
+    with pytest.raises(ResultsError, match=r"records\.jsonl:1 is no record"):
         run_tiny(tiny_split, ["counting"], tmp_path)
     assert counting[1]() == []
 
@@ -399,10 +402,8 @@ def test_a_worker_is_told_no_names(tiny_split, tmp_path):
     anomalous = data.anomalous("iid")
     with (tmp_path / "sent").open("wb") as file:
         chunks = [list(anomalous), list(data.twins)]
-        sender = _Sender(os.dup(file.fileno()), request, data.train, chunks)
-        sender.join()
+        _send(_child(os.dup(file.fileno())), request, data.train, chunks)
     sent = (tmp_path / "sent").read_bytes()
-    assert sender.error is None
     assert anomalous[0].observations.tobytes() in sent
     for word in ("cartpole", "iid", "nominal", "calib", "test", "onset", "anom", "tiny"):
         assert word.encode() not in sent
@@ -442,10 +443,13 @@ def test_an_error_of_reading_data_is_kept_for_the_caller():
         raise OSError("disk gone")
 
     reading, writing = os.pipe()
-    sender = _Sender(writing, Request("trivial", "clock", {}, 0, 1, 0), broken(), [])
-    sender.join()
+    with pytest.raises(OSError, match="disk gone"):
+        _send(_child(writing), Request("trivial", "clock", {}, 0, 1, 0), broken(), [])
     os.close(reading)
-    assert isinstance(sender.error, OSError)
+
+
+def _child(descriptor):
+    return SimpleNamespace(channel=Channel(-1, descriptor), sending=descriptor)
 
 
 # Selection
@@ -495,7 +499,7 @@ def test_broken_expressions_are_refused(text):
 
 
 def test_numbers_times_and_amounts():
-    assert whole_numbers("--seed", "0,3,3", least=0) == [0, 3]
+    assert whole_numbers("0,3,3", least=0) == [0, 3]
     assert [seconds(t) for t in ("90", "1.5m", "2h")] == [90, 90, 7200]
     assert [memory_bytes(t) for t in ("8GB", "1 GiB", "500mb")] == [8 * 10**9, 2**30, 5 * 10**8]
 
@@ -503,31 +507,82 @@ def test_numbers_times_and_amounts():
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: whole_numbers("--horizon", "0", least=1),
-        lambda: whole_numbers("--seed", "x", least=0),
+        lambda: whole_numbers("0", least=1),
+        lambda: whole_numbers("x", least=0),
         lambda: seconds("soon"),
         lambda: seconds("0"),
         lambda: memory_bytes("8 bananas"),
     ],
 )
 def test_what_is_no_number_is_refused(call):
-    with pytest.raises(UsageError, match=r"expected whole numbers|is not an? "):
+    with pytest.raises(UsageError, match=r"expected (whole numbers|a time|an amount)"):
         call()
 
 
-def test_cell_ids_name_what_is_not_a_default(monkeypatch, tmp_path, tiny_split):
+@pytest.fixture
+def tuned(monkeypatch, tmp_path):
     code = """
+    from dataclasses import dataclass
+    from oodd_eval.plugins.parameters import parameter
+
+    @dataclass(frozen=True)
+    class Parameters:
+        size: int = parameter(5)
+        kind: str = parameter("a")
+        draws: int = parameter(1, decides="scores")
+        device: str = parameter("cpu", decides="nothing")
+
     @hookimpl
     def oodd_detectors():
-        return [DetectorSpec("tuned", Good, "", parameters={"size": 5, "kind": "a"})]
+        return [DetectorSpec("tuned", Good, "", parameters=Parameters, horizon_decides_fit=False)]
     """
-    install(monkeypatch, tmp_path, "tuned", code)
-    plan = make_plan(
-        discover(), split="mini", split_digest="", detectors=["tuned"], environments=["ant"],
-        anomalies=["iid"], horizons=[10], seeds=[3], parameters={"size": 7, "kind": "a"},
-    )  # fmt: skip
-    assert plan.cells == ["mini/ant/iid::tuned[h=10,seed=3,size=7]"]
-    assert plan.units[0].parameters == {"kind": "a", "size": 7}
+    install(monkeypatch, tmp_path, "tuned", textwrap.dedent(code))
+    return discover()
+
+
+def tuned_unit(plugins, digest="dd", **changes):
+    asked = {"environments": ["ant"], "anomalies": ["iid"], "horizons": [10], "seeds": [3],
+             "parameters": {"size": 7, "kind": "a"}, **changes}  # fmt: skip
+    (unit,) = make_plan(
+        plugins, split="mini", split_digest=digest, detectors=["tuned"], **asked
+    ).units
+    return unit
+
+
+def test_cells_name_what_is_not_a_default(tuned):
+    unit = tuned_unit(tuned)
+    assert unit.label == "tuned[h=10,seed=3,size=7]"
+    assert unit.parameters == {"device": "cpu", "draws": 1, "kind": "a", "size": 7}
+
+
+@pytest.mark.parametrize(
+    ("change", "scores", "fit"),
+    [
+        ({"digest": "ee"}, True, True),
+        ({"seeds": [4]}, True, True),
+        ({"environments": ["hopper"]}, True, True),
+        ({"limit": 3}, True, True),
+        ({"parameters": {"size": 8}}, True, True),
+        ({"parameters": {"size": 7, "draws": 2}}, True, False),
+        ({"horizons": [1]}, True, False),
+        ({"anomalies": ["drift"]}, False, False),
+        ({"parameters": {"kind": "a", "size": 7, "draws": 1}}, False, False),
+        ({"device": "cuda"}, False, False),
+    ],
+)
+def test_everything_that_decides_scores_or_the_fit_is_in_their_key(tuned, change, scores, fit):
+    before, after = tuned_unit(tuned), tuned_unit(tuned, **change)
+    assert (before.scores_key != after.scores_key, before.fit_key != after.fit_key) == (scores, fit)
+
+
+def test_the_device_reaches_the_detector_and_makes_no_row_of_its_own(tuned):
+    unit = tuned_unit(tuned, device="cuda")
+    assert unit.parameters["device"] == "cuda"
+    assert unit.setting == tuned_unit(tuned).setting
+    assert "device" not in unit.shown
+    with pytest.raises(UsageError, match="none of the detectors has a device"):
+        make_plan(tuned, split="mini", split_digest="", detectors=["clock"], environments=["ant"],
+                  device="cuda")  # fmt: skip
 
 
 def test_filtering_a_plan_drops_units_without_cells():
@@ -536,7 +591,8 @@ def test_filtering_a_plan_drops_units_without_cells():
         environments=["ant", "hopper"],
     )  # fmt: skip
     assert len(plan.cells) == 2 * 2 * 8
-    assert plan.matching(expression("clock and ant/ and wind")).cells == [
+    left = plan.matching(expression("clock and ant/ and wind"))
+    assert list(map(str, left.cells)) == [
         "mini/ant/wind-l2r::clock[h=1,seed=0]",
         "mini/ant/wind-r2l::clock[h=1,seed=0]",
     ]

@@ -1,1 +1,1 @@
-"""Room."""
+"""Scoring: from names to a plan, from a plan to scores and records."""

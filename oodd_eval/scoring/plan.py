@@ -1,60 +1,66 @@
-"""What a run is going to do: units (one fit each) and their cells (one anomaly each)."""
+"""A plan: the units of a run (one fit each) and their cells (one anomaly each). Data only."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import ANOMALIES, PROTOCOL
 from oodd_eval.names import Predicate
-from oodd_eval.plugins.discovery import Plugins, resolve_parameters
+from oodd_eval.results.identity import Cell, Setting
+from oodd_eval.results.record import Record
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One fit: detector x parameters x horizon x seed x environment, and what it is scored on.
+    """One fit: setting x seed x environment, and the anomalies that it scores.
 
-    Attributes
-    ----------
-    detector, horizon, seed, environment
-        Names and numbers as on the command line.
-    parameters
-        All parameters, defaults included, sorted by name.
-    overrides
-        Those parameters that are not at their default: part of the cell's id.
-    anomalies
-        Ids of the anomalies to score.
+    `parameters` are all that the factory gets, sorted by name; `shown` are those that are part of
+    the result, which the device is not. `plugin` is empty for a factory of this process, which has
+    no `source` (the digest of a plug-in's code) and no keys of stored scores and fits.
     """
 
-    detector: str
-    horizon: int
-    seed: int
     environment: str
-    parameters: Mapping[str, Any]
-    overrides: Mapping[str, Any]
+    setting: Setting
+    seed: int
     anomalies: tuple[str, ...]
+    parameters: Mapping[str, Any]
+    shown: Mapping[str, Any]
+    plugin: str
+    distribution: str
+    version: str
+    source: str = ""
+    inputs: str = ""
+    scores_key: str = ""
+    fit_key: str = ""
+
+    @property
+    def detector(self) -> str:
+        """Name of the detector."""
+        return self.setting.detector
+
+    @property
+    def horizon(self) -> int:
+        """Prediction horizon in steps."""
+        return self.setting.horizon
 
     @property
     def label(self) -> str:
-        """Detector and settings, the right-hand part of the cell's id."""
-        settings = {"h": self.horizon, "seed": self.seed, **self.overrides}
-        return f"{self.detector}[{','.join(f'{k}={_plain(v)}' for k, v in settings.items())}]"
+        """Setting and seed, such as ``riqn[h=1,seed=0]``."""
+        return self.setting.label(self.seed)
+
+    @property
+    def local(self) -> bool:
+        """True if the detector is no plug-in's and runs in this process."""
+        return not self.plugin
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All units of a run, in the order of the records.
+    """All units of a run, in the order in which they are begun and recorded.
 
-    Attributes
-    ----------
-    split, split_digest
-        The data.
-    units
-        What is fitted.
-    limit
-        The first so many trajectories of each part are used; None means all.
+    Of each part the first `limit` trajectories are used; None means all.
     """
 
     split: str
@@ -63,66 +69,41 @@ class Plan:
     limit: int | None = None
 
     @property
-    def cells(self) -> list[str]:
-        """Ids of all cells, in order."""
+    def cells(self) -> list[Cell]:
+        """All cells, in order."""
         return [self.cell(unit, anomaly) for unit in self.units for anomaly in unit.anomalies]
 
-    def cell(self, unit: Unit, anomaly: str) -> str:
-        """Return the id of one cell, such as ``mini/hopper/iid::riqn[h=1,seed=0]``."""
-        return f"{self.split}/{unit.environment}/{anomaly}::{unit.label}"
+    def cell(self, unit: Unit, anomaly: str) -> Cell:
+        """Return one cell of a unit."""
+        return Cell(self.split, unit.environment, anomaly, unit.setting, unit.seed)
 
     def matching(self, wanted: Predicate) -> Plan:
-        """Return the plan with those cells only whose ids pass; units without any are left out."""
+        """Return the plan with those cells only whose text passes, without empty units."""
         units = (
-            replace(u, anomalies=tuple(a for a in u.anomalies if wanted(self.cell(u, a))))
+            replace(u, anomalies=tuple(a for a in u.anomalies if wanted(str(self.cell(u, a)))))
             for u in self.units
         )
         return replace(self, units=tuple(u for u in units if u.anomalies))
 
-
-def make_plan(
-    plugins: Plugins,
-    *,
-    split: str,
-    split_digest: str,
-    detectors: Sequence[str],
-    environments: Sequence[str],
-    anomalies: Sequence[str] = tuple(ANOMALIES),
-    horizons: Sequence[int] = (1,),
-    seeds: Sequence[int] = (0,),
-    parameters: Mapping[str, Any] | None = None,
-    limit: int | None = None,
-) -> Plan:
-    """Lay out every unit, environments outermost.
-
-    Raises
-    ------
-    UnknownNameError
-        When a detector or one of its parameters does not exist.
-    """
-    offers = [plugins.offer(name) for name in detectors]
-    settings = [(o.spec, resolve_parameters(o.spec, parameters or {})) for o in offers]
-    units = tuple(
-        Unit(
-            detector=spec.name,
-            horizon=horizon,
-            seed=seed,
-            environment=environment,
-            parameters=resolved,
-            overrides={
-                k: v
-                for k, v in resolved.items()
-                if k not in spec.parameters or v != spec.parameters[k]
-            },
-            anomalies=tuple(anomalies),
+    def blank(self, unit: Unit, anomaly: str, **outcome: Any) -> Record:
+        """Return the record of a cell with its identity filled in, and no metrics."""
+        return Record(
+            detector=unit.detector,
+            detector_version=unit.version,
+            plugin=f"{unit.distribution}:{unit.plugin}",
+            plugin_source=unit.source,
+            parameters=dict(unit.shown),
+            overrides=unit.setting.overrides,
+            inputs=unit.inputs,
+            environment=unit.environment,
+            anomaly=anomaly,
+            group=ANOMALIES[anomaly].group,
+            horizon=unit.horizon,
+            seed=unit.seed,
+            split=self.split,
+            split_digest=self.split_digest,
+            limit=self.limit,
+            scores=unit.scores_key,
+            protocol=PROTOCOL,
+            **outcome,
         )
-        for environment in environments
-        for spec, resolved in settings
-        for horizon in horizons
-        for seed in seeds
-    )
-    return Plan(split, split_digest, units, limit)
-
-
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, default=str)

@@ -1,195 +1,192 @@
-"""Carry out a plan: one worker per unit, several at a time, every finished unit kept at once.
+"""Run a plan: one worker per unit, several at a time, every finished unit kept at once.
 
-The runner prints nothing. Observers (`oodd_eval.plugins.hooks`) hear of every cell, and results are the
-same bytes for any number of jobs.
+The runner prints nothing. Observers (`oodd_eval.scoring.observers`) hear of every cell, and results
+are the same bytes for any number of jobs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+import time
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from graphlib import TopologicalSorter
 
-from oodd_eval.data.split import EnvironmentData, Split
+from oodd_eval.data.parts import EnvironmentData, limited
+from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
-from oodd_eval.plugins.isolation.supervisor import Limits
-from oodd_eval.results import provenance
-from oodd_eval.results.directory import ResultsDirectory, unit_key
-from oodd_eval.results.evaluate import make_records
-from oodd_eval.results.keeping import Keeper
+from oodd_eval.results.directory import RecordWriter, ResultsDirectory
+from oodd_eval.results.evaluate import evaluated
+from oodd_eval.results.provenance import gather
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.executors import LOCAL as LOCAL_EXECUTOR
-from oodd_eval.scoring.executors import Executor, Orders, available_cores, opener
-from oodd_eval.scoring.executors.turns import Turns
+from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
+from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan
-from oodd_eval.scoring.unit import LOCAL, Scored, UnitJob
-
-__all__ = ["Run", "Settings", "available_cores", "run"]
+from oodd_eval.scoring.unit import Scored, UnitJob
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """How to run, without influence on any metric.
+class RunOutcome:
+    """Records of the finished units in the order of the plan, and the number of units left.
 
-    Attributes
-    ----------
-    jobs
-        Units at a time; None means one per core, or per thread of a cluster.
-    limits
-        Of each unit's worker.
-    fresh
-        Whether to fit again what the results directory has already.
-    stop_on_failure
-        Whether to end the run at the first cell that is not ok.
-    executor
-        Where units are carried out: ``"local"`` or ``"dask://HOST:PORT"``.
+    Units are left after an interrupt (Ctrl-C), a failure with `stop_on_failure`, or a deadline.
     """
-
-    jobs: int | None = None
-    limits: Limits = field(default_factory=Limits)
-    fresh: bool = False
-    stop_on_failure: bool = False
-    executor: str = LOCAL_EXECUTOR
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """What a run came to: records in the order of the plan, and whether it was interrupted."""
 
     records: list[Record]
     interrupted: bool = False
+    left: int = 0
 
 
 def run(
     plan: Plan,
     split: Split,
     plugins: Plugins,
-    settings: Settings,
+    settings: RunSettings,
     results: ResultsDirectory | None = None,
-) -> Run:
-    """Fit and score every unit of a plan.
+    observers: Sequence[object] = (),
+) -> RunOutcome:
+    """Fit and score every unit of a plan, which was made for the split.
 
-    Parameters
-    ----------
-    plan
-        What to do.
-    split
-        The data; `plan` was made for it.
-    plugins
-        Detectors, and the observers that hear of the progress.
-    settings
-        How to do it.
-    results
-        Where to keep scores and records, and to resume from; None keeps nothing.
-
-    Returns
-    -------
-    Run
-        A failing detector is a record with another status than ``"ok"``. An interrupted run has the
-        records of the units that were finished.
-
-    Raises
-    ------
-    UsageError, ExecutorError
-        Before any work, when the executor does not exist.
-    OutputError
-        Before any work, when `results` cannot be written to.
-    SplitError
-        When data is missing or damaged; what was finished is kept.
+    Scores and records are kept in `results`, from which a later run resumes; None keeps nothing.
+    `observers` are objects of the program that hear of the progress, beside those that a plug-in
+    offers. A failing detector is a record with another status than ``"ok"``. An executor or a
+    results directory that cannot be used raises before any work; missing or damaged data raises
+    `SplitError`, and what was finished is kept.
     """
-    open_executor = opener(settings.executor)
-    keeper = Keeper(results)
-    keeper.prepare()
-    executor = open_executor(Orders(split, settings.limits, results, settings.fresh), settings.jobs)
+    check_executor(settings.executor)
+    if results:
+        results.prepare()
+    executor = open_executor(settings, split, results)
+    writer = RecordWriter(results)
+    hearing = Observers(plugins, observers)
     data: dict[str, EnvironmentData] = {}
-    interrupted = False
+    interrupted, done = False, 0
     try:
         for environment in dict.fromkeys(unit.environment for unit in plan.units):
             data[environment] = split.environment(environment)
-        plugins.notify("oodd_run_started", plan=plan)
-        _carry_out(plan, data, plugins, settings, executor, keeper)
+        jobs = [
+            UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
+            for unit in plan.units
+        ]
+        hearing.notify("oodd_run_started", plan=plan)
+        origin = gather(settings.command)
+        with closing(_as_they_finish(jobs, executor, settings, results)) as finished:
+            for index, scored in finished:
+                done += 1
+                records = _records(jobs[index], scored, origin)
+                writer.add(index, records)
+                for record in records:
+                    hearing.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
+                if settings.stop_on_failure and scored.status != "ok":
+                    break
     except KeyboardInterrupt:
         interrupted = True
     finally:
         executor.close()
         for opened in data.values():
             opened.close()
-        keeper.write()
-    records = keeper.records
-    plugins.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
-    return Run(records, interrupted)
-
-
-def _carry_out(
-    plan: Plan,
-    data: dict[str, EnvironmentData],
-    plugins: Plugins,
-    settings: Settings,
-    executor: Executor,
-    keeper: Keeper,
-) -> None:
-    """Carry out the units, make records of each, and tell the observers."""
-    origin = provenance.gather()
-    jobs = [
-        UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
-        for unit in plan.units
-    ]
-
-    def score(job: UnitJob) -> Scored:
-        scored = executor(job)
-        if job.offer.plugin != LOCAL:
-            keeper.keep(unit_key(plan, job.unit, job.offer), scored)
-        return scored
-
-    with closing(_as_they_finish(jobs, score, executor)) as outcomes:
-        for index, scored in outcomes:
-            job, source = jobs[index], {}
-            if job.offer.plugin != LOCAL:
-                key = unit_key(plan, job.unit, job.offer)
-                source = {"plugin_source": key.source, "scores": key.text}
-            records = make_records(plan, job.unit, job.offer, job.data, scored, origin, **source)
-            keeper.add(index, records)
-            for record in records:
-                plugins.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
-            if settings.stop_on_failure and scored.status != "ok":
-                return
+        writer.write()
+    records = writer.records
+    hearing.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
+    return RunOutcome(records, interrupted, len(plan.units) - done)
 
 
 def _as_they_finish(
-    jobs: Sequence[UnitJob], score: Callable[[UnitJob], Scored], executor: Executor
+    jobs: Sequence[UnitJob],
+    executor: Executor,
+    settings: RunSettings,
+    results: ResultsDirectory | None,
 ) -> Generator[tuple[int, Scored], None, None]:
     """Yield places of jobs and their scores as they finish.
 
-    A job is begun only when one of those before it has been taken, so that the scores of a few
-    units are in memory, however many there are.
+    A unit whose fit another unit is about to make waits for that one. Only a few more units are
+    begun than are taken, so that few scores are in memory, however many units there are.
     """
+    end = None if settings.deadline is None else time.monotonic() + settings.deadline
+    # With twice as many, no thread is idle while records are made. What waits in the pool begins
+    # later, however, which a deadline forbids.
+    most = executor.jobs * (2 if end is None else 1)
+    waiting = _in_dependence(jobs, executor, settings, results)
+    waiting.prepare()
+    ready: list[int] = []
+    running: dict[Future[Scored], int] = {}
+
+    def score(job: UnitJob) -> Scored:
+        scored = executor(job)
+        if results and not job.unit.local:
+            if scored.status == "ok" and not scored.resumed:
+                results.write_scores(job.unit.scores_key, scored.file)
+            if scored.log:
+                results.write_log(job.unit.scores_key, scored.log)
+        return scored
+
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
-    elsewhere = [(i, job) for i, job in enumerate(jobs) if job.offer.plugin != LOCAL]
-    turns = Turns(elsewhere, executor.fit_of)
-
-    def turn() -> tuple[int, Scored]:
-        with turns.take() as (index, job):
-            return index, score(job)
-
-    running: list[Future[tuple[int, Scored]]] = []
-    waiting = enumerate(jobs)
     try:
-        while True:
-            # Twice as many as are carried out at a time: nobody waits while records are made.
-            while len(running) < 2 * executor.jobs and (entry := next(waiting, None)):
-                index, job = entry
-                if job.offer.plugin == LOCAL:
-                    yield index, score(job)  # in this thread, where it can be interrupted
+        while waiting.is_active():
+            ready = sorted([*ready, *waiting.get_ready()])
+            while ready and len(running) < most:
+                if end is not None and time.monotonic() >= end:
+                    ready.clear()
+                    break
+                index = ready.pop(0)
+                if jobs[index].unit.local:
+                    yield index, score(jobs[index])  # in this thread, where it can be interrupted
+                    waiting.done(index)
+                    ready = sorted([*ready, *waiting.get_ready()])
                 else:
-                    running.append(pool.submit(turn))
+                    running[pool.submit(score, jobs[index])] = index
             if not running:
                 return
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            finished = wait(running, return_when=FIRST_COMPLETED).done
             for future in [f for f in running if f in finished]:
-                running.remove(future)
-                yield future.result()
+                index = running.pop(future)
+                waiting.done(index)
+                yield index, future.result()
     finally:
         executor.stop()
-        turns.stop()
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_dependence(
+    jobs: Sequence[UnitJob],
+    executor: Executor,
+    settings: RunSettings,
+    results: ResultsDirectory | None,
+) -> TopologicalSorter[int]:
+    """Return the places of all jobs, those that share a fit behind the first, which makes it."""
+    graph: TopologicalSorter[int] = TopologicalSorter()
+    makers: dict[str, int] = {}
+    for index, job in enumerate(jobs):
+        graph.add(index)
+        key = job.unit.fit_key
+        if not (executor.keeps_fits and results and key) or results.fits.has(
+            key, fresh=settings.fresh
+        ):
+            continue
+        if (maker := makers.setdefault(key, index)) != index:
+            graph.add(index, maker)
+    return graph
+
+
+def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Record]:
+    """Return the records of a unit's cells, in the order of its anomalies."""
+    plan, unit, cost = job.plan, job.unit, dict(scored.file.cost)
+    counts = {"train": job.data.train, "calibration": job.data.calibration, "test": job.data.twins}
+    # A whole number, also when it was read back from a file of floats.
+    steps = int(cost.pop("steps_scored")) if "steps_scored" in cost else None
+    device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
+    records = [
+        plan.blank(
+            unit,
+            anomaly,
+            status=scored.status,
+            reason=scored.reason,
+            counts={part: limited(len(known), plan.limit) for part, known in counts.items()},
+            steps_scored=steps,
+            provenance={**origin, **device},
+            **cost,
+        )
+        for anomaly in unit.anomalies
+    ]
+    return evaluated(records, scored.file, job.data) if scored.status == "ok" else records

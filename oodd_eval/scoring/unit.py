@@ -1,4 +1,4 @@
-"""Get the checked scores of one unit: from an earlier run, a worker, or this process."""
+"""Score one unit: take kept scores, or fit and score in a worker, and check all that comes back."""
 
 from __future__ import annotations
 
@@ -10,47 +10,48 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.layout import TWINS
-from oodd_eval.data.split import EnvironmentData, TrajectorySet
-from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.data.parts import EnvironmentData, TrajectorySet, lengths_of, limited, parts_of
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.causality import Probe, check_prefix, probes
-from oodd_eval.plugins.contract import Scores, check_scores
-from oodd_eval.plugins.discovery import Offer
-from oodd_eval.plugins.isolation.processes import printable
+from oodd_eval.plugins.contract import (
+    Scores,
+    check_prefix,
+    check_scores,
+    make_detector,
+    probes,
+    score_chunk,
+)
+from oodd_eval.plugins.discovery import Offer, printable
 from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Request, Stop, run_isolated
-from oodd_eval.plugins.isolation.worker import make_detector, score_chunk
-from oodd_eval.results.directory import ResultsDirectory, ScoreFile, fit_key, unit_key
-from oodd_eval.results.fits import FittedStore
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.fits import FitStore
+from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
-CALIBRATION: Final = "calibration"
-
-LOCAL: Final = ""
-"""Plug-in name of a detector that is no plug-in's: it runs in this process."""
+COSTS: Final = ("seconds_fit", "seconds_score", "peak_rss_mb")
 
 
 @dataclass(slots=True)
 class Scored:
     """Checked scores of one unit by part, or the way in which it failed.
 
-    `log` is the end of what a failing detector printed; `resumed` tells scores of an earlier run.
-    The reason may have come from the detector: it is made fit to print.
+    Status and reason are as in a record. `log` is the end of the output of a failing detector;
+    `resumed` tells scores of an earlier run.
     """
 
-    status: str = "ok"
+    status: Status = "ok"
     reason: str = ""
     file: ScoreFile = field(default_factory=lambda: ScoreFile({}, {}))
     log: str = ""
     resumed: bool = False
 
     def __post_init__(self) -> None:
+        # It may have come from the detector.
         self.reason = printable(self.reason)
 
 
 @dataclass(frozen=True, slots=True)
 class UnitJob:
-    """One unit's work, in a thread of its own: scores from the cache, a worker or this process."""
+    """The work of one unit, to be called in a thread of its own."""
 
     plan: Plan
     unit: Unit
@@ -58,193 +59,149 @@ class UnitJob:
     offer: Offer
 
     def __call__(
-        self,
-        limits: Limits,
-        stop: Stop,
-        results: ResultsDirectory | None,
-        *,
-        fresh: bool,
+        self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
     ) -> Scored:
         """Return the unit's scores, or how its detector failed."""
-        sets = parts_of(self.data, self.unit.anomalies)
-        counts = {part: limited(len(s), self.plan.limit) for part, s in sets.items()}
-        if self.offer.plugin == LOCAL:
-            return self._in_process(sets, counts)
+        work = _Work(self, parts_of(self.data, self.unit.anomalies))
+        if self.unit.local:
+            return work.in_process()
         if reason := self.offer.unavailable():
             return Scored("unavailable", reason)
-        if not fresh and (kept := self.stored(results)):
+        if not fresh and (kept := self.kept(results)):
             return kept
-        # A worker knows its seed, but not the digest: it cannot draw the same.
-        order, again = shuffled(counts, self._key), self._probes()
 
         def isolated(*, load: str = "", save: str = "") -> Outcome:
-            train = 0 if load else limited(len(self.data.train), self.plan.limit)
-            return run_isolated(
-                Request(
-                    plugin=self.offer.plugin,
-                    detector=self.unit.detector,
-                    parameters=dict(self.unit.parameters),
-                    seed=self.unit.seed,
-                    horizon=self.unit.horizon,
-                    train=train,
-                    load=load,
-                    save=save,
-                ),
-                islice(self.data.train, train),
-                (sets[part][i] for part, i in order),
-                (sets[p.part][p.index][: p.rows] for p in again),
-                limits=limits,
-                stop=stop,
-            )
+            return work.isolated(limits, stop, load=load, save=save)
 
-        if results:
-            key = fit_key(self.plan, self.unit, self.offer)
-            outcome = _with_store(isolated, results.fitted, key, stop, fresh=fresh)
-        else:
-            outcome = isolated()
-        return self._checked(outcome, order, again, sets, counts)
+        if results is None:
+            return work.checked(isolated())
+        fits = results.fits
+        return work.checked(_with_kept_fit(isolated, fits, self.unit.fit_key, stop, fresh=fresh))
 
-    def stored(self, results: ResultsDirectory | None) -> Scored | None:
+    def kept(self, results: ResultsDirectory | None) -> Scored | None:
         """Return the scores that an earlier run has kept, if they are there and fit."""
         if results is None:
             return None
-        key = unit_key(self.plan, self.unit, self.offer).text
-        kept = results.scores(key, self._lengths())
+        lengths = lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
+        kept = results.scores(self.unit.scores_key, lengths)
         return Scored(file=kept, resumed=True) if kept else None
 
-    def _checked(
-        self,
-        outcome: Outcome,
-        order: list[tuple[str, int]],
-        again: list[Probe],
-        sets: Mapping[str, TrajectorySet],
-        counts: Mapping[str, int],
-    ) -> Scored:
-        """Check every score sequence and put them back in order."""
+
+class _Work:
+    """The trajectories of one unit, the order in which they are scored, and the checks of scores.
+
+    Scoring is in an order that tells nothing of parts. A worker knows its seed, but not the
+    split's digest: it cannot draw the same order.
+    """
+
+    def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
+        self._job, self._sets = job, sets
+        self._lengths = lengths_of(sets, job.plan.limit)
+        key = f"{job.plan.split_digest}|{job.unit.environment}|{job.unit.seed}"
+        counts = {part: len(lengths) for part, lengths in self._lengths.items()}
+        self._order, self._probes = shuffled(counts, key), probes(self._lengths, key)
+
+    def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
+        """Fit (or load a fit) and score in a worker process."""
+        unit, data = self._job.unit, self._job.data
+        train = 0 if load else limited(len(data.train), self._job.plan.limit)
+        request = Request(
+            unit.plugin, unit.detector, dict(unit.parameters), unit.seed, unit.horizon, train,
+            load, save,
+        )  # fmt: skip
+        whole = (self._sets[part][i] for part, i in self._order)
+        cut = (self._sets[p.part][p.index][: p.rows] for p in self._probes)
+        return run_isolated(
+            request, islice(data.train, train), whole, cut, limits=limits, stop=stop
+        )
+
+    def checked(self, outcome: Outcome) -> Scored:
+        """Check every score sequence of a worker and put them back in order."""
         if outcome.status != "ok":
-            return Scored(outcome.status, outcome.reason, log=outcome.log)
-        parts: dict[str, list[Scores]] = {p: [np.empty(0)] * n for p, n in counts.items()}
+            return Scored(outcome.status, outcome.reason, log=outcome.log)  # type: ignore[arg-type]
+        parts: dict[str, list[Scores]] = {
+            p: [np.empty(0)] * len(n) for p, n in self._lengths.items()
+        }
+        returned, warm_up = outcome.scores, outcome.warm_up
+        whole, prefixes = returned[: len(self._order)], returned[len(self._order) :]
         try:
-            returned, warm_up = outcome.scores, outcome.warm_up
-            for (part, i), scores in zip(order, returned[: len(order)], strict=True):
-                parts[part][i] = self._check(scores, warm_up, part, i, sets[part][i])
-            for probe, scores in zip(again, returned[len(order) :], strict=True):
-                self._check_prefix(scores, warm_up, probe, sets, parts)
+            for (part, i), scores in zip(self._order, whole, strict=True):
+                parts[part][i] = self._check(scores, warm_up, part, i)
+            self._check_prefixes(prefixes, warm_up, parts)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
-        cost = {
-            "seconds_fit": outcome.seconds_fit,
-            "seconds_score": outcome.seconds_score,
-            "peak_rss_mb": outcome.peak_rss_mb,
-            "steps_scored": sum(len(scores) for part in parts.values() for scores in part)
-            + sum(probe.rows for probe in again),
-        }
+        steps = sum(map(sum, self._lengths.values())) + sum(p.rows for p in self._probes)
+        cost = {name: getattr(outcome, name) for name in COSTS}
         known = {name: value for name, value in cost.items() if value is not None}
-        return Scored(file=ScoreFile(parts, known))
+        return Scored(file=ScoreFile(parts, {**known, "steps_scored": steps}))
+
+    def in_process(self) -> Scored:
+        """Fit and score in this process; errors of the detector pass through."""
+        unit, limit = self._job.unit, self._job.plan.limit
+        detector = make_detector(
+            self._job.offer.spec.factory,
+            seed=unit.seed,
+            horizon=unit.horizon,
+            parameters=unit.parameters,
+        )
+        detector.fit(list(islice(self._job.data.train, limit)))
+        warm_up = getattr(detector, "warm_up", 0)
+        parts = {
+            part: [
+                self._check(scores, warm_up, part, i)
+                for i, scores in enumerate(score_chunk(detector, trajectories[:limit]))
+            ]
+            for part, trajectories in self._sets.items()
+        }
+        cut = [self._sets[p.part][p.index][: p.rows] for p in self._probes]
+        self._check_prefixes(score_chunk(detector, cut) if cut else [], warm_up, parts)
+        return Scored(file=ScoreFile(parts, {}))
 
     def _check(
-        self, scores: object, warm_up: object, part: str, i: int, trajectory: Trajectory
+        self, scores: object, warm_up: object, part: str, i: int, rows: int | None = None
     ) -> Scores:
         return check_scores(
             scores,
-            trajectory,
-            horizon=self.unit.horizon,
-            warm_up=warm_up,  # type: ignore[arg-type]  # check_scores is what checks it
-            detector=self.unit.detector,
-            where=f"{self.unit.environment}/{part}[{i}]",
+            self._lengths[part][i] if rows is None else rows,
+            horizon=self._job.unit.horizon,
+            warm_up=warm_up,
+            detector=self._job.unit.detector,
+            where=self._place(part, i),
         )
 
-    def _check_prefix(
-        self,
-        scores: object,
-        warm_up: object,
-        probe: Probe,
-        sets: Mapping[str, TrajectorySet],
-        parts: Mapping[str, list[Scores]],
+    def _check_prefixes(
+        self, returned: list[object], warm_up: object, parts: Mapping[str, list[Scores]]
     ) -> None:
-        part, i = probe.part, probe.index
-        found = self._check(scores, warm_up, part, i, sets[part][i][: probe.rows])
-        where = f"{self.unit.environment}/{part}[{i}]"
-        check_prefix(found, parts[part][i], detector=self.unit.detector, where=where)
+        for probe, scores in zip(self._probes, returned, strict=True):
+            part, i = probe.part, probe.index
+            found = self._check(scores, warm_up, part, i, probe.rows)
+            check_prefix(
+                found, parts[part][i], detector=self._job.unit.detector, where=self._place(part, i)
+            )
 
-    @property
-    def _key(self) -> str:
-        return f"{self.plan.split_digest}|{self.unit.environment}|{self.unit.seed}"
-
-    def _probes(self) -> list[Probe]:
-        return probes(self._lengths(), self._key)
-
-    def _lengths(self) -> dict[str, list[int]]:
-        return lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
-
-    def _in_process(self, sets: Mapping[str, TrajectorySet], counts: Mapping[str, int]) -> Scored:
-        """Fit and score here: what the detector raises passes through."""
-        detector = make_detector(
-            self.offer.spec.factory,
-            seed=self.unit.seed,
-            horizon=self.unit.horizon,
-            parameters=self.unit.parameters,
-        )
-        detector.fit(list(islice(self.data.train, self.plan.limit)))
-        parts: dict[str, list[Scores]] = {}
-        for part, trajectories in sets.items():
-            chunk = trajectories[: counts[part]]
-            parts[part] = [
-                self._check(scores, getattr(detector, "warm_up", 0), part, i, chunk[i])
-                for i, scores in enumerate(score_chunk(detector, chunk))
-            ]
-        again = self._probes()
-        prefixes = [sets[p.part][p.index][: p.rows] for p in again]
-        scored = score_chunk(detector, prefixes) if prefixes else []
-        for probe, scores in zip(again, scored, strict=True):
-            self._check_prefix(scores, getattr(detector, "warm_up", 0), probe, sets, parts)
-        return Scored(file=ScoreFile(parts, {}))
+    def _place(self, part: str, i: int) -> str:
+        return f"{self._job.unit.environment}/{part}[{i}]"
 
 
-def _with_store(
-    isolated: Callable[..., Outcome],
-    store: FittedStore,
-    key: str,
-    stop: Stop,
-    *,
-    fresh: bool,
+def _with_kept_fit(
+    isolated: Callable[..., Outcome], fits: FitStore, key: str, stop: Stop, *, fresh: bool
 ) -> Outcome:
-    """Score with the fit that is kept under a key, or fit and keep it."""
-    fitted = store.find(key, fresh=fresh)
-    if fitted is None:
-        with store.alone(key):
-            # Meanwhile another unit of the same fit may have kept it.
-            fitted = store.find(key, fresh=fresh)
-            if fitted is None:
-                with store.room() as room:
-                    outcome = isolated(save=str(room.absolute()))
-                    if outcome.status == "ok" and outcome.seconds_fit is not None:
-                        store.keep(key, room, outcome.seconds_fit)
-                return outcome
-    outcome = isolated(load=str(fitted.path.absolute()))
+    """Score with the fit that is kept under a key, or fit, score and keep the fit."""
+    fit = fits.find(key, fresh=fresh)
+    if fit is None:
+        with fits.filling() as directory:
+            outcome = isolated(save=str(directory.absolute()))
+            if outcome.status == "ok" and outcome.seconds_fit is not None:
+                fits.keep(key, directory, outcome.seconds_fit)
+        return outcome
+    outcome = isolated(load=str(fit.path.absolute()))
     if outcome.seconds_fit is not None:
-        outcome.seconds_fit = fitted.seconds_fit
+        outcome.seconds_fit = fit.seconds_fit
     elif outcome.status != "ok" and not stop.is_set():
         # It ended before it was loaded; whatever the reason, a fit of its own is what counts.
-        store.distrust(key)
-        return _with_store(isolated, store, key, stop, fresh=True)
+        fits.distrust(key)
+        return _with_kept_fit(isolated, fits, key, stop, fresh=True)
     return outcome
-
-
-def parts_of(data: EnvironmentData, anomalies: tuple[str, ...]) -> dict[str, TrajectorySet]:
-    """Return the parts to score by name: calibration, the twins and the anomalies."""
-    anomalous = {f"test/{a}": data.anomalous(a) for a in anomalies}
-    return {CALIBRATION: data.calibration, TWINS: data.twins, **anomalous}
-
-
-def lengths_of(sets: Mapping[str, TrajectorySet], limit: int | None) -> dict[str, list[int]]:
-    """Return the number of observations of each trajectory to score, by part."""
-    return {part: [int(n) + 1 for n in s.lengths[:limit]] for part, s in sets.items()}
-
-
-def limited(n: int, limit: int | None) -> int:
-    """Return how many of n trajectories are used."""
-    return n if limit is None else min(n, limit)
 
 
 def shuffled(counts: Mapping[str, int], key: str) -> list[tuple[str, int]]:

@@ -1,11 +1,10 @@
-"""Where units are carried out: in workers of this machine, or on an existing Dask cluster."""
+"""Executors: where units run. In workers of this machine, or on an existing Dask cluster."""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 from urllib.parse import urlsplit
 
@@ -13,30 +12,42 @@ from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors.local import LocalExecutor
 from oodd_eval.scoring.unit import Scored, UnitJob
 
 LOCAL: Final = "local"
-"""The executor that is meant where none is named."""
+"""The executor where none is named."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """Settings of a run that have no influence on any metric.
+
+    `jobs` are units at a time (None: one per core, or per thread of a cluster), `limits` those of
+    each worker. `fresh` fits again what the results directory has. `executor` is ``"local"`` or
+    ``"dask://HOST:PORT"``. After `deadline` seconds nothing new is begun. `command` is the command
+    line, for the provenance of records.
+    """
+
+    jobs: int | None = None
+    limits: Limits = field(default_factory=Limits)
+    fresh: bool = False
+    stop_on_failure: bool = False
+    executor: str = LOCAL
+    deadline: float | None = None
+    command: str = ""
 
 
 class Executor(Protocol):
-    """Carries out units; called from several threads at a time."""
+    """Runs units; called from several threads at a time."""
 
-    @property
-    def jobs(self) -> int:
-        """Units at a time."""
-        ...
+    jobs: int
+    """Units at a time."""
+
+    keeps_fits: bool
+    """True if units with one fit key share the fit that the first one keeps."""
 
     def __call__(self, job: UnitJob) -> Scored:
-        """Carry out a unit, or find its scores in an earlier run's results."""
-        ...
-
-    def fit_of(self, job: UnitJob) -> str:
-        """Key of the fit that a unit would make, or wait for while another one makes it.
-
-        Empty when it would do neither: the fit is kept, or shared with nobody.
-        """
+        """Score a unit, or find its scores in an earlier run's results."""
         ...
 
     def stop(self) -> None:
@@ -44,18 +55,31 @@ class Executor(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of whatever is held; no call is under way any more."""
+        """Release what is held, once no call is under way."""
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Orders:
-    """What every unit of a run has in common: data, limits of its worker, where results are."""
+class LocalExecutor:
+    """Gives each unit a worker process of its own, which is killed when the run stops."""
 
-    split: Split
-    limits: Limits
-    results: ResultsDirectory | None
-    fresh: bool
+    def __init__(
+        self, settings: RunSettings, results: ResultsDirectory | None, stopping: threading.Event
+    ) -> None:
+        self.jobs = settings.jobs or available_cores()
+        self.keeps_fits = results is not None
+        self._settings, self._results, self._stopping = settings, results, stopping
+
+    def __call__(self, job: UnitJob) -> Scored:
+        """Score a unit."""
+        fresh = self._settings.fresh
+        return job(self._settings.limits, self._stopping, self._results, fresh=fresh)
+
+    def stop(self) -> None:
+        """Kill the workers."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """Do nothing: workers end with their calls."""
 
 
 def available_cores() -> int:
@@ -63,19 +87,22 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def opener(name: str) -> Callable[[Orders, int | None], Executor]:
-    """Return what makes an executor by its name: ``local`` or ``dask://HOST:PORT``.
+def open_executor(
+    settings: RunSettings, split: Split, results: ResultsDirectory | None
+) -> Executor:
+    """Return the executor that the settings name."""
+    check_executor(settings.executor)
+    if settings.executor == LOCAL:
+        return LocalExecutor(settings, results, threading.Event())
+    from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra
 
-    The maker takes the orders and the number of units at a time, None for as many as there is room
-    for.
+    return DaskExecutor(f"tcp://{urlsplit(settings.executor).netloc}", settings, split, results)
 
-    Raises
-    ------
-    UsageError
-        For a name that is neither.
-    """
+
+def check_executor(name: str) -> None:
+    """Raise `UsageError` unless a name is ``local`` or ``dask://HOST:PORT``."""
     if name == LOCAL:
-        return _local
+        return
     try:
         place = urlsplit(name)
         whole = place.scheme == "dask" and place.hostname and place.port
@@ -86,17 +113,3 @@ def opener(name: str) -> Callable[[Orders, int | None], Executor]:
             f"--executor {name!r}, expected 'local' or 'dask://HOST:PORT', the address of a Dask "
             "scheduler"
         )
-
-    def dask(orders: Orders, jobs: int | None) -> Executor:
-        from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra
-
-        return DaskExecutor(f"tcp://{place.netloc}", orders, jobs)
-
-    return dask
-
-
-def _local(orders: Orders, jobs: int | None) -> Executor:
-    return LocalExecutor(
-        jobs or available_cores(), orders.limits, orders.results, threading.Event(),
-        fresh=orders.fresh,
-    )  # fmt: skip

@@ -4,19 +4,34 @@ The cluster's workers need this package, the same plug-ins and a copy of the spl
 there in processes of their own with the same limits as here. Scores come back over the network and
 are kept on this side, so that resuming works as ever. When a worker is lost, Dask gives its units
 to another one.
+
+Orders and outcomes are plain dictionaries, so that a worker with another version of this package
+can still say so. Everything that must be the same on both sides (plug-in, its code, the data) is
+named in the order by digest and compared before any work.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.errors import ExecutorError, MissingExtraError
-from oodd_eval.scoring.executors import Orders
-from oodd_eval.scoring.executors.remote import Message, carry_out, order_of, scored_of
+from oodd_eval._version import __version__
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.split import Split, load_split
+from oodd_eval.errors import ExecutorError, MissingExtraError, OoddError, PluginError, SplitError
+from oodd_eval.plugins.discovery import offer_of
+from oodd_eval.plugins.isolation.supervisor import Limits, Stop
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.identity import Setting
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.keys import source_digest
+from oodd_eval.scoring.plan import Plan, Unit
 from oodd_eval.scoring.unit import Scored, UnitJob
 
 try:
@@ -29,27 +44,19 @@ except ImportError as error:
 
 CONNECT_SECONDS: Final = 10.0
 
+Message = dict[str, Any]
+
 
 class DaskExecutor:
-    """Sends units to the workers of a cluster.
+    """Sends units to the workers of a cluster."""
 
-    Parameters
-    ----------
-    address
-        Of the scheduler, such as ``"tcp://10.0.0.1:8786"``.
-    orders
-        What all units have in common.
-    jobs
-        Units at a time; None means one per thread of the workers.
+    keeps_fits = False
 
-    Raises
-    ------
-    ExecutorError
-        When nobody answers at the address, or the cluster has no workers.
-    """
-
-    def __init__(self, address: str, orders: Orders, jobs: int | None) -> None:
-        self._address, self._orders = address, orders
+    def __init__(
+        self, address: str, settings: RunSettings, split: Split, results: ResultsDirectory | None
+    ) -> None:
+        self._address, self._settings = address, settings
+        self._split, self._results = split, results
         self._stopping = threading.Event()
         self._running: set[Any] = set()
         try:
@@ -62,7 +69,7 @@ class DaskExecutor:
                 f"no Dask scheduler answers at {address} ({error}): start one with `dask "
                 "scheduler`, or correct the address in --executor"
             ) from error
-        self.jobs = jobs or sum(self._client.nthreads().values())
+        self.jobs = settings.jobs or sum(self._client.nthreads().values())
         if not self.jobs:
             self._client.close()
             raise ExecutorError(
@@ -71,44 +78,33 @@ class DaskExecutor:
             )
 
     def __call__(self, job: UnitJob) -> Scored:
-        """Carry out a unit on the cluster.
-
-        Raises
-        ------
-        ExecutorError
-            When the worker lacks something, or the cluster is gone.
-        """
-        orders = self._orders
-        if not orders.fresh and (kept := job.stored(orders.results)):
+        """Score a unit on the cluster."""
+        if not self._settings.fresh and (kept := job.kept(self._results)):
             return kept
         future: Any = None
         try:
-            order = order_of(job, orders.split, orders.limits)
+            order = order_of(job, self._split, self._settings.limits)
             future = self._client.submit(on_worker, order, pure=False)
             self._running.add(future)
             if self._stopping.is_set():
                 future.cancel()
             outcome = future.result()
         except KilledWorker as error:
-            return Scored("error", f"the cluster lost every worker that carried it out: {error}")
+            return Scored("error", f"the cluster lost every worker that ran it: {error}")
         except Exception as error:
             if self._stopping.is_set():
                 return Scored("error", "interrupted")
             raise ExecutorError(
-                f"{job.unit.label} on {job.unit.environment} could not be carried out on the "
-                f"cluster at {self._address} ({type(error).__name__}: {error}); its workers need "
-                "oodd-eval and the same plug-ins as this side"
+                f"{job.unit.label} on {job.unit.environment} could not be run on the cluster at "
+                f"{self._address} ({type(error).__name__}: {error}); its workers need oodd-eval "
+                "and the same plug-ins as this side"
             ) from error
         finally:
             self._running.discard(future)
-        try:
-            return scored_of(outcome)
-        except ExecutorError as error:
-            raise ExecutorError(f"Dask worker {outcome['worker']}: {error}") from None
-
-    def fit_of(self, job: UnitJob) -> str:  # noqa: ARG002  as every executor's
-        """Nothing: workers keep no fits, so that no unit waits for another's."""
-        return ""
+        if "refused" in outcome:
+            raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
+        file = ScoreFile(outcome["parts"], outcome["cost"])
+        return Scored(outcome["status"], outcome["reason"], file, outcome["log"])
 
     def stop(self) -> None:
         """Tell the workers that nobody waits any more."""
@@ -122,21 +118,104 @@ class DaskExecutor:
         self._client.close()
 
 
+def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
+    """Describe a unit for a worker elsewhere."""
+    return {
+        "version": __version__,
+        "split": {"path": str(split.path.absolute()), "name": str(split.manifest["name"])},
+        "plan": {"split": job.plan.split, "split_digest": job.plan.split_digest,
+                 "limit": job.plan.limit},
+        "unit": asdict(job.unit),
+        "limits": asdict(limits),
+    }  # fmt: skip
+
+
 def on_worker(order: Message) -> Message:
-    """Carry out an order inside a Dask worker; the outcome tells which."""
+    """Run an order inside a Dask worker; the outcome tells which."""
     worker = distributed.get_worker()
-    outcome = carry_out(order, _Forgotten(worker, worker.get_current_task()))
+    outcome = run_order(order, _Withdrawn(worker, worker.get_current_task()))
     return {**outcome, "worker": worker.address}
 
 
 @dataclass(frozen=True, slots=True)
-class _Forgotten:
+class _Withdrawn:
     """Set when the scheduler has withdrawn a task: its client cancelled it, or is no more."""
 
     worker: Any
     key: Any
 
     def is_set(self) -> bool:
-        """Whether nobody waits for the task's result."""
+        """Return True if nobody waits for the task's result."""
         task = self.worker.state.tasks.get(self.key)
         return task is None or task.state == "cancelled"
+
+
+def run_order(order: Message, stop: Stop) -> Message:
+    """Run an order on this machine, in a worker process of its own."""
+    try:
+        return _scored(order, stop)
+    except OoddError as error:
+        return {"refused": str(error)}
+
+
+def _scored(order: Message, stop: Stop) -> Message:
+    if order["version"] != __version__:
+        raise ExecutorError(
+            f"it has oodd-eval {__version__}, expected {order['version']} as on this side: "
+            "install the same version there"
+        )
+    unit = _unit(order["unit"])
+    plan = Plan(units=(unit,), **order["plan"])
+    try:
+        offer = offer_of(unit.plugin, unit.detector)
+    except PluginError as error:
+        raise ExecutorError(f"on the other side, {error}") from None
+    found = {"version": offer.version, "source": source_digest(offer.module)}
+    for name, here in found.items():
+        if here != getattr(unit, name):
+            raise ExecutorError(
+                f"plug-in {unit.plugin!r} has the {name} {here!r} there, expected "
+                f"{getattr(unit, name)!r} as on this side: install the same code there"
+            )
+    data = _environment(
+        order["split"]["path"], order["split"]["name"], plan.split_digest, unit.environment
+    )
+    scored = UnitJob(plan, unit, data, offer)(Limits(**order["limits"]), stop, None, fresh=True)
+    return {
+        "status": scored.status,
+        "reason": scored.reason,
+        "log": scored.log,
+        "parts": scored.file.parts,
+        "cost": scored.file.cost,
+    }
+
+
+def _unit(plain: Message) -> Unit:
+    """Read a unit back, also from JSON, which turns tuples into lists."""
+    setting = plain["setting"]
+    parameters = tuple((name, text) for name, text in setting["parameters"])
+    read = Setting(setting["detector"], setting["horizon"], parameters)
+    return Unit(**{**plain, "setting": read, "anomalies": tuple(plain["anomalies"])})
+
+
+@functools.lru_cache(maxsize=16)
+def _environment(path: str, name: str, digest: str, environment: str) -> EnvironmentData:
+    """Open one environment of the split with a digest; it stays open for the units to come."""
+    places: tuple[Callable[[], Split], ...] = (
+        lambda: load_split(Path(path)),
+        lambda: load_split(name),
+    )
+    looked = []
+    for place in places:
+        try:
+            split = place()
+        except OoddError as error:
+            looked.append(str(error))
+            continue
+        if split.digest == digest:
+            return split.environment(environment)
+        looked.append(f"{split.path} has the digest {split.digest[:12]}")
+    raise SplitError(
+        f"split {name!r} with the digest {digest[:12]} is not there ({'; '.join(looked)}): copy it "
+        f"to the same path, or install it there with `oodd-eval data fetch`"
+    )

@@ -1,0 +1,80 @@
+"""Observers of a run: the hooks that plug-ins and the program's own reporters implement.
+
+A plug-in is asked to observe when it has an entry point in the group ``oodd_eval.observers``, or
+when it was loaded for its detectors. No observer may change a result.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint
+from typing import Any
+
+import pluggy
+
+from oodd_eval.plugins import hookspec
+from oodd_eval.plugins.discovery import Plugins, register
+from oodd_eval.results.record import Record
+from oodd_eval.scoring.plan import Plan
+
+
+@hookspec
+def oodd_run_started(plan: Plan) -> None:
+    """Observe that a run is about to start.
+
+    Called once, before any detector is fitted, with everything the run is going to do.
+    """
+
+
+@hookspec
+def oodd_cell_finished(record: Record, resumed: bool) -> None:
+    """Observe a finished cell, whatever its status.
+
+    Called in the harness's process, in the order in which cells finish. `resumed` tells that the
+    scores are of an earlier run with the same key; nothing was fitted.
+    """
+
+
+@hookspec
+def oodd_run_finished(plan: Plan, records: list[Record], interrupted: bool) -> None:
+    """Observe the end of a run.
+
+    Called once, after the records are written, with the records in the order of the plan; when the
+    run was interrupted, with those that were finished.
+    """
+
+
+class Observers:
+    """All observers of one run.
+
+    A plug-in that cannot be loaded, or that raises, is noted in ``plugins.broken`` and not called
+    again: a plug-in that watches may not stop the run. The program's own observers may raise.
+    """
+
+    def __init__(self, plugins: Plugins, own: Iterable[object] = ()) -> None:
+        specification = sys.modules[__name__]
+        self._plugins = plugins
+        self._foreign: list[tuple[EntryPoint, pluggy.HookRelay]] = []
+        observing: dict[int, EntryPoint] = {}
+        loaded = [plugin.point for plugin in plugins.loaded.values()]
+        for point in (*loaded, *plugins.observer_points):
+            with plugins.blaming(point):
+                module = point.load()
+                # A module that is in both groups is called once.
+                if id(module) not in observing:
+                    observing[id(module)] = point
+                    self._foreign.append((point, register(module, specification)))
+        self._own = [register(observer, specification) for observer in own]
+
+    def notify(self, hook: str, **arguments: Any) -> None:
+        """Call one hook of every observer."""
+        for entry in list(self._foreign):
+            point, hooks = entry
+            failures = len(self._plugins.broken)
+            with self._plugins.blaming(point, f"hook {hook} failed: "):
+                getattr(hooks, hook)(**arguments)
+            if len(self._plugins.broken) > failures:
+                self._foreign.remove(entry)
+        for hooks in self._own:
+            getattr(hooks, hook)(**arguments)

@@ -1,0 +1,137 @@
+"""Units that share a fit: it is made once, and no thread waits while there is other work."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.runner import _as_they_finish
+from oodd_eval.scoring.unit import Scored
+
+
+def jobs_of(text):
+    """Jobs whose names tell the fit by their letter: ``"a1 a10 b1"``."""
+    return [
+        SimpleNamespace(name=name, unit=SimpleNamespace(local=False, fit_key=name[0]))
+        for name in text.split()
+    ]
+
+
+class Results:
+    def __init__(self, kept=""):
+        self.fits = SimpleNamespace(has=lambda key, *, fresh: key in kept and not fresh)
+
+    def write_scores(self, key, file): ...
+
+
+class Executor:
+    """Calls `work`, and notes the order in which units begin."""
+
+    keeps_fits = True
+
+    def __init__(self, work=lambda job: None, jobs=1):
+        self.work, self.jobs, self.begun, self.stopped = work, jobs, [], False
+
+    def __call__(self, job):
+        self.begun.append(job.name)
+        self.work(job)
+        return Scored(resumed=True)
+
+    def stop(self):
+        self.stopped = True
+
+
+def finish(text, executor, *, kept="", results=True, **settings):
+    found = _as_they_finish(
+        jobs_of(text), executor, RunSettings(**settings), Results(kept) if results else None
+    )
+    return [index for index, _ in found]
+
+
+def test_units_begin_in_the_order_of_the_plan():
+    executor = Executor()
+    assert finish("a b c", executor) == [0, 1, 2]
+    assert executor.begun == ["a", "b", "c"]
+
+
+def test_a_unit_whose_fit_is_under_way_is_passed_over():
+    both = threading.Barrier(2, timeout=10)  # passed only when both first units run together
+    executor = Executor(lambda job: both.wait() if job.name.endswith("1") else None, jobs=2)
+    assert sorted(finish("a1 a10 a20 b1 b10 b20", executor)) == list(range(6))
+    assert sorted(executor.begun[:2]) == ["a1", "b1"]
+
+
+@pytest.mark.parametrize("settings", [{"kept": "a"}, {"results": False}])
+def test_units_of_a_kept_fit_and_without_a_store_go_side_by_side(settings):
+    both = threading.Barrier(2, timeout=10)
+    finish("a1 a10", Executor(lambda _job: both.wait(), jobs=2), **settings)
+
+
+def test_a_fit_that_is_kept_counts_not_when_fresh():
+    running, most = [], []
+
+    def work(job):
+        running.append(job)
+        most.append(len(running))
+        running.remove(job)
+
+    finish("a1 a10 a20", Executor(work, jobs=3), kept="a", fresh=True)
+    assert max(most) == 1
+
+
+def test_when_one_fit_is_all_there_is_the_run_still_ends():
+    assert sorted(finish("a1 a2 a3 a4 a5", Executor(jobs=4))) == list(range(5))
+
+
+def test_an_error_stops_the_executor_and_passes_through():
+    def work(job):
+        if job.name == "b":
+            raise ZeroDivisionError
+
+    executor = Executor(work)
+    with pytest.raises(ZeroDivisionError):
+        finish("a b c d e f", executor)
+    assert executor.stopped
+    assert "f" not in executor.begun
+
+
+def test_after_the_deadline_nothing_is_begun():
+    executor = Executor()
+    assert finish("a b c", executor, deadline=0.0) == []
+    assert executor.begun == []
+
+
+def test_what_runs_at_the_deadline_is_finished(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("oodd_eval.scoring.runner.time.monotonic", lambda: now[0])
+    executor = Executor(lambda job: now.__setitem__(0, now[0] + 6.0))
+    assert finish("a b c d e f g", executor, deadline=10.0) == [0, 1]
+
+
+def test_scores_of_a_few_units_are_in_memory_at_a_time():
+    taken, most = 0, 0
+
+    def work(_job):
+        nonlocal most
+        most = max(most, len(executor.begun) - taken)
+
+    executor = Executor(work, jobs=2)
+    jobs = jobs_of(" ".join(f"{n:02d}" for n in range(50)))
+    for job in jobs:
+        job.unit.fit_key = job.name
+    for _ in _as_they_finish(jobs, executor, RunSettings(), None):
+        taken += 1
+        time.sleep(0.002)
+    assert taken == 50
+    assert most <= 2 * executor.jobs + 1  # the one that the caller has in its hands
+
+
+def test_units_go_on_while_the_caller_is_busy():
+    second = threading.Event()
+    executor = Executor(lambda job: second.set() if job.name == "b" else None)
+    finished = _as_they_finish(jobs_of("a b"), executor, RunSettings(), None)
+    next(finished)
+    assert second.wait(10)
+    finished.close()
