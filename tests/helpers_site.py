@@ -10,18 +10,18 @@ import numpy as np
 from helpers_records import make_record
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.leaderboard.entry import Entry, read_entries
+from oodd_eval.leaderboard.entry import EntryInfo, read_entries
+from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.site.data import site_data
-from oodd_eval.metrics.alarms import CALIBRATED
-from oodd_eval.metrics.auc import METRICS, POOLED, AlarmRule, Contribution
-from oodd_eval.metrics.bootstrap import bootstrap_weights, interval
+from oodd_eval.metrics.auc import AlarmRule, Contribution
+from oodd_eval.metrics.bootstrap import cell_samples, percentiles
+from oodd_eval.metrics.catalogue import CALIBRATED, POOLED, RATIOS
+from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.results.curves import Sweep, cell_curves, thresholds, write_curves
+from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.record import Metric
 
 DIGEST = "ab" * 32
-
-_weights = functools.cache(bootstrap_weights)
 
 
 def write_entry(root, identity, records, *, curves=(), **fields):
@@ -39,7 +39,7 @@ def write_entry(root, identity, records, *, curves=(), **fields):
         "url": "https://example.org/page", "trust": "reported", "created": "2026-11-21",
         "command": "oodd-eval run --detector all", "caption": "", "plugins": [],
     } | fields  # fmt: skip
-    entry = Entry(
+    entry = EntryInfo(
         id=identity, detectors=sorted({r.detector for r in records}), split=first.split,
         split_digest=first.split_digest, protocol=first.protocol, environment={}, **given,
     )  # fmt: skip
@@ -58,7 +58,7 @@ def make_curves(record, seed, twins_seed=0):
     rule = AlarmRule(Standardization(mean=0.0, std=1.0))
     sweep = Sweep.over(twins, rule, thresholds(twins, rule))
     return {
-        "cell": record.cell, "detector": record.detector, "horizon": record.horizon,
+        "cell": str(record.cell), "detector": record.detector, "horizon": record.horizon,
         "seed": record.seed, "overrides": record.overrides,
         "environment": record.environment, "anomaly": record.anomaly,
         **cell_curves(sweep, rule, anomalous, onsets),
@@ -72,17 +72,16 @@ def describe(record, *, inputs="observations", **fields):
     metrics = {}
     for name, pair in columns.items():
         c = Contribution(*map(np.array, pair))
-        weights = _weights(len(c.numerator), key=record.environment)
-        metrics[name] = Metric(c.value, *interval(c, weights), n=c.n)
+        drawn = cell_samples(record.environment, c)
+        metrics[name] = Metric(c.value, *percentiles(drawn), n=c.n)
     fields = {"metrics": metrics, "per_trajectory": columns} | fields
-    provenance = {**record.provenance, "inputs": inputs, "steps_scored": 1000}
-    cost = {"seconds_fit": 2.5, "seconds_score": 0.05, "peak_rss_mb": 150.0}
-    return replace(record, **cost, **fields, provenance=provenance)
+    cost = {"seconds_fit": 2.5, "seconds_score": 0.05, "peak_rss_mb": 150.0, "steps_scored": 1000}
+    return replace(record, **cost, **fields, inputs=inputs)
 
 
 def values(rng, level, n=4):
     """Numerators per metric over n trajectories; AUCs about a level."""
-    found = {name: list(np.round(rng.uniform(0, 0.2, n), 3)) for name in METRICS}
+    found = {name: list(np.round(rng.uniform(0, 0.2, n), 3)) for name in RATIOS}
     for name in ("auc", "auc_matched"):
         found[name] = [float(v) for v in np.clip(rng.normal(level, 0.05, n), 0, 1)]
     for name in ("delay", "delay_null", "delay_censored"):
@@ -148,7 +147,7 @@ def one_row(root):
     for e in ENVIRONMENTS:
         for a in ANOMALIES:
             given = {
-                name: list(rng.uniform(0, 40 if "delay" in name else 1, 10)) for name in METRICS
+                name: list(rng.uniform(0, 40 if "delay" in name else 1, 10)) for name in RATIOS
             }
             record = describe(make_record("detector-0", e, a, values=given))
             others = [*POOLED, "threshold_at_1pct", "threshold_at_01pct"]
@@ -159,7 +158,7 @@ def one_row(root):
             units.append(make_curves(record, len(units), twins_seed=list(ENVIRONMENTS).index(e)))
     write_entry(root, "one", records)
     write_curves({"units": units}, root / "one" / "curves.json")
-    return site_data(read_entries(root))
+    return site_data(sections(read_entries(root)))
 
 
 @functools.cache

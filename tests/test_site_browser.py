@@ -10,11 +10,12 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
-from oodd_eval.results.curves import read_curves
-from oodd_eval.results.tables.tables import show_value
+from oodd_eval.leaderboard.site.data import site_data
+from oodd_eval.results.curve_file import read_curves
+from oodd_eval.results.tables.layout import show_value
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.browser,
     pytest.mark.skipif(
         helpers_browser.programs() is None,
         reason="no chromium with chromedriver on this machine (Debian: chromium-driver)",
@@ -29,9 +30,16 @@ def entries(tmp_path_factory):
     return helpers_site.example(tmp_path_factory.mktemp("results"))
 
 
+def written(entries, directory):
+    """Address of a site of some entries."""
+    file = directory / site.PAGE
+    file.write_text(site.page(sections(entries)), encoding="utf-8")
+    return file.as_uri()
+
+
 @pytest.fixture(scope="module")
 def url(entries, tmp_path_factory):
-    return site.render(entries, tmp_path_factory.mktemp("site")).as_uri()
+    return written(entries, tmp_path_factory.mktemp("site"))
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +206,7 @@ def test_means_and_intervals_are_the_boards_for_every_selection(browser, entries
             for standing in section.ranks.standings:
                 value = board.mean(standing.entry, some, chosen, "auc_matched", intervals=True)
                 expected = show_value(value, "auc_matched").split(maxsplit=1)
-                text = found[standing.entry.label].replace("\n", " ").split(maxsplit=1)
+                text = found[str(standing.entry)].replace("\n", " ").split(maxsplit=1)
                 assert text == expected
                 compared += 1
     assert compared == 3 * 3 * 2 * 6
@@ -247,7 +255,7 @@ def test_the_papers_digits_stand_in_a_column_of_their_own(browser):
     browser.choose("group", "Sensor")
     browser.click("#filters [value=aucs]")
     found = column(browser, "Paper’s AUC")  # noqa: RUF001
-    paper = site.data.site_data([])[0]["paper"]["cartpole"]["auc"]["sensor"]
+    paper = site_data([])[0]["paper"]["cartpole"]["auc"]["sensor"]
     assert found["riqn"] == f"{paper['riqn']:.1f}"
     assert found["rf"] == f"{paper['rf']:.1f}"
     # They are at horizon 1 and with the paper's settings.
@@ -370,7 +378,7 @@ def test_heat_shows_every_cell_of_a_row(browser, entries):
     section = sections(entries)[0]
     board = section.ranks.board
     open_row(browser, "rf")
-    (rf,) = [s.entry for s in section.ranks.standings if s.entry.label == "rf"]
+    (rf,) = [s.entry for s in section.ranks.standings if str(s.entry) == "rf"]
     shown = iter(browser.texts(".heat tbody td"))
     everything = [*([e] for e in board.environments), board.environments]
     for some in everything:
@@ -535,7 +543,7 @@ def test_the_policy_stops_requests(window, url):
 
 
 def test_a_page_without_entries_says_so(window, tmp_path):
-    window.open(site.render([], tmp_path).as_uri())
+    window.open(written([], tmp_path))
     assert "There are no entries yet." in window.texts("#overview .note")
     assert window.console() == []
 
@@ -544,7 +552,7 @@ def test_a_board_on_which_everything_failed_is_shown(window, tmp_path):
     record = helpers_site.make_record(status="oom", reason="needed 9 GB")
     helpers_site.write_entry(tmp_path / "results", "one", [record])
     entries = read_entries(tmp_path / "results")
-    window.open(site.render(entries, tmp_path / "site").as_uri())
+    window.open(written(entries, tmp_path))
     assert column(window, "Matched AUC") == {"riqn": "oom"}
     open_row(window, "riqn")
     assert window.text(".failure") == "oom: needed 9 GB"
@@ -560,7 +568,7 @@ def large(tmp_path_factory):
     data, curves = helpers_site.full()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(site, "site_data", lambda _: (data, curves))
-        return site.render([], tmp_path_factory.mktemp("site")).as_uri()
+        return written([], tmp_path_factory.mktemp("site"))
 
 
 def test_the_first_view_takes_less_than_a_second(window, large):

@@ -2,18 +2,21 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import helpers_plugins
 import pytest
+from helpers_records import make_record
 from helpers_submission import Draft
 
 from oodd_eval.cli import main as cli
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.selecting import run_command
+from oodd_eval.leaderboard.submit import command_of, selected
 
 
 def submit(submissions, root, *options):
@@ -45,28 +48,30 @@ def test_what_is_submitted_is_valid_and_complete(submissions, tmp_path, capsys):
     assert len(list((entry.path / "scores").iterdir())) == 2
 
 
-def test_the_command_of_an_entry_selects_its_cells(submissions, capsys):
-    entry = json.loads((submissions.plain / "entry.json").read_text())
-    words = entry["command"].replace("small", str(submissions.split)).split()
-    assert words[:4] == ["oodd-eval", "run", "--detector", "persistence,random"]
-    assert cli.main([*words[1:], "--collect-only", "-q"]) == 0
+def made_by(*commands):
+    """Records whose runs recorded these commands."""
+    return [replace(make_record(), provenance={"command": command}) for command in commands]
 
 
-def test_the_command_names_parameters_and_splits_unlike_runs(submissions):
-    from dataclasses import replace
+def test_the_command_of_an_entry_is_what_its_runs_recorded():
+    first, second = "oodd-eval run --detector rf", "oodd-eval run --detector rf --seed 1"
+    assert command_of(made_by(first, second, first)) == f"{first} && {second}"
 
-    from oodd_eval.results.directory import ResultsDirectory
 
-    records = ResultsDirectory(submissions.results).records()
-    wide = [
-        replace(r, provenance=r.provenance | {"overrides": {"width": 3, "kind": "a b"}})
-        for r in records if r.detector == "random"
-    ]  # fmt: skip
-    first, second = run_command([r for r in records if r.detector != "random"] + wide).split(" && ")
-    assert first.endswith(
-        "--detector persistence --env cartpole --split small --horizon 1 --seed 0"
-    )
-    assert second.endswith("--param 'kind=a b' --param width=3")
+@pytest.mark.parametrize("command", ["", "python a.py", "oodd-eval run --env $(rm)", "x" * 5000])
+def test_a_command_that_could_not_be_published_is_left_out(command):
+    assert command_of(made_by(command, "oodd-eval reproduce")) == "oodd-eval reproduce"
+
+
+def test_a_command_with_markup_is_no_part_of_a_published_record():
+    (record,), _ = selected(made_by("oodd-eval run --param 'kind=<b>'"), "all")
+    assert "command" not in record.provenance
+
+
+def test_commands_that_are_too_long_end_with_a_whole_one():
+    text = command_of(made_by(*(f"oodd-eval run --seed {i}" for i in range(1000))))
+    assert 3900 < len(text) <= 4000
+    assert re.fullmatch(r"(oodd-eval run --seed \d+( && )?)+", text)
 
 
 def test_an_existing_entry_is_never_overwritten(submissions, tmp_path, capsys):
@@ -88,7 +93,7 @@ def test_a_cell_that_another_entry_has_is_refused(submissions, tmp_path, capsys)
 
 def test_what_would_not_be_valid_is_not_written(submissions, tmp_path, capsys):
     assert submit(submissions, tmp_path, "--title", "<b>mine</b>") == 1
-    assert "persistence-random-small: entry.json: title: contains '<'" in capsys.readouterr().out
+    assert "persistence-random-small: entry.json: title: is " in capsys.readouterr().out
     assert not list(tmp_path.iterdir())
 
 
@@ -206,28 +211,12 @@ def test_a_detectors_name_belongs_to_one_distribution(submissions, tmp_path, cap
     second.entry["plugins"][0]["distribution"] = "oodd-other"
     for record in second.records:
         record.update(plugin="oodd-other:trivial", seed=1)
-        record["cell"] = record["cell"].replace("seed=0", "seed=1")
     for path in (second.path / "scores", second.file("curves.json")):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     second.entry["files"] = {"records.jsonl": {}}
     second.write()
     assert verify(submissions, tmp_path) == 1
     assert "a name stands for one detector" in capsys.readouterr().out
-
-
-def test_a_cell_that_was_computed_elsewhere_is_the_same_cell(submissions, tmp_path, capsys):
-    first = Draft(submissions.plain, tmp_path)
-    first.write()
-    second = Draft(submissions.full, tmp_path)
-    for record in second.records:
-        record["parameters"] = record["provenance"]["overrides"] = {"device": "cuda"}
-        record["cell"] = record["cell"].replace("]", ",device=cuda]")
-    for path in (second.path / "scores", second.file("curves.json")):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    second.entry["files"] = {"records.jsonl": {}}
-    second.write()
-    assert verify(submissions, tmp_path) == 1
-    assert "cell: is in entry persistence-random-small too" in capsys.readouterr().out
 
 
 def test_a_partial_entry_is_said_to_be_one(submissions, capsys):

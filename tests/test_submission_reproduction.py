@@ -1,7 +1,6 @@
 """Entries of many setups, as a reproduction leaves them: what is kept, left out, packed, drawn."""
 
 import json
-import shlex
 import shutil
 from dataclasses import replace
 
@@ -11,13 +10,12 @@ from helpers_submission import Draft, assert_refused
 
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data import files as packed
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.selecting import run_command
-from oodd_eval.leaderboard.verify import rules
-from oodd_eval.leaderboard.verify.curves_check import with_curves
-from oodd_eval.results import files as packed
+from oodd_eval.leaderboard.submit import with_curves
 from oodd_eval.results.directory import ResultsDirectory
+
+# Its results are made once, not once a worker.
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +33,6 @@ def many(tmp_path_factory):
         ("mewma", {}),
     ):
         evaluate(detector, split, output=out, **more)
-    plain = {"tier": {"name": "reduced", "split": "reduced"}}
-    (out / "reproduction.json").write_text(json.dumps(plain))
     return split, out
 
 
@@ -67,7 +63,6 @@ def test_seeds_that_lack_cells_are_left_out_and_named(many, tmp_path, capsys):
     assert "left out: random[h=1,seed=2], which has 8 of 16 cells" in out
     (entry,) = read_entries(tmp_path)
     assert labels(entry) == ALL
-    assert entry.meta.command == "oodd-eval reproduce --tier reduced --split many"
     assert entry.meta.detectors == ["mewma", "persistence", "random"]
 
 
@@ -114,7 +109,7 @@ def test_a_row_without_some_anomalies_is_refused_or_left_out(many, tmp_path, cap
 def test_large_files_are_packed_and_read_like_plain_ones(many, tmp_path, monkeypatch, capsys):
     options = ("-k", "random and seed=0", "--curves", "rows")
     assert submit(many, tmp_path / "plain", *options) == 0
-    monkeypatch.setattr(packed, "LARGE", 10_000)
+    monkeypatch.setattr(packed, "COMPRESSED_FROM", 10_000)
     assert submit(many, tmp_path / "packed", *options) == 0
     ((plain,), (small,)) = (read_entries(tmp_path / name) for name in ("plain", "packed"))
     assert {p.name for p in small.path.iterdir()} == {
@@ -136,11 +131,11 @@ def test_large_files_are_packed_and_read_like_plain_ones(many, tmp_path, monkeyp
 
 def test_packing_gives_the_same_bytes_and_no_name_or_time():
     content = b"a record\n" * 1000
-    once = packed.pack(content)
-    assert once == packed.pack(content)
+    once = packed.compress(content)
+    assert once == packed.compress(content)
     # RFC 1952: no flags, no time.
     assert once[3:8] == bytes(5)
-    assert packed.unpack(once) == content
+    assert packed.decompress(once) == content
 
 
 def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
@@ -150,7 +145,7 @@ def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
     assert submit(many, tmp_path, "--complete") == 0
     out = capsys.readouterr().out
     assert "MB; next:" in out
-    assert "a burden to the repository" in " ".join(out.split())
+    assert "burden to the repository" in " ".join(out.split())
 
 
 # Curves
@@ -231,66 +226,8 @@ def test_nobody_chooses_the_cells_that_look_best(drawn, tmp_path):
     assert_refused(draft.verdict(), "units", "lack many/cartpole/iid::random")
 
 
-# The command
-
-
-def commands_of(records):
-    return [shlex.split(part) for part in run_command(records).split(" && ")]
-
-
-def test_a_command_names_the_runs_and_no_others(many):
-    records = [r for r in ResultsDirectory(many[1]).records() if r.seed != 2]
-    found = {" ".join(words[2:]) for words in commands_of(records)}
-    both = "--env cartpole,hopper --split many --horizon"
-    assert found == {
-        f"--detector random {both} 1 --seed 0,1",
-        f"--detector persistence {both} 3 --seed 0",
-        f"--detector mewma {both} 1 --seed 0",
-        f"--detector mewma {both} 1 --seed 0 --param order=2",
-    }
-    assert not rules.command(run_command(records))
-
-
-def test_runs_that_are_alike_share_a_command(many):
-    (first,) = [
-        r for r in ResultsDirectory(many[1]).records()
-        if r.cell.endswith("cartpole/iid::random[h=1,seed=0]")
-    ]  # fmt: skip
-    records = [
-        replace(first, detector=d, horizon=h, seed=s, environment=e)
-        for d in ("random", "clock") for h in (1, 10) for s in (0, 1, 10, 2) for e in ENVIRONMENTS
-    ]  # fmt: skip
-    (words,) = commands_of(records)
-    assert words[2:] == [
-        "--detector", "clock,random", "--env", "all", "--split", "many", "--horizon", "1,10",
-        "--seed", "0,1,2,10",
-    ]  # fmt: skip
-
-
-def test_commands_that_are_too_long_end_with_a_whole_one(many):
-    first = ResultsDirectory(many[1]).records()[0]
-    records = [
-        replace(first, provenance=first.provenance | {"overrides": {"width": i}})
-        for i in range(100)
-    ]
-    text = run_command(records)
-    assert 3800 < len(text) <= 4000
-    assert not rules.command(text)
-    assert text.rpartition("--param ")[2].startswith("width=")
-
-
-def test_results_of_a_damaged_reproduction_have_a_plain_command(many, tmp_path):
-    from oodd_eval.leaderboard.selecting import made_with
-
-    records = ResultsDirectory(many[1]).records()
-    assert made_with(tmp_path, records) == run_command(records)
-    for text in ("no json", "[]", '{"tier": {"name": "x; rm", "split": "y"}}'):
-        (tmp_path / "reproduction.json").write_text(text)
-        assert made_with(tmp_path, records) == run_command(records)
-
-
 def test_records_of_a_packed_entry_serve_where_results_do(many, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(packed, "LARGE", 10_000)
+    monkeypatch.setattr(packed, "COMPRESSED_FROM", 10_000)
     assert submit(many, tmp_path / "entries", "--complete") == 0
     entry = tmp_path / "entries" / "all"
     assert cli.main(["compare", str(many[1]), "--against", str(entry)]) == 0

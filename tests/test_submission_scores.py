@@ -116,78 +116,57 @@ def cycle(file):
 
 
 SCORES = {
-    "changed-score": (number("test/iid", 50, 99.0), "metrics.auc", "but the scores give"),
-    "changed-calibration": (
-        number("calibration", 5, 99.0), "metrics.far_twin.value", "but the scores give",
-    ),
-    "infinite-score": (number("test/iid", 50, np.inf), "test/iid/scores", "is infinite at t = 50"),
-    "undefined-in-the-middle": (
-        number("test/iid", 50, np.nan), "test/iid/scores", "after a defined score",
-    ),
-    "undefined-too-long": (
-        number("test/iid", slice(0, 30), np.nan), "test/iid/scores", "at most 20 undefined",
-    ),
-    "other-lengths": (inside(shorter), "test/iid", "does not fit the split"),
+    "changed-score": (number("test/iid", 50, 99.0), "metrics.auc.value"),
+    "changed-calibration": (number("calibration", 5, 99.0), "metrics.far_twin.value"),
+    "infinite-score": (number("test/iid", 50, np.inf), "test/iid/scores"),
+    "undefined-in-the-middle": (number("test/iid", 50, np.nan), "test/iid/scores"),
+    "undefined-too-long": (number("test/iid", slice(0, 30), np.nan), "test/iid/scores"),
+    "other-lengths": (inside(shorter), "scores"),
     "single-precision": (
         replaced("calibration/scores", data=np.zeros(9, np.float32)), "calibration/scores",
-        "has dtype <f4",
     ),
-    "objects": (inside(objects), "calibration/scores", "has dtype |O"),
-    "opaque-bytes": (inside(opaque), "calibration/scores", "has dtype |V3"),
-    "two-dimensions": (
-        replaced("calibration/scores", data=np.zeros((3, 3))), "calibration/scores", "(3, 3)",
-    ),
+    "objects": (inside(objects), "calibration/scores"),
+    "opaque-bytes": (inside(opaque), "calibration/scores"),
+    "two-dimensions": (replaced("calibration/scores", data=np.zeros((3, 3))), "calibration/scores"),
     "bomb": (
         replaced(
             "calibration/scores", shape=(10**9,), dtype="f8", chunks=(10**6,), compression="gzip"
         ),
-        "calibration/scores", "has 1000000000 values",
+        "calibration/scores",
     ),
     "other-filter": (
         replaced("calibration/scores", data=np.zeros(9), compression="lzf"), "calibration/scores",
-        "is packed by filter",
     ),
     "offsets-that-fall": (
         replaced("calibration/offsets", data=np.array([0, 50, 20])), "calibration/offsets",
-        "do not rise",
     ),
-    "external-link": (
-        linked(h5py.ExternalLink("/etc/passwd", "/x")), "calibration/scores", "ExternalLink",
-    ),
-    "soft-link": (linked(h5py.SoftLink("/test")), "calibration/scores", "SoftLink"),
-    "kept-elsewhere": (inside(kept_elsewhere), "calibration/scores", "in other files"),
-    "virtual": (inside(virtual), "calibration/scores", "in other files"),
-    "cycle": (inside(cycle), "test/again", "is no part of a score file"),
-    "unknown-part": (
-        inside(lambda f: f.create_group("code")), "code", "is no part of a score file",
-    ),
+    "external-link": (linked(h5py.ExternalLink("/etc/passwd", "/x")), "calibration/scores"),
+    "soft-link": (linked(h5py.SoftLink("/test")), "calibration/scores"),
+    "kept-elsewhere": (inside(kept_elsewhere), "calibration/scores"),
+    "virtual": (inside(virtual), "calibration/scores"),
+    "cycle": (inside(cycle), "test/again"),
+    "unknown-part": (inside(lambda f: f.create_group("code")), "code"),
     "unknown-dataset": (
         inside(lambda f: f["calibration"].create_dataset("x", data=b"x")), "calibration/x",
-        "is no dataset of a score file",
     ),
-    "missing-part": (inside(lambda f: f.__delitem__("test/drift")), "test/drift", "is missing"),
-    "attribute-of-a-file": (
-        inside(lambda f: f.attrs.update(code="import os")), "attribute code", "expected a cost",
-    ),
-    "negative-cost": (
-        inside(lambda f: f.attrs.update(seconds_fit=-1.0)), "attribute seconds_fit", "at least 0",
-    ),
+    "missing-part": (inside(lambda f: f.__delitem__("test/drift")), "test/drift"),
+    "attribute-of-a-file": (inside(lambda f: f.attrs.update(code="import os")), "attribute code"),
+    "negative-cost": (inside(lambda f: f.attrs.update(seconds_fit=-1.0)), "attribute seconds_fit"),
     "attribute-of-data": (
         inside(lambda f: f["calibration/scores"].attrs.update(x=1)), "calibration/scores",
-        "has attributes",
     ),
-    "user-block": (user_block, "userblock", "512 bytes"),
-    "cut-off": (cut_off, KEY, "is damaged or no HDF5 file"),
-    "pickle-as-scores": (overwritten(b"\x80\x04K\x01."), KEY, "is damaged or no HDF5 file"),
-    "empty-file": (overwritten(b""), KEY, "is damaged or no HDF5 file"),
-    "removed": (removed, "files", "names a file"),
-    "of-no-record": (unknown_file, "scores/other.h5", "belongs to no record"),
+    "user-block": (user_block, "userblock"),
+    "cut-off": (cut_off, KEY),
+    "pickle-as-scores": (overwritten(b"\x80\x04K\x01."), KEY),
+    "empty-file": (overwritten(b""), KEY),
+    "removed": (removed, "files"),
+    "of-no-record": (unknown_file, "scores/other.h5"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", SCORES)
 def test_tampered_scores_are_refused_by_their_field(submissions, tmp_path, case):
-    tamper, field, message = SCORES[case]
+    tamper, field = SCORES[case]
     draft = Draft(submissions.full, tmp_path)
     tamper(draft)
     draft.write()
@@ -196,8 +175,8 @@ def test_tampered_scores_are_refused_by_their_field(submissions, tmp_path, case)
         assert draft.verdict(submissions.split).ok
         draft.entry["trust"] = "re-scored"
         draft.seal()
-        field, message = "trust", "scores are not there"
-    assert_refused(draft.verdict(submissions.split), field, message)
+        field = "trust"
+    assert_refused(draft.verdict(submissions.split), field)
 
 
 def curves(change):
@@ -217,42 +196,38 @@ def unit(**changes):
 
 CURVES = {
     "rate": (
-        curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 0.0123)),
-        "units[0].roc.tpr[3]", "but the scores give",
+        curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 0.0123)), "units[0].roc.tpr[3]",
     ),
     "rate-above-one": (
         curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 1.5)), "units[0].roc.tpr[3]",
-        "is 1.5",
     ),
-    "other-cell": (unit(cell="small/cartpole/iid::x[h=1,seed=0]"), "units[0].cell", "no record"),
-    "other-detector": (unit(detector="riqn"), "units[0].detector", "in the record of its cell"),
-    "html": (unit(detector="<script>"), "units[0].detector", "in the record of its cell"),
-    "truth-as-seed": (unit(seed=False), "units[0].seed", "is False"),
-    "unknown-field": (unit(code="x"), "units[0]", "unknown ['code']"),
-    "no-unit": (curves(lambda c: c["units"].pop()), "units", "all its evaluated cells, or of none"),
-    "unit-twice": (curves(lambda c: c["units"].append(c["units"][0])), "units[8].cell", "before"),
+    "other-cell": (unit(cell="small/cartpole/iid::x[h=1,seed=0]"), "units[0].cell"),
+    "other-detector": (unit(detector="riqn"), "units[0].detector"),
+    "html": (unit(detector="<script>"), "units[0].detector"),
+    "truth-as-seed": (unit(seed=False), "units[0].seed"),
+    "unknown-field": (unit(code="x"), "units[0].code"),
+    "no-unit": (curves(lambda c: c["units"].pop()), "units"),
+    "unit-twice": (curves(lambda c: c["units"].append(c["units"][0])), "units[8].cell"),
     "index": (
         curves(lambda c: c["units"][0]["example"].update(index=999)), "units[0].example.index",
-        "no test trajectory",
     ),
     "not-a-number": (
         curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, float("nan"))), "curves.json",
-        "NaN is no JSON number",
     ),
-    "schema": (curves(lambda c: c.update(schema=2)), "schema", "is 2"),
+    "schema": (curves(lambda c: c.update(schema=2)), "schema"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CURVES)
 def test_tampered_curves_are_refused_by_their_field(submissions, tmp_path, case):
-    tamper, field, message = CURVES[case]
+    tamper, field = CURVES[case]
     draft = Draft(submissions.full, tmp_path)
     tamper(draft)
-    assert_refused(draft.verdict(submissions.split), field, message)
+    assert_refused(draft.verdict(submissions.split), field)
 
 
 def test_scores_confirm_every_metric(submissions):
-    from oodd_eval.leaderboard.verify.verify import verify_entry
+    from oodd_eval.leaderboard.verify import verify_entry
 
     verdict = verify_entry(submissions.full, split=submissions.split)
     assert verdict.ok

@@ -1,123 +1,207 @@
-"""``oodd-eval leaderboard build``: tables and site from the entries."""
+"""The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
 from __future__ import annotations
 
-import argparse
-import sys
-import tempfile
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.errors import OutputError
+from oodd_eval.data.facts import GROUPS
+from oodd_eval.data.files import write_text
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import SubmittedEntry, read_entries
-from oodd_eval.leaderboard.page import page, table_file
-from oodd_eval.leaderboard.sections import sections
-from oodd_eval.results.tables import csv_tables
+from oodd_eval.leaderboard.entry import SubmittedEntry
+from oodd_eval.leaderboard.sections import TABLES, LeaderboardSection, sections
+from oodd_eval.results.tables import layout, rendering
+from oodd_eval.results.tables.board import Board
+from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables.rendering import about_split, escape
+from oodd_eval.results.tables.rendering import markdown as table
 
 PAGE: Final = "README.md"
-TABLES: Final = "tables"
 SITE: Final = "site"
+STALE: Final = "no part of the leaderboard any more"
 
-_STALE: Final = "no part of the leaderboard any more"
+_INTRODUCTION = """# Leaderboard
 
+Detectors of out-of-distribution dynamics on frozen splits, ranked by matched AUC. This page is
+written by `oodd-eval leaderboard build` from the entries under [results](results); edit those, not
+this. How to read it: [docs/leaderboard.md](../docs/leaderboard.md). How to take part:
+[docs/submitting.md](../docs/submitting.md).
+"""
 
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
-    entries = read_entries(options.results)
-    if not entries:
-        print(f"oodd-eval: no entries in {options.results}", file=sys.stderr)  # noqa: T201
-        return 5
-    output = Path(options.output)
-    if options.check:
-        with tempfile.TemporaryDirectory() as fresh:
-            build(entries, Path(fresh))
-            return _report(differences(Path(fresh), output), output)
-    written = build(entries, output)
-    if options.verbosity >= 0:
-        print("\n".join(str(output / name) for name in written))  # noqa: T201
-    for name in sorted(_tables(output) - set(written)):
-        print(  # noqa: T201
-            f"oodd-eval: {output / name} is {_STALE}: delete it", file=sys.stderr
-        )
-    return 0
+_LEGEND = """Rank is 1 + the number of rows that are significantly better (paired bootstrap over
+test seeds, Holm's correction over all pairs of the table). Rows that share a letter under *ties*
+cannot be told apart. Trivial rows know nothing of the dynamics: what does not beat them has found
+nothing. AUC is the paper's, for which the trivial row *clock* has 100 by construction. Brackets
+hold 95 % intervals.
+"""
+
+MANY: Final = 6
+"""Findings beyond which they are folded away."""
+
+WIDEST: Final = 12
+"""Rows beyond which the matrix of win rates is left to ``comparisons.csv``."""
 
 
 def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:
-    """Write page, tables and site: the same bytes for the same entries.
+    """Write page, tables and site, the same bytes for the same entries; return their names.
 
-    Returns
-    -------
-    The page, the tables and the site, relative to `output`.
-
-    Raises
-    ------
-    OutputError
-        When a file cannot be written.
-    ResultsError
-        When the entries contradict one another.
+    The page is the first. ResultsError: the entries contradict one another.
     """
     found = sections(entries)
-    address = _build_site(entries, output)
+    address = f"{SITE}/{site.PAGE}"
     files = {PAGE: page(found, site=address)}
     for section in found:
-        files[table_file(section, "ranking")] = csv_tables.ranking(section.ranks, section.trust)
-        files[table_file(section, "cells")] = csv_tables.cells(section.ranks)
-        files[table_file(section, "comparisons")] = csv_tables.comparisons(section.ranks)
-    try:
-        for name, text in files.items():
-            path = output / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise OutputError(f"cannot write the leaderboard into {str(output)!r}: {error}") from None
-    return [*files, address]
-
-
-def _build_site(entries: Sequence[SubmittedEntry], output: Path) -> str:
-    """Render the site and return the address of its page, relative to `output`."""
-    return site.render(entries, output / SITE).relative_to(output).as_posix()
+        files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
+        files[section.file("cells")] = rendering.cells_csv(section.ranks)
+        files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
+    files[address] = site.page(found)
+    for name, text in files.items():
+        write_text(output / name, text)
+    return list(files)
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
-    """Return a line for every file that a build would change, add or no longer write.
-
-    Parameters
-    ----------
-    fresh, existing
-        Directories of a new build and of what is there.
-    """
+    """Return a line for every file of `existing` that a fresh build changes, adds or drops."""
     new, old = _files(fresh), _files(existing)
-    lines = [f"{name}: missing" for name in new - old]
-    lines += [f"{name}: {_STALE}" for name in old - new]
-    lines += [
-        f"{name}: differs"
-        for name in new & old
-        if (fresh / name).read_bytes() != (existing / name).read_bytes()
-    ]
-    return sorted(lines)
+    changed = {n for n in new & old if (fresh / n).read_bytes() != (existing / n).read_bytes()}
+    parts = ((new - old, "missing"), (old - new, STALE), (changed, "differs"))
+    return sorted(f"{name}: {what}" for names, what in parts for name in names)
+
+
+def stale(output: Path, written: Collection[str]) -> list[str]:
+    """Return the tables below a directory that are not among those written."""
+    return sorted(name for name in _files(output) - set(written) if name.startswith(TABLES))
 
 
 def _files(output: Path) -> set[str]:
     """Return the names of the files that builds write, and of none beside them."""
-    paths = (path for path in (output / SITE).rglob("*") if path.is_file())
-    names = {path.relative_to(output).as_posix() for path in paths} | _tables(output)
-    return names | ({PAGE} if (output / PAGE).is_file() else set())
+    paths = [output / PAGE, *(output / TABLES).glob("*.csv"), *(output / SITE).rglob("*")]
+    return {path.relative_to(output).as_posix() for path in paths if path.is_file()}
 
 
-def _tables(output: Path) -> set[str]:
-    return {f"{TABLES}/{path.name}" for path in (output / TABLES).glob("*.csv")}
+def page(sections: Sequence[LeaderboardSection], *, site: str = "") -> str:
+    """Return the whole page, which links to the `site` if there is one."""
+    entries = {e.meta.id: e for section in sections for e in section.entries}
+    parts = [_INTRODUCTION]
+    if site:
+        parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
+    parts += [_contents(sections)] if len(sections) > 1 else []
+    parts += [_section(section) for section in sections]
+    parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
+    return "\n".join(parts)
 
 
-def _report(lines: list[str], output: Path) -> int:
-    if not lines:
-        print(f"{output} is up to date")  # noqa: T201
-        return 0
-    print("\n".join(lines))  # noqa: T201
-    print(  # noqa: T201
-        f"oodd-eval: {output} is not what its entries say: run leaderboard build, delete what is "
-        "no part of it, and commit",
-        file=sys.stderr,
-    )
-    return 1
+def _contents(sections: Sequence[LeaderboardSection]) -> str:
+    """Return links to the boards; no two of them are to be compared."""
+    seen: Counter[str] = Counter()
+    lines = ["Boards, which are not to be compared with one another:", ""]
+    for section in sections:
+        title = _title(section.ranks.board)
+        # As GitHub makes addresses of headings, equal ones numbered.
+        slug = re.sub(r"[^a-z0-9 _-]", "", title.lower()).replace(" ", "-")
+        address = f"{slug}-{seen[slug]}" if seen[slug] else slug
+        seen[slug] += 1
+        rows = len(section.ranks.standings)
+        digest = section.ranks.board.digest[:12]
+        lines.append(f"- [{escape(title)}](#{address}), digest {digest}: {rows} rows")
+    return "\n".join([*lines, ""])
+
+
+def _title(board: Board) -> str:
+    limited = f", first {board.limit} trajectories of each part" if board.limit is not None else ""
+    return f"Split {board.split}, protocol {board.protocol}{limited}"
+
+
+def _section(section: LeaderboardSection) -> str:
+    ranks, board = section.ranks, section.ranks.board
+    about = [entry.meta for entry in section.entries]
+    ok = sum(r.ok for r in board.records)
+    kinds = ("ranking", "cells", "comparisons")
+    files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
+    cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
+    size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
+    rendered = [
+        layout.alarms(ranks),
+        layout.cost(ranks),
+        *_as_in_the_paper(board),
+        layout.by_environment(board),
+        layout.all_metrics(board),
+        layout.calibrated(board),
+        layout.pooled(board, ranks.standings),
+        layout.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
+        layout.failures(board),
+    ]
+    parts = [
+        f"## {escape(_title(board))}\n",
+        f"{about_split(board)}\n",
+        f"{size} As CSV: {files}.\n",
+        *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
+        table(layout.ranking(ranks, section.trust)),
+        _LEGEND,
+        *(f"- {escape(line)}" for line in layout.ranking_notes(ranks)),
+        "",
+        *_findings(board),
+        *(table(one) for one in rendered if one),
+        *(f"- {escape(line)}" for line in layout.notes(board)),
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _findings(board: Board) -> list[str]:
+    """Return what simple rows beat, in bold; folded away where it is much."""
+    found = [escape(sentence) for sentence in layout.findings(board)]
+    if len(found) <= MANY:
+        return [f"**{sentence}**\n" for sentence in found]
+    summary = f"{len(found)} times a simple row has a higher mean than a learned one"
+    listed = [f"- {sentence}" for sentence in found]
+    return [f"<details><summary><b>{summary}</b></summary>\n", *listed, "\n</details>\n"]
+
+
+def _as_in_the_paper(board: Board) -> list[Table]:
+    """Return the layout of the paper's Table 5 for each horizon and group of anomalies.
+
+    It has a column per row of the board, so that it is kept to rows with default parameters.
+    """
+    records = [r for r in board.records if not r.overrides]
+    if not records:
+        return []
+    own = Board(records)
+    groups = [group for group in GROUPS if own.in_group(group)]
+    return [layout.anomaly_groups(own, h, [group]) for h in own.horizons for group in groups]
+
+
+def _entry(entry: SubmittedEntry) -> str:
+    """Return who submitted an entry, and all that is known of how it was made."""
+    meta = entry.meta
+    rerun = f", by {meta.rerun.get('by', '')}: {meta.rerun.get('how', '')}" if meta.rerun else ""
+    shown = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
+    plugins = [shown.format(**plugin) for plugin in meta.plugins]
+    packages = meta.environment.get("packages", {})
+    versions = [f"{name} {packages[name]}" for name in sorted(packages)]
+    python = f"Python {meta.environment.get('python', '')}"
+    lines = [
+        ("Detectors", ", ".join(sorted(meta.detectors))),
+        ("Split", f"{meta.split}, digest {meta.split_digest[:12]}, protocol {meta.protocol}"),
+        ("Submitted by", f"{meta.submitter or 'nobody named'}, {meta.created}"),
+        ("Trust level", f"{meta.trust}{rerun}"),
+        ("Citation", meta.citation),
+        ("Plug-ins", "; ".join(plugins)),
+        ("Platform", f"{python}, {meta.environment.get('platform', '')}"),
+        ("Packages", ", ".join(versions)),
+        ("Note", meta.caption),
+    ]
+    listed = [f"- {name}: {escape(text)}" for name, text in lines if text]
+    if meta.url:
+        listed.append(f"- Page: {_link(meta.url)}")
+    command = " ".join(meta.command.split())
+    # An indented block ends nowhere but at its line's end, whatever the command holds.
+    made = ["", "Made with:", "", f"    {command}"] if command else []
+    return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, *made, ""])
+
+
+def _link(url: str) -> str:
+    """Return a link to a plain web address, and anything else as text."""
+    return f"<{url}>" if re.fullmatch(r"https?://[^\s<>|\\`]+", url) else escape(url)

@@ -7,22 +7,24 @@
     curves.json      illustrations computed from the scores (optional)
     scores/*.h5      every score, as in a results directory (optional)
 
-Records or curves of more than a megabyte are packed: ``records.jsonl.gz``, ``curves.json.gz``.
+Records or curves of more than a megabyte are compressed: ``records.jsonl.gz``, ``curves.json.gz``.
 
-Reading here is for entries that were verified (`oodd_eval.leaderboard.verify.verify`): the shape of
+Entries are read here after they were verified (`oodd_eval.leaderboard.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, Literal, get_args
 
-from oodd_eval.data import files as stored_files
+from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
-from oodd_eval.results.directory import RECORDS, ResultsDirectory
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1
@@ -32,41 +34,21 @@ ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
 SCORES: Final = "scores"
 
-TRUST: Final = ("reported", "re-scored", "re-run")
+Trust = Literal["reported", "re-scored", "re-run"]
+TRUST: Final[tuple[Trust, ...]] = get_args(Trust)
 """Levels of trust, the lowest first."""
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """What ``entry.json`` says.
+class EntryInfo:
+    """The content of ``entry.json``.
 
-    Attributes
-    ----------
-    id
-        Name of the entry and of its directory.
-    title, submitter, citation, url, caption
-        Plain text for people; the caption is a note above the tables. All but the title may be
-        empty.
-    detectors
-        Names of the detectors in the records, sorted.
-    trust
-        ``"reported"``, ``"re-scored"`` or ``"re-run"``.
-    rerun
-        For ``"re-run"``, ``{"by": who, "how": on what}``; else None.
-    split, split_digest, protocol
-        What all records are of.
-    plugins
-        ``{"distribution", "plugin", "version", "source_digest"}`` of every plug-in.
-    environment
-        ``{"python", "platform", "packages": {name: version}}`` of the run.
-    created
-        Date, as ``"2026-11-21"``.
-    command
-        How the entry was made.
-    files
-        ``{relative name: {"sha256", "bytes"}}`` of every other file.
-    schema
-        Version of this layout.
+    Title, submitter, citation, url and caption (a note above the tables) are plain text for people;
+    all but the title may be empty, like the command that made the records. Detectors, sorted, split
+    and protocol are those of the records. `plugins` have ``distribution``, ``plugin``, ``version``
+    and ``source_digest``, the `environment` ``python``, ``platform`` and ``packages``; `rerun` has
+    ``by`` and ``how`` where the trust is ``"re-run"``. `files` has ``sha256`` and ``bytes`` of all
+    other files by relative name.
     """
 
     id: str
@@ -75,7 +57,7 @@ class Entry:
     submitter: str
     citation: str
     url: str
-    trust: str
+    trust: Trust
     split: str
     split_digest: str
     protocol: int
@@ -88,33 +70,11 @@ class Entry:
     rerun: dict[str, str] | None = None
     schema: int = SCHEMA
 
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
+
     def to_json(self) -> str:
         """Return the text of ``entry.json``, keys sorted."""
         return json.dumps(asdict(self), indent=1, sort_keys=True, ensure_ascii=False) + "\n"
-
-    @classmethod
-    def from_plain(cls, plain: Any, where: str) -> Entry:
-        """Make an entry of a JSON value.
-
-        Raises
-        ------
-        ResultsError
-            When it has another schema or other fields.
-        """
-        if not isinstance(plain, dict):
-            raise ResultsError(f"{where} is {type(plain).__name__}, expected a JSON object")
-        if plain.get("schema") != SCHEMA:
-            raise ResultsError(
-                f"{where}: schema is {plain.get('schema')!r:.60}, expected {SCHEMA}: it was "
-                "written by another version of oodd-eval"
-            )
-        names = {f.name for f in fields(cls)}
-        if plain.keys() != names:
-            raise ResultsError(
-                f"{where} has other fields than an entry: missing {sorted(names - plain.keys())}, "
-                f"unknown {sorted(plain.keys() - names)!s:.200}"
-            )
-        return cls(**plain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,61 +82,64 @@ class SubmittedEntry:
     """An entry that was read: `meta` is ``entry.json``, `path` its directory."""
 
     path: Path
-    meta: Entry
+    meta: EntryInfo
     records: list[Record]
 
     @property
     def curves(self) -> Path | None:
         """The file of curves; None when the entry has none."""
-        return stored_files.find_file(self.path / CURVES)
-
-    @property
-    def results(self) -> ResultsDirectory:
-        """Access to the entry as a results directory, to its scores above all."""
-        return ResultsDirectory(self.path)
+        return find_file(self.path / CURVES)
 
 
 def read_entry(path: Path | str) -> SubmittedEntry:
-    """Read the entry in a directory.
+    """Read the entry in a directory; ResultsError when it cannot be read."""
+    from pydantic import TypeAdapter, ValidationError  # noqa: PLC0415  only where entries are read
 
-    Raises
-    ------
-    ResultsError
-        When it cannot be read.
-    """
-    path = Path(path)
-    file = path / ENTRY
+    file = Path(path) / ENTRY
     try:
-        plain = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        meta = TypeAdapter(EntryInfo).validate_json(file.read_bytes())
+    except OSError as error:
         raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
-    meta = Entry.from_plain(plain, str(file))
-    return SubmittedEntry(path, meta, ResultsDirectory(path).records())
-
-
-def entry_paths(root: Path | str) -> list[Path]:
-    """Return the directories below `root`, or `root` itself, that hold an entry, sorted."""
-    root = Path(root)
-    if (root / ENTRY).exists():
-        return [root]
-    found = (path.parent for path in root.glob(f"*/{ENTRY}"))
-    # A name with a leading dot is an entry that is being written.
-    return sorted(path for path in found if not path.name.startswith("."))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ResultsError(f"{str(file)!r} is no entry: {place}: {first['msg']}") from None
+    if meta.schema != SCHEMA:
+        raise ResultsError(
+            f"{str(file)!r}: schema is {meta.schema}, expected {SCHEMA}: it was written by another "
+            "version of oodd-eval"
+        )
+    return SubmittedEntry(file.parent, meta, ResultsDirectory(path).records())
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
-    """Read every entry below a directory, in the order of their names.
-
-    Raises
-    ------
-    ResultsError
-        When the directory does not exist or an entry cannot be read.
-    """
+    """Read the entries below a directory in the order of their names, or the one that it is."""
     root = Path(root)
     if not root.is_dir():
         raise ResultsError(f"no directory of entries at {str(root)!r}")
-    return [read_entry(path) for path in entry_paths(root)]
+    if (root / ENTRY).exists():
+        return [read_entry(root)]
+    # A name with a leading dot is an entry that is being written.
+    found = sorted(p.parent for p in root.glob(f"*/{ENTRY}") if not p.parent.name.startswith("."))
+    return [read_entry(path) for path in found]
 
 
-__all__ = ["CURVES", "ENTRY", "RECORDS", "SCHEMA", "SCORES", "TRUST", "Entry", "SubmittedEntry",
-           "entry_paths", "read_entries", "read_entry"]  # fmt: skip
+def place_of(record: Record) -> tuple[Cell, str, int, int | None]:
+    """Return the place on the leaderboard that only one record may have."""
+    return record.cell, record.split_digest, record.protocol, record.limit
+
+
+def recorded_versions(records: Iterable[Record]) -> dict[str, str]:
+    """Return the versions that records were made with, by package and for ``python``.
+
+    Several versions of one are joined by ``+``.
+    """
+    found: dict[str, set[str]] = {}
+    for record in records:
+        origin = record.provenance
+        named = {"python": origin.get("python", ""), "oodd-eval": origin.get("oodd_eval", "")}
+        # Records without a list of packages name the version of one.
+        named |= origin.get("packages", {"numpy": origin.get("numpy", "")})
+        for name, version in named.items():
+            found.setdefault(name, set()).add(str(version))
+    return {name: "+".join(sorted(versions)) for name, versions in sorted(found.items())}

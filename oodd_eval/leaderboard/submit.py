@@ -3,53 +3,47 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import os
-import platform
-import re
 import shutil
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
-import numpy as np
-
-from oodd_eval.data import files as stored_files
-from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import OutputError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, Entry, read_entries
-from oodd_eval.leaderboard.selecting import made_with, selected
-from oodd_eval.leaderboard.verify import rules
-from oodd_eval.leaderboard.verify.cells import joined
-from oodd_eval.leaderboard.verify.curves_check import Extent, with_curves
-from oodd_eval.leaderboard.verify.findings import Findings
-from oodd_eval.leaderboard.verify.verify import Seen, Verdict, check_clashes, verify_entry
-from oodd_eval.results.curves import make_curves, write_curves
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.files import compress_large
+from oodd_eval.errors import OutputError, UsageError
+from oodd_eval.leaderboard.entry import (
+    CURVES,
+    ENTRY,
+    SCORES,
+    EntryInfo,
+    Trust,
+    read_entries,
+    recorded_versions,
+)
+from oodd_eval.leaderboard.verify import Seen, check_clashes, find_split, formats, verify_entry
+from oodd_eval.leaderboard.verify.files import Findings
+from oodd_eval.leaderboard.verify.scores import first_seeds
+from oodd_eval.leaderboard.verify.trust import EntryVerdict
+from oodd_eval.names import expression, select
+from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
 LARGE: Final = 10 * 10**6
 """Bytes beyond which an entry is said to be large: a repository keeps every version of it."""
 
+Extent = Literal["rows", "detectors", "none"]
+
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What a submitter says about an entry, beyond what its records say.
-
-    Attributes
-    ----------
-    id
-        Name of the entry; empty for one made of detectors and split.
-    title
-        Empty for one made of detectors and split.
-    submitter, citation, url, caption
-        See `oodd_eval.leaderboard.entry.Entry`.
-    trust
-        Level of trust that is claimed: ``"reported"``, or ``"re-scored"`` with the scores.
-    """
+    """A submitter's statements about an entry, beyond its records; empty ones are made up."""
 
     id: str = ""
     title: str = ""
@@ -57,29 +51,19 @@ class Statement:
     citation: str = ""
     url: str = ""
     caption: str = ""
-    trust: str = "reported"
+    trust: Trust = "reported"
 
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """What became of a submission.
+    """The place of an entry and its verdict; nothing is left there with a problem.
 
-    Attributes
-    ----------
-    place
-        Of the entry.
-    verdict
-        What verification found; when it found a problem, nothing is left at `place`.
-    left_out
-        A line for each seed of a row that was left out as incomplete.
-    size
-        Bytes of the entry.
+    `left_out` has a line for each seed of a row that was left out as incomplete.
     """
 
     place: Path
-    verdict: Verdict
+    verdict: EntryVerdict
     left_out: list[str]
-    size: int
 
 
 def submit(
@@ -94,208 +78,189 @@ def submit(
     curves: Extent = "rows",
     split: str | Path | None = None,
 ) -> Submission:
-    """Write an entry, verify what was written, and move it to its place.
-
-    Parameters
-    ----------
-    results
-        Results directory.
-    root
-        Directory of the entries.
-    statement
-        What its submitter says.
-    detectors
-        Names of the detectors to submit: comma lists, globs or ``"all"``.
-    cells, complete
-        See `oodd_eval.leaderboard.selecting.selected`.
-    scores
-        Whether to include every score.
-    curves
-        Of which rows, see `oodd_eval.leaderboard.verify.curves_check.with_curves`.
-    split
-        Name or path of the split; default: where splits usually are. Without the split the entry
-        has no curves.
-
-    Raises
-    ------
-    UsageError
-        For unknown detectors, records that cannot make one entry, or a name that is taken.
-    ResultsError
-        When the results cannot be read.
-    OutputError
-        When the entry cannot be written.
-    """
+    """Write an entry from a results directory, verify it, and move it to its place in `root`."""
     source, root = ResultsDirectory(results), Path(root)
     records, left_out = selected(source.records(), detectors, cells, complete=complete)
-    _require_one_split(records)
-    entry = _entry(records, statement, made_with(source.path, records))
+    _check_publishable(records)
+    entry = _info(records, statement)
     place = root / entry.id
     if os.path.lexists(place):
-        raise UsageError(
-            f"entry {entry.id!r} is there already, in {str(root)!r}: name another with --id, or "
-            "remove it first if this one replaces it"
-        )
+        advice = "name another with --id, or remove it first if this one replaces it"
+        raise UsageError(f"entry {entry.id!r} is there already, in {str(root)!r}: {advice}")
     with _written(place) as directory:
         text = "".join(record.to_json() + "\n" for record in records)
         (directory / RECORDS).write_text(text, encoding="utf-8")
-        stored_files.compress_large(directory / RECORDS)
-        opened = _split(records[0], split)
+        compress_large(directory / RECORDS)
+        opened, _ = find_split(records[0].split, records[0].split_digest, split)
         drawn = with_curves(records, curves)
         if opened is not None and drawn:
-            _require_scores(drawn, source, "submit with --curves none, or")
+            _score_files(drawn, source, "submit with --curves none, or")
             write_curves(make_curves(drawn, source, opened), directory / CURVES)
-            stored_files.compress_large(directory / CURVES)
+            compress_large(directory / CURVES)
         if scores:
-            _copy_scores([record for record in records if record.ok], source, directory)
+            (directory / SCORES).mkdir()
+            evaluated = [record for record in records if record.ok]
+            for file in _score_files(evaluated, source, "leave out --scores, or"):
+                shutil.copyfile(file, directory / SCORES / file.name)
         entry = replace(entry, files=_facts(directory))
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
-            _check_clashes(verdict, root)
-        size = sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+            seen = Seen()
+            for other in read_entries(root):
+                numbered = {str(i): record for i, record in enumerate(other.records)}
+                check_clashes(other.meta.id, numbered, seen, Findings())
+            check_clashes(verdict.name, verdict.records, seen, verdict.findings)
         if verdict.ok:
             directory.rename(place)
-    return Submission(place, verdict, left_out, size)
+    return Submission(place, verdict, left_out)
 
 
-def _require_one_split(records: Sequence[Record]) -> None:
+def selected(
+    records: Sequence[Record], detectors: str, cells: str = "", *, complete: bool = False
+) -> tuple[list[Record], list[str]]:
+    """Return the records to publish, in the order of the board, and what is left out."""
+    if not records:
+        raise UsageError("these results have no records: expected those of a finished run")
+    names = select("detector of these results", detectors, sorted({r.detector for r in records}))
+    wanted = expression(cells) if cells else lambda _: True
+    chosen = [r for r in records if r.detector in names and wanted(str(r.cell))]
+    if not chosen:
+        raise UsageError(f"-k {cells!r} selects none of the {len(records)} records")
+    left_out: list[str] = []
+    if complete:
+        chosen, left_out = _complete(chosen)
+    order = {name: i for i, name in enumerate((*ENVIRONMENTS, *ANOMALIES))}
+    chosen.sort(key=lambda r: (order[r.environment], order[r.anomaly]))
+    chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
+    return [_publishable(r) for r in chosen], left_out
+
+
+def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+    """Leave out the seeds of rows that lack cells which any row here has."""
+    cells: dict[str, set[tuple[str, str]]] = defaultdict(set)
+    for r in records:
+        cells[r.label].add((r.environment, r.anomaly))
+    every = set().union(*cells.values())
+    partial = {label: len(own) for label, own in sorted(cells.items()) if own != every}
+    if len(partial) == len(cells):
+        raise UsageError(
+            f"--complete: no row of these results has all {len(every)} cells that occur in them; "
+            "run the rest, or choose cells that all rows have with -k"
+        )
+    left_out = [f"{label}, which has {n} of {len(every)} cells" for label, n in partial.items()]
+    return [r for r in records if r.label not in partial], left_out
+
+
+def _publishable(record: Record) -> Record:
+    """Return a record whose texts are plain; a command that is not is left out.
+
+    Exceptions may say anything, and parameters on the command line may have any value.
+    """
+    reason = "".join(c if c.isprintable() else " " for c in record.reason)
+    reason = reason.replace("<", "(").replace(">", ")").replace("](", "] (")[:1000]
+    origin = dict(record.provenance)
+    if formats.complaint(formats.FreeValue, origin.get("command", "")):
+        del origin["command"]
+    return replace(record, reason=reason, provenance=origin)
+
+
+def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
+    """Return the records that curves are made of.
+
+    With ``"detectors"`` these are, of each detector, those of the row with the fewest parameters
+    that are not defaults, and of such rows the one with the shortest horizon.
+    """
+    seeds = first_seeds(records)
+    if extent == "none":
+        return []
+    if extent == "detectors":
+        simplest: dict[str, Setting] = {}
+        for row in sorted(seeds, key=lambda s: (len(s.parameters), s.horizon, s.overrides_json)):
+            simplest.setdefault(row.detector, row)
+        seeds = {row: seeds[row] for row in simplest.values()}
+    return [r for r in records if r.ok and seeds.get(r.setting) == r.seed]
+
+
+def _check_publishable(records: Sequence[Record]) -> None:
     splits = sorted({(r.split, r.split_digest[:12]) for r in records})
     if len(splits) > 1:
         listed = ", ".join(f"{name} ({digest})" for name, digest in splits)
-        raise UsageError(
-            f"these results are of {len(splits)} splits: {listed}; an entry is of one, so run "
-            "each into a results directory of its own"
-        )
-    if limited := [r for r in records if r.limit is not None]:
-        raise UsageError(
-            f"{len(limited)} records, such as {limited[0].cell}, used --limit "
-            f"{limited[0].limit}: an entry uses all trajectories, so run without "
-            "it, into another results directory"
-        )
-    if local := [r for r in records if rules.plugin_name(r.plugin)]:
-        raise UsageError(
-            f"detector {local[0].detector!r} is of no installed plug-in (plugin is "
-            f"{local[0].plugin!r}): others could not run it again; see oodd-eval new"
-        )
+        advice = "an entry is of one, so run each into a results directory of its own"
+        raise UsageError(f"these results are of {len(splits)} splits: {listed}; {advice}")
+    for record in records:
+        if record.limit is not None:
+            raise UsageError(
+                f"{record.cell} used --limit {record.limit}: an entry uses all trajectories, so "
+                "run without it, into another results directory"
+            )
+        if formats.complaint(formats.PluginName, record.plugin):
+            raise UsageError(
+                f"detector {record.detector!r} is of no installed plug-in (plugin is "
+                f"{record.plugin!r}): others could not run it again; see oodd-eval new"
+            )
 
 
-def _split(record: Record, place: str | Path | None) -> Split | None:
-    """Open the split of the records; None when it is not here and was not asked for by place."""
-    try:
-        split = load_split(place or record.split.partition("@")[0])
-    except (SplitError, UnknownNameError):
-        if place:
-            raise
-        return None
-    return split if split.digest == record.split_digest else None
-
-
-def _entry(records: Sequence[Record], statement: Statement, command: str) -> Entry:
+def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     """Return ``entry.json`` without its files."""
     first = records[0]
     detectors = sorted({r.detector for r in records})
-    split = first.split.replace("@", "-").lower()
     # Detectors made of classes have capitals and a colon in their names.
+    split = first.split.replace("@", "-")
     name = statement.id or f"{'-'.join(detectors)}-{split}".lower().replace(":", "-")
-    if not statement.id and (len(detectors) > 3 or rules.entry_id(name)):
-        raise UsageError(
-            f"the names of {len(detectors)} detectors make no short id: choose one with --id"
-        )
-    if complaint := rules.entry_id(name):
+    complaint = formats.complaint(formats.EntryId, name)
+    if not statement.id and (len(detectors) > 3 or complaint):
+        raise UsageError("the names of these detectors make no short id: choose one with --id")
+    if complaint:
         raise UsageError(f"--id {complaint}")
     shown = ", ".join(detectors[:3]) + (f" and {len(detectors) - 3} more" * (len(detectors) > 3))
-    return Entry(
-        id=name,
-        title=statement.title or f"{shown} on {first.split}",
+    plugins = []
+    for plugin, *source in sorted(
+        {(r.plugin, r.detector_version, r.plugin_source) for r in records}
+    ):
+        names = ("distribution", "plugin", "version", "source_digest")
+        plugins.append(dict(zip(names, (*plugin.split(":", 1), *source), strict=True)))
+    packages = {r.plugin.partition(":")[0]: r.detector_version for r in records}
+    packages |= recorded_versions(records)
+    platforms = sorted({r.provenance.get("platform", "") for r in records})
+    environment = {
+        "python": packages.pop("python"),
+        "platform": "+".join(platforms)[:200],
+        "packages": dict(sorted(packages.items())),
+    }
+    stated = asdict(statement) | {
+        "id": name,
+        "title": statement.title or f"{shown} on {first.split}",
+    }
+    return EntryInfo(
+        **stated,
         detectors=detectors,
-        submitter=statement.submitter,
-        citation=statement.citation,
-        url=statement.url,
-        trust=statement.trust,
-        split=first.split,
-        split_digest=first.split_digest,
-        protocol=first.protocol,
-        plugins=_plugins(records),
-        environment=_environment(records),
+        **{name: getattr(first, name) for name in ("split", "split_digest", "protocol")},
+        plugins=plugins,
+        environment=environment,
         created=datetime.now(UTC).date().isoformat(),
-        command=command,
-        caption=statement.caption,
+        command=command_of(records),
     )
 
 
-def _plugins(records: Iterable[Record]) -> list[dict[str, str]]:
-    sources = {(r.plugin, r.detector_version, r.plugin_source) for r in records}
-    return [
-        {
-            "distribution": plugin.partition(":")[0],
-            "plugin": plugin.partition(":")[2],
-            "version": version,
-            "source_digest": source,
-        }
-        for plugin, version, source in sorted(sources)
-    ]
-
-
-def _environment(records: Sequence[Record]) -> dict[str, Any]:
-    """Return what the records were made with, as far as it can be known.
-
-    Versions of the libraries that a plug-in depends on are added where the records were made by
-    the Python and numpy that run now.
-    """
-    python = joined(str(r.provenance.get("python", "")) for r in records)
-    numpy = joined(str(r.provenance.get("numpy", "")) for r in records)
-    packages: dict[str, str] = {}
-    if (python, numpy) == (platform.python_version(), np.__version__):
-        for distribution in {r.plugin.partition(":")[0] for r in records}:
-            packages |= _dependencies(distribution)
-    packages |= {r.plugin.partition(":")[0]: r.detector_version for r in records}
-    packages["oodd-eval"] = joined(str(r.provenance.get("oodd_eval", "")) for r in records)
-    packages["numpy"] = numpy
-    return {
-        "python": python,
-        "platform": joined(str(r.provenance.get("platform", "")) for r in records)[:200],
-        "packages": dict(sorted(packages.items())),
-    }
-
-
-def _dependencies(distribution: str) -> dict[str, str]:
-    """Return installed versions of what a distribution, or its extra ``reference``, requires."""
-    found: dict[str, str] = {}
-    try:
-        required = importlib.metadata.requires(distribution) or []
-    except importlib.metadata.PackageNotFoundError:
-        return found
-    for requirement in required:
-        extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)", requirement)
-        name = re.match(r"[A-Za-z0-9._-]+", requirement)
-        if name is None or (extra is not None and extra[1] != "reference"):
-            continue
-        try:
-            found[name[0]] = importlib.metadata.version(name[0])
-        except importlib.metadata.PackageNotFoundError:
-            continue
+def command_of(records: Sequence[Record]) -> str:
+    """Return the commands that records were made with, as far as they can be published."""
+    found = ""
+    for command in dict.fromkeys(str(r.provenance.get("command", "")) for r in records):
+        longer = f"{found} && {command}" if found else command
+        if command and not formats.complaint(formats.Command, longer):
+            found = longer
     return found
 
 
-def _copy_scores(records: Iterable[Record], source: ResultsDirectory, directory: Path) -> None:
-    (directory / SCORES).mkdir()
-    for file in _require_scores(records, source, "leave out --scores, or"):
-        shutil.copyfile(file, directory / SCORES / file.name)
-
-
-def _require_scores(
-    records: Iterable[Record], source: ResultsDirectory, instead: str
-) -> list[Path]:
+def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: str) -> list[Path]:
     """Return the score files of records, each once; refuse when one is not there."""
-    files = []
-    for key in sorted({r.scores for r in records}):
-        file = source.path / SCORES / f"{key}.h5"
-        if rules.score_key(key) or not file.is_file():
-            raise UsageError(
-                f"scores are not there in {str(file)!r}: {instead} run again into this directory"
-            )
-        files.append(file)
-    return files
+    files = {r.scores: source.path / SCORES / f"{r.scores}.h5" for r in records}
+    for key, file in files.items():
+        if formats.complaint(formats.ScoreKey, key) or not file.is_file():
+            advice = f"{instead} run again into this directory"
+            raise UsageError(f"scores are not there in {str(file)!r}: {advice}")
+    return list(files.values())
 
 
 def _facts(directory: Path) -> dict[str, dict[str, Any]]:
@@ -303,20 +268,9 @@ def _facts(directory: Path) -> dict[str, dict[str, Any]]:
     found = {}
     for path in sorted(p for p in directory.rglob("*") if p.is_file()):
         content = path.read_bytes()
-        found[path.relative_to(directory).as_posix()] = {
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "bytes": len(content),
-        }
+        facts = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+        found[path.relative_to(directory).as_posix()] = facts
     return found
-
-
-def _check_clashes(verdict: Verdict, root: Path) -> None:
-    """Compare a new entry with those that are there."""
-    seen: Seen = {}
-    for other in read_entries(root):
-        numbered = {str(i): record for i, record in enumerate(other.records, start=1)}
-        check_clashes(other.meta.id, numbered, seen, Findings())
-    check_clashes(verdict.name, verdict.records or {}, seen, verdict.findings)
 
 
 @contextmanager

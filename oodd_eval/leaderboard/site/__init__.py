@@ -1,73 +1,55 @@
 """The leaderboard's site: one HTML file that works from disk, without a server or a network.
 
 Data is embedded as JSON, styles and scripts are in the page, and its content security policy
-allows nothing else, by digest. What the page shows is in `oodd_eval.leaderboard.site.data`.
+allows nothing else, by digest. What is embedded is computed in `oodd_eval.leaderboard.site.data`;
+here its curves are made small: lists that are shared stand in the page once, and examples are on a
+grid as fine as the screen's.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import itertools
 import json
+import math
 import re
-from collections.abc import Sequence
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_eval.errors import OutputError
-from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.site.data import site_data
+from oodd_eval.leaderboard.sections import LeaderboardSection
+from oodd_eval.leaderboard.site.data import Json, site_data
+from oodd_eval.metrics.cusum import THRESHOLD
 
 PAGE: Final = "index.html"
 
 SCRIPTS: Final = (
-    "core.js",
-    "model.js",
-    "columns.js",
-    "table.js",
-    "filters.js",
-    "plots.js",
-    "detector.js",
+    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "detector.js",
     "main.js",
-)
+)  # fmt: skip
 """Parts of the page's one script, in order."""
+
+LEVELS: Final = 250
+"""Least number of steps between zero and the largest value of a drawing, about one a pixel."""
+
+HEAVY: Final = 30
+"""A largest value this many times the typical one asks for a logarithmic scale."""
 
 _STATIC = Path(__file__).with_name("static")
 
 
-def render(entries: Sequence[SubmittedEntry], output: Path) -> Path:
-    """Write the site of some entries into a directory and return its page.
-
-    Parameters
-    ----------
-    entries
-        As read by `oodd_eval.leaderboard.entry.read_entries`.
-    output
-        Directory; it is made where it is missing.
-
-    Raises
-    ------
-    ResultsError
-        When the curves of an entry cannot be read.
-    OutputError
-        When the page cannot be written.
-    """
-    text = page(entries)
-    path = output / PAGE
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{str(path)!r} cannot be written: {error}") from None
-    return path
-
-
-def page(entries: Sequence[SubmittedEntry]) -> str:
-    """Return the page of some entries; the same entries give the same text."""
-    data, curves = site_data(entries)
+def page(sections: Sequence[LeaderboardSection]) -> str:
+    """Return the site of a leaderboard; the same entries give the same text."""
+    data, curves = site_data(sections)
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
+    tags = (
+        f'<script type="application/json" id="curves-{i}">{embedded(packed(part))}</script>'
+        for i, part in enumerate(curves)
+    )
     parts = {
         "version": __version__,
         "style": style,
@@ -75,23 +57,14 @@ def page(entries: Sequence[SubmittedEntry]) -> str:
         "script": script,
         "script-hash": _digest(script),
         "data": embedded(data),
-        "curves": "\n".join(
-            f'<script type="application/json" id="curves-{i}">{embedded(part)}</script>'
-            for i, part in enumerate(curves)
-        ),
+        "curves": "\n".join(tags),
     }
     # One pass, so that nothing in the data is taken for a place to fill in.
     return re.sub(r"@([a-z-]+)@", lambda match: parts[match[1]], _static("page.html"))
 
 
 def embedded(value: Any) -> str:
-    r"""Return JSON that may stand in a script element: no markup in it can end the element.
-
-    Examples
-    --------
-    >>> embedded("</script>")
-    '"\\u003c/script\\u003e"'
-    """
+    r"""Return JSON that may stand in a script element: no markup in it can end the element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -103,5 +76,71 @@ def _static(name: str) -> str:
 
 
 def _digest(content: str) -> str:
-    """Return what a content security policy names a style or script by."""
+    """Return a style's or script's name in a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+
+
+def packed(curves: Mapping[str, Json]) -> Json:
+    """Return the curves of a row's cells, by ``environment/anomaly``, in fewer characters.
+
+    The result has ``lists``, every list of ``roc`` and ``delay_far`` once, and ``cells``, in which
+    places in ``lists`` stand for these. Examples are those of `gridded`; their twins lack the first
+    ``same_scores`` and ``same_cusum`` values, which are no others.
+    """
+    places: dict[tuple[float, ...], int] = {}
+
+    def place(numbers: Sequence[float]) -> int:
+        return places.setdefault(tuple(numbers), len(places))
+
+    cells = {}
+    for name, cell in curves.items():
+        example = _without_same(gridded(cell["example"]))
+        lists = {
+            part: {key: place(numbers) for key, numbers in cell[part].items()}
+            for part in ("roc", "delay_far")
+        }
+        cells[name] = cell | lists | {"example": example}
+    return {"lists": [list(numbers) for numbers in places], "cells": cells}
+
+
+def gridded(example: Json) -> Json:
+    """Return an example whose scores and statistics are whole numbers of steps.
+
+    A ``score_step`` or ``cusum_step`` of None says that the numbers are as they were, because a few
+    are so large that they need a logarithmic scale.
+    """
+    found = dict(example)
+    for step_name, unit, names in (
+        ("score_step", 1.0, ("scores", "twin")),
+        ("cusum_step", THRESHOLD, ("cusum", "twin_cusum")),
+    ):
+        step = _step((v for name in names for v in example[name] if v is not None), unit)
+        found[step_name] = step
+        if step is not None:
+            for name in names:
+                found[name] = [None if v is None else round(v / step) for v in example[name]]
+    return found
+
+
+def _without_same(example: Json) -> Json:
+    """Leave out the beginnings of the twin's series: up to the onset both are the same."""
+    found = dict(example)
+    for name, twin in (("scores", "twin"), ("cusum", "twin_cusum")):
+        pairs = zip(example[name], example[twin], strict=False)
+        same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+        found[f"same_{name}"] = same
+        found[twin] = example[twin][same:]
+    return found
+
+
+def _step(numbers: Iterable[float], unit: float) -> float | None:
+    """Return a round step for numbers that are drawn together; None where they are too uneven."""
+    sizes = [abs(v) for v in numbers]
+    largest = max([unit, *sizes])
+    typical = max(unit, statistics.median(sizes) if sizes else unit)
+    if largest > HEAVY * typical:
+        return None
+    power = math.floor(math.log10(largest / LEVELS))
+    # Not 10**-4 but the float that is printed as 0.0001.
+    steps = [float(f"{digit}e{power}") for digit in (1, 2, 5)]
+    return max(s for s in steps if s <= largest / LEVELS * (1 + 1e-9))

@@ -1,34 +1,32 @@
-"""What the site shows, as plain data for its page: boards, rows, cells, intervals, curves.
+"""The content of the site as plain data: boards, rows, cells, intervals, curves.
 
 Everything that is not simple arithmetic is computed here; the page filters, averages over cells,
-sorts and draws.
+sorts and draws. It has the intervals of a mean for every selection of cells that its filters can
+make.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.leaderboard.entry import Entry, SubmittedEntry
-from oodd_eval.leaderboard.sections import LeaderboardSection, sections
-from oodd_eval.leaderboard.site.packing import packed
-from oodd_eval.leaderboard.site.selections import Cell, selection_intervals, selections
-from oodd_eval.metrics.auc import HIGHER_IS_BETTER, METRICS, POOLED
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.leaderboard.entry import EntryInfo
+from oodd_eval.leaderboard.sections import LeaderboardSection
+from oodd_eval.metrics import bootstrap
+from oodd_eval.metrics.bootstrap import Samples
+from oodd_eval.metrics.catalogue import POOLED, RATIOS, TARGETS, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.standings import Standing
-from oodd_eval.results.tables.tables import PERCENT, TITLES
+from oodd_eval.results.tables.board import Standing, contribution
 
+_COMPARED: Final = ("delay", "delay_censored", "missed", "far_twin")
 WITH_INTERVALS: Final = (
     "auc_matched", "auc", "delay", "delay_null", "delay_censored", "missed", "far", "far_twin",
-    *(f"{name}_{suffix}" for suffix in ("at_1pct", "at_01pct")
-      for name in ("delay", "delay_censored", "missed", "far_twin")),
+    *(f"{name}_{suffix}" for suffix in TARGETS for name in _COMPARED),
 )  # fmt: skip
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
@@ -36,101 +34,64 @@ ENTRY_FIELDS: Final = (
     "id", "title", "submitter", "trust", "rerun", "created", "citation", "url", "caption",
     "command",
 )  # fmt: skip
-"""What the site says of an entry."""
+"""Fields of an entry that the site shows."""
 
-SUFFIXES: Final = {"": "", "at_1pct": "1 %", "at_01pct": "0.1 %"}
-"""Targets of calibrated thresholds by the suffix of their metrics."""
-
-_ORDER: Final = {
-    (e, a): (i, j) for i, e in enumerate(ENVIRONMENTS) for j, a in enumerate(ANOMALIES)
-}
-
-_THRESHOLD: Final = {"threshold": "smallest threshold that meets the target on calibration data"}
-
-_PAPER = Path(__file__).parents[2] / "data" / "paper_tables.json"
+_ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
 
 Json = dict[str, Any]
 Units = Mapping[str, list[Json]]
 """Curves of single cells by the id of their entry."""
 
+SelectedCell = tuple[str, str]
+"""Environment and anomaly."""
 
-def site_data(entries: Sequence[SubmittedEntry]) -> tuple[Json, list[Json]]:
-    """Return the content of the site.
 
-    Parameters
-    ----------
-    entries
-        As read by `oodd_eval.leaderboard.entry.read_entries`.
+def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]:
+    """Return the data that the page needs at once, and the curves of single rows.
 
-    Returns
-    -------
-    data
-        What the page needs at once.
-    curves
-        What it needs when a row is opened, by ``environment/anomaly``. A row names its place in
-        this list.
-
-    Raises
-    ------
-    ResultsError
-        When entries contradict one another, or curves cannot be read.
+    A row names its place in the list of curves, which are by ``environment/anomaly``.
     """
-    units = {entry.meta.id: read_curves(entry.curves)["units"] for entry in entries if entry.curves}
+    entries = {entry.meta.id: entry for section in sections for entry in section.entries}
+    units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
     curves: list[Json] = []
-    shown = [_board(section, units, curves) for section in sections(entries)]
+    shown = [_board(section, units, curves) for section in sections]
     names = dict.fromkeys(name for board in shown for name in board["metrics"])
-    return {
+    data = {
         "threshold": THRESHOLD,
         "drift": DRIFT,
         "metrics": {name: _metric(name) for name in names},
-        "environments": {
-            e.id: {"title": e.title, "family": e.family} for e in ENVIRONMENTS.values()
-        },
-        "anomalies": {
-            a.id: {"title": a.title, "group": a.group, "summary": a.summary}
-            for a in ANOMALIES.values()
-        },
-        "paper": json.loads(_PAPER.read_text(encoding="utf-8"))["table5_groups_delta1"],
+        "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
+        "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in ANOMALIES.values()},
+        "paper": paper_tables()["table5_groups_delta1"],
         "boards": shown,
-    }, curves
+    }
+    return data, curves
+
+
+def _fields(thing: object, *names: str) -> Json:
+    return {name: getattr(thing, name) for name in names}
 
 
 def _metric(name: str) -> Json:
-    base, _, suffix = name.partition("_at_")
-    target = SUFFIXES[f"at_{suffix}" if suffix else ""]
-    title = TITLES.get(base, base) + (f" at {target}" if target else "")
-    meaning = (METRICS | POOLED | _THRESHOLD)[base]
-    under = f"; with a false-alarm rate calibrated to {target}" if base in METRICS else ""
-    return {
-        "title": title[0].upper() + title[1:],
-        "meaning": meaning + (under if target else ""),
-        "kind": _kind(name),
-        "higher": base in HIGHER_IS_BETTER,
-    }
-
-
-def _kind(metric: str) -> str:
-    base = metric.partition("_at_")[0]
-    return "percent" if base in PERCENT else "steps" if base.startswith("delay") else "rate"
+    info = metric_info(name)
+    title = info.title[0].upper() + info.title[1:]
+    higher = info.better == "higher"
+    return {"title": title, "meaning": info.summary, "kind": info.unit, "higher": higher}
 
 
 def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Json:
     ranks, board = section.ranks, section.ranks.board
     found = {name for r in board.records for name in r.metrics}
-    calibrated = [f"{m}_{s}" for s in SUFFIXES if s for m in (*METRICS, *_THRESHOLD)]
     # The plain ones stand there even where every cell of the board has failed.
-    names = [*METRICS, *(name for name in (*calibrated, *POOLED) if name in found)]
+    calibrated = [f"{m}_{suffix}" for suffix in TARGETS for m in (*RATIOS, "threshold")]
+    names = [*RATIOS, *(name for name in (*calibrated, *POOLED) if name in found)]
     have = {(r.environment, r.anomaly) for r in board.records}
     chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
     return {
         "id": section.name,
-        "split": board.split,
-        "digest": board.digest,
-        "protocol": board.protocol,
-        "limit": board.limit,
+        **_fields(board, "split", "digest", "protocol", "limit"),
         "tests": board.test_seeds(),
-        "environments": board.environments,
-        "anomalies": board.anomalies,
+        **_fields(board, "environments", "anomalies"),
         "metrics": names,
         "intervals": _with_intervals(names),
         "rows": [_row(section, s, names, chosen, units, curves) for s in ranks.standings],
@@ -147,17 +108,17 @@ def _row(
     section: LeaderboardSection,
     standing: Standing,
     names: Sequence[str],
-    chosen: Mapping[str, Sequence[Cell]],
+    chosen: Mapping[str, Sequence[SelectedCell]],
     units: Units,
     curves: list[Json],
 ) -> Json:
-    row, records, cost = standing.entry, standing.records, standing.cost
+    row, records = standing.entry, standing.records
     sources = [source.meta for source in section.sources[row]]
     own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
     if own:
-        curves.append(packed(own))
+        curves.append(own)
     return {
-        "id": f"{section.name}/{str(row)}",
+        "id": f"{section.name}/{row!s}",
         "label": str(row),
         "detector": row.detector,
         "version": records[0].detector_version,
@@ -166,13 +127,9 @@ def _row(
         "parameters": records[0].parameters,
         "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        "trivial": standing.trivial,
-        "inputs": standing.inputs,
-        "rank": standing.rank,
-        "ties": standing.ties,
-        "state": standing.state,
+        **_fields(standing, "trivial", "inputs", "rank", "ties", "state"),
         "wins": _short(standing.wins),
-        "cost": {name: _short(getattr(cost, name)) for name in ("fit", "step", "peak")},
+        "cost": {n: _short(v) for n, v in _fields(standing.cost, "fit", "step", "peak").items()},
         "trust": section.trust[row],
         "entries": [_entry(meta, records[0].plugin) for meta in sources],
         "cells": [_cell(r, names) for r in sorted(records, key=_place)],
@@ -181,34 +138,24 @@ def _row(
     }
 
 
-def _entry(meta: Entry, plugin: str) -> Json:
-    """Tell who an entry is from, and the digest of the plug-in's source that it names."""
-    digests = [
-        named["source_digest"]
-        for named in meta.plugins
-        if f"{named['distribution']}:{named['plugin']}" == plugin
-    ]
-    return {name: getattr(meta, name) for name in ENTRY_FIELDS} | {
-        "source_digest": digests[0] if digests else ""
-    }
+def _entry(meta: EntryInfo, plugin: str) -> Json:
+    """Return who an entry is from, and the digest of the plug-in's source that it names."""
+    digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in meta.plugins[::-1]}
+    return _fields(meta, *ENTRY_FIELDS) | {"source_digest": digests.get(plugin, "")}
 
 
-def _place(record: Record) -> tuple[int, int, int]:
+def _place(record: Record) -> tuple[int, int]:
     """Order of the benchmark: environment, anomaly, seed."""
-    return (*_ORDER[record.environment, record.anomaly], record.seed)
+    return _ORDER[record.environment, record.anomaly], record.seed
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:
     """One record: its values, and its intervals, in the orders of the board's lists of names."""
-    plain: Json = {
-        "environment": record.environment,
-        "anomaly": record.anomaly,
-        "seed": record.seed,
-    }
+    plain = _fields(record, "environment", "anomaly", "seed")
     if not record.ok:
-        return plain | {"status": record.status, "reason": record.reason}
+        return plain | _fields(record, "status", "reason")
     metrics = [record.metrics.get(name) for name in names]
-    bounds = [(record.metrics.get(name), _kind(name)) for name in _with_intervals(names)]
+    bounds = [(record.metrics.get(name), metric_info(name).unit) for name in _with_intervals(names)]
     return plain | {
         "values": [m and _short(m.value) for m in metrics],
         "low": [m and _printed(m.low, kind) for m, kind in bounds],
@@ -217,14 +164,14 @@ def _cell(record: Record, names: Sequence[str]) -> Json:
 
 
 def _intervals(
-    records: Sequence[Record], names: Sequence[str], chosen: Mapping[str, Sequence[Cell]]
+    records: Sequence[Record], names: Sequence[str], chosen: Mapping[str, Sequence[SelectedCell]]
 ) -> Json:
     """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
     metrics = _with_intervals(names)
     found: dict[str, list[list[float | None] | None]] = {}
     for i, metric in enumerate(metrics):
         for key, pair in selection_intervals(records, metric, chosen).items():
-            bounds = [_printed(value, _kind(metric)) for value in pair]
+            bounds = [_printed(value, metric_info(metric).unit) for value in pair]
             found.setdefault(key, [None] * len(metrics))[i] = bounds
     return found
 
@@ -244,19 +191,65 @@ def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
     return found
 
 
-def _short(value: float | None) -> float | None:
+def _short(value: float) -> float | None:
     """Round to six digits, finer than anything printed; None for what is undefined."""
-    if value is None or not math.isfinite(value):
+    if not math.isfinite(value):
         return None
     near = float(f"{value:.6g}")
     return int(near) if near.is_integer() else near
 
 
-def _printed(value: float | None, kind: str) -> float | None:
+def _printed(value: float, kind: str) -> float | None:
     """Round an end of an interval to what is printed: nothing is computed from it."""
-    if value is None or not math.isfinite(value):
-        return None
     # A percentage is rounded as one, so that the page and other tables have the same digits.
     if kind == "percent":
         return _short(round(round(100 * value, 1) / 100, 3))
     return _short(round(value, 1 if kind == "steps" else 3))
+
+
+def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
+    """Return the selections of cells that filters can make, by key.
+
+    A key is ``environments|anomalies``: for the one ``all``, a family or an environment, for the
+    other ``all``, a group or an anomaly.
+    """
+    environments: dict[str, set[str]] = {}
+    anomalies: dict[str, set[str]] = {}
+    for environment, anomaly in cells:
+        for name in ("all", ENVIRONMENTS[environment].family, environment):
+            environments.setdefault(name, set()).add(environment)
+        for name in ("all", ANOMALIES[anomaly].group, anomaly):
+            anomalies.setdefault(name, set()).add(anomaly)
+    found = {
+        f"{some}|{others}": [(e, a) for e, a in cells if e in environments[some] and a in named]
+        for some in environments
+        for others, named in anomalies.items()
+    }
+    return {key: chosen for key, chosen in found.items() if chosen}
+
+
+def selection_intervals(
+    records: Sequence[Record], metric: str, chosen: Mapping[str, Sequence[SelectedCell]]
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of one row's mean over each selection of cells, by key.
+
+    They are those of `Board.mean`, with each cell resampled once. Left out are selections with a
+    failed cell, without an interval, and of one record, which has its own.
+    """
+    draws: dict[tuple[int, str, str], Samples] = {}
+    for r in records:
+        if metric in r.per_trajectory:
+            drawn = bootstrap.cell_samples(r.environment, contribution(r, metric))
+            draws[r.seed, r.environment, r.anomaly] = drawn
+    seeds = list(dict.fromkeys(seed for seed, _, _ in draws))
+    failed = {(r.environment, r.anomaly) for r in records if not r.ok}
+    found = {}
+    for key, cells in chosen.items():
+        by_seed = [[draws[s, *cell] for cell in cells if (s, *cell) in draws] for s in seeds]
+        means = [bootstrap.mean_samples(own) for own in by_seed if own]
+        one = len(seeds) == len(cells) == 1
+        if means and not one and not failed.intersection(cells):
+            low, high = bootstrap.percentiles(bootstrap.mean_over_seeds(means))
+            if not math.isnan(low):
+                found[key] = low, high
+    return found

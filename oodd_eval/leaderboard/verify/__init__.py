@@ -1,1 +1,211 @@
-"""Entries of the leaderboard: their format, how one is written, and how it is checked as data."""
+"""Verify entries strictly as data: nothing of them is imported, executed or followed.
+
+An entry is checked in an order in which every step only meets what the steps before have found
+sound: files, ``entry.json``, digests, the fields of each record, the metrics of each record, the
+records among each other, scores, and last the trajectories of the split, where it is at hand.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from oodd_eval.data.facts import SPLITS
+from oodd_eval.data.files import GZIP
+from oodd_eval.data.split import Split, load_split, published_digests
+from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
+from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, place_of, recorded_versions
+from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files
+from oodd_eval.leaderboard.verify.formats import read_info, read_records
+from oodd_eval.leaderboard.verify.records import (
+    Records,
+    check_against_split,
+    check_record,
+    check_together,
+)
+from oodd_eval.leaderboard.verify.scores import (
+    check_curves,
+    check_recomputed_curves,
+    check_rescored,
+    check_scores,
+)
+from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
+from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.record import Record
+
+ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})
+"""Files that may lie beside the entries."""
+
+Seen = dict[object, tuple[str, str]]
+"""By cell or detector: the entry that has it, and the distribution that a detector is from."""
+
+
+def verify_entry(
+    directory: Path,
+    *,
+    name: str = "",
+    split: str | Path | None = None,
+    rerun: Sequence[Record] = (),
+) -> EntryVerdict:
+    """Check one entry, which is going to have another name if one is given.
+
+    `split` is the name or path of its split, where that is not at its usual place; `rerun` are the
+    records of a run that the verifier made.
+    """
+    name = name or Path(os.path.abspath(directory)).name  # noqa: PTH100  a link is not followed
+    findings = Findings()
+    if not stat.S_ISDIR(directory.lstat().st_mode):
+        findings.refuse("entry", "", "is a link or a file, expected a directory")
+        return EntryVerdict(name, findings, {})
+    contents = read_files(directory, findings)
+    entry = read_info(contents, findings)
+    if entry is not None:
+        _check_info(entry, name, findings)
+        check_digests(contents, entry.files, findings)
+    records = read_records(contents, findings)
+    terms = {where: check_record(where, record, findings) for where, record in records.items()}
+    sums = {where: own for where, own in terms.items() if own is not None}
+    if entry is None or not records:
+        return EntryVerdict(name, findings, records, entry)
+    _check_statements(entry, records, findings)
+    check_together(entry, records, sums, findings)
+    scored = check_scores(directory, contents, records, findings)
+    curves = check_curves(contents, records, findings)
+    complete = bool(scored) and all(w in scored for w, r in records.items() if r.ok)
+    rescored = False
+    opened, note = find_split(entry.split, entry.split_digest, split)
+    if opened is None:
+        findings.notes.append(f"{note}: compared with no trajectory, nothing recomputed")
+    else:
+        sound = not findings.count
+        own = {w: r for w, r in records.items() if r.split_digest == opened.digest}
+        scored = {w: r for w, r in scored.items() if w in own}
+        check_against_split(own, sums, opened, findings)
+        if scored:
+            rescored = check_rescored(scored, directory, opened, findings) and complete
+        if scored and curves is not None and sound:
+            check_recomputed_curves(curves, scored, directory, opened, findings)
+    again = compare_rerun(records, rerun, findings) if rerun else None
+    if entry.trust == "re-scored" and not complete:
+        message = "is 're-scored', but scores are not there, or not sound, for every record"
+        findings.refuse(ENTRY, "trust", message)
+    rescored = rescored and not findings.count
+    verdict = EntryVerdict(name, findings, records, entry, rescored, again)
+    findings.notes.extend(_notes_on_trust(entry, verdict))
+    return verdict
+
+
+def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
+    """Check ``entry.json`` by itself: its name, its claim, and the split it names.
+
+    A split's name that is the benchmark's own stands for one digest only; any other split of that
+    name carries the start of its digest.
+    """
+    findings.expect(ENTRY, "id", name, entry.id, "the name of its directory")
+    if (entry.trust == "re-run") != (entry.rerun is not None):
+        expected = "who ran it again and how" if entry.trust == "re-run" else "null"
+        findings.refuse(ENTRY, "rerun", f"must be {expected} where trust is {entry.trust!r}")
+    published, split, digest = published_digests(), entry.split, entry.split_digest
+    names = [known for known, its in published.items() if its == digest]
+    if not digest.startswith(split.partition("@")[2]):
+        findings.refuse(ENTRY, "split", f"is {split!r}, but split_digest is {digest[:8]}…")
+    if names and split not in names:
+        findings.expect(ENTRY, "split", names[0], split, "the split of this digest")
+    elif split in SPLITS and not names:
+        expected = published.get(split, "not published yet")
+        why = f"that of {split!r}; another split would be {split}@{digest[:8]}"
+        findings.expect(ENTRY, "split_digest", expected, digest, why)
+    elif not names:
+        note = f"unpublished split {split} (digest {digest[:12]})"
+        findings.notes.append(f"{note}: shown in tables of its own, not ranked with others")
+
+
+def _check_statements(entry: EntryInfo, records: Records, findings: Findings) -> None:
+    """Check what ``entry.json`` says of its records: detectors, plug-ins, versions."""
+    why = "as the records have it"
+    found = sorted({record.detector for record in records.values()})
+    findings.expect(ENTRY, "detectors", found, entry.detectors, why)
+    listed = sorted(
+        (f"{p['distribution']}:{p['plugin']}", p["version"], p["source_digest"])
+        for p in entry.plugins
+    )
+    used = {(r.plugin, r.detector_version, r.plugin_source) for r in records.values()}
+    findings.expect(ENTRY, "plugins", sorted(used), listed, why)
+    stated = entry.environment["packages"] | {"python": entry.environment["python"]}
+    for package, version in recorded_versions(records.values()).items():
+        field = f"environment.{'' if package == 'python' else 'packages.'}{package}"
+        findings.expect(ENTRY, field, version, stated.get(package), why)
+
+
+def find_split(name: str, digest: str, place: str | Path | None) -> tuple[Split | None, str]:
+    """Open a split, or say why it is not at hand; one that is named by `place` has to be there."""
+    try:
+        split = load_split(place or name.partition("@")[0])
+    except (SplitError, UnknownNameError):
+        if place:
+            raise
+        return None, f"split {name} is not on this machine (name its place with --split)"
+    if split.digest == digest:
+        return split, ""
+    digests = f"digest {split.digest[:12]}, the entry's is {digest[:12]}"
+    return None, f"split {split.name} here has {digests}"
+
+
+def _notes_on_trust(entry: EntryInfo, verdict: EntryVerdict) -> Iterator[str]:
+    """Compare the level of trust that an entry claims with what could be established."""
+    if entry.trust == "re-scored" and not verdict.rescored and verdict.ok:
+        yield "trust 're-scored' could not be confirmed here"
+    if entry.rerun is not None and verdict.rerun is None:
+        claim = f"by {entry.rerun['by']}: {entry.rerun['how']}"
+        said = f"trust 're-run' is what the entry says ({claim})"
+        yield f"{said}; nothing here confirms it without a run of yours (--rerun)"
+    if entry.trust == "reported" and verdict.rescored:
+        yield "every metric was recomputed from the scores: qualifies for 're-scored'"
+    if entry.trust != "re-run" and verdict.reached == "re-run":
+        yield "the run again agrees: qualifies for 're-run'"
+
+
+def verify(
+    path: Path | str, *, split: str | Path | None = None, rerun: Sequence[Record] = ()
+) -> Iterator[EntryVerdict]:
+    """Check an entry, or all entries of a directory and that no two of them clash.
+
+    Yields one verdict an entry, in the order of their names, and one more for the directory itself
+    when something else lies in it; for `split` and `rerun` see `verify_entry`.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise ResultsError(f"{str(path)!r} is no directory: expected an entry, or one of entries")
+    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + GZIP)):
+        yield verify_entry(path, split=split, rerun=rerun)
+        return
+    if rerun:
+        raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")
+    stray, seen = Findings(), Seen()
+    for child in sorted(path.iterdir()):
+        if child.is_symlink() or child.is_dir():
+            verdict = verify_entry(child, split=split)
+            check_clashes(verdict.name, verdict.records, seen, verdict.findings)
+            yield verdict
+        elif child.name not in ROOT_FILES:
+            stray.refuse(plain(child.name), "", "is no entry: expected directories alone")
+    if stray.count:
+        yield EntryVerdict(str(path), stray, {})
+
+
+def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -> None:
+    """Refuse what an entry in `seen` has too: a cell, or a detector's name from another place."""
+    for where, record in records.items():
+        cell, *conditions = place_of(record)
+        other, _ = seen.setdefault((replace(cell, split=""), *conditions), (name, ""))
+        if other != name:
+            message = f"is in entry {other} too: replace that one, or leave it out"
+            findings.refuse(where, "cell", message)
+        distribution = record.plugin.partition(":")[0]
+        owner, known = seen.setdefault(record.detector, (name, distribution))
+        why = f"as in entry {owner}: a name stands for one detector"
+        findings.expect(where, "detector", f"from {known}", f"from {distribution}", why)

@@ -1,4 +1,4 @@
-"""The files of an entry: which there may be, how large, and how they are read without trust.
+"""The files of an entry, read without trust, and the problems that are found in them.
 
 Nothing is followed, opened or decoded before it is known to be a plain file of bounded size.
 """
@@ -9,127 +9,159 @@ import hashlib
 import json
 import os
 import re
+import reprlib
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data import files as stored_files
+from oodd_eval.data.files import GZIP
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES
-from oodd_eval.leaderboard.verify.findings import Findings, shown
 from oodd_eval.results.directory import RECORDS
 
 MB: Final = 10**6
 MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}
-"""Largest sizes of files that may be packed, unpacked."""
+"""Largest decompressed sizes of files that may be compressed."""
 
-MOST_BYTES: Final = {
-    ENTRY: MB // 4,
-    **MOST_PLAIN,
-    **{name + stored_files.GZIP: 8 * MB for name in MOST_PLAIN},
-}
+MOST_BYTES: Final = {ENTRY: MB // 4, **MOST_PLAIN, **{n + GZIP: 8 * MB for n in MOST_PLAIN}}
 """Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""
 
 MOST_SCORE_BYTES: Final = 64 * MB
 MOST_TOTAL_BYTES: Final = 128 * MB
 MOST_FILES: Final = 2000
 
+MOST_PROBLEMS: Final = 200
+"""Problems of one entry that are kept; more are counted."""
+
 _SCORE_FILE: Final = re.compile(rf"{SCORES}/[a-z0-9][a-z0-9._-]{{0,159}}\.h5")
 
+_SHORT: Final = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
+_SHORT.maxlevel = 2
 
-def list_files(entry: Path, findings: Findings) -> dict[str, int]:
-    """Return the sizes of an entry's files by relative name: of those alone that may be read.
+
+def shown(value: Any) -> str:
+    """Return a value of a submission, shortened and safe to print on a terminal."""
+    return _SHORT.repr(value).encode("ascii", "backslashreplace").decode()
+
+
+def plain(text: str) -> str:
+    """Return a name of a submission like `shown`, without its quotes."""
+    return shown(text)[1:-1]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One reason to refuse an entry.
+
+    `where` is a file, with line and cell where there are any: ``records.jsonl:3 (<cell>)``.
+    `field`, such as ``metrics.auc.value``, is empty for the file as a whole.
+    """
+
+    where: str
+    field: str
+    message: str
+
+    @property
+    def text(self) -> str:
+        """The problem as one line."""
+        return ": ".join(part for part in (self.where, self.field, self.message) if part)
+
+
+@dataclass(slots=True)
+class Findings:
+    """Problems and notes of one entry, in the order in which they were found."""
+
+    problems: list[Problem] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def refuse(self, where: str, field: str, message: str) -> None:
+        """Add a problem; beyond `MOST_PROBLEMS` it is counted only."""
+        self.count += 1
+        if len(self.problems) < MOST_PROBLEMS:
+            self.problems.append(Problem(where, field, message))
+
+    def expect(self, where: str, field: str, expected: Any, found: Any, why: str = "") -> None:
+        """Refuse a value that is not the expected one."""
+        if found != expected:
+            reason = f": {why}" if why else ""
+            self.refuse(where, field, f"is {shown(found)}, expected {shown(expected)}{reason}")
+
+    @contextmanager
+    def reading(self, where: str) -> Iterator[None]:
+        """Make a problem of a file out of the error that ends this block."""
+        try:
+            yield
+        except ResultsError as error:
+            self.refuse(where, "", str(error))
+
+
+def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
+    """Return the content of an entry's files by relative name.
 
     Everything else in the directory is refused: other files, directories, links, devices.
     """
-    found: dict[str, int] = {}
     listed = _scan(entry, "", findings)
     if SCORES in listed and stat.S_ISDIR(listed[SCORES].st_mode):
         del listed[SCORES]
         listed |= _scan(entry / SCORES, f"{SCORES}/", findings)
+    sizes = {}
     for name, status in sorted(listed.items()):
-        if _is_fine(name, status, findings):
-            found[name] = status.st_size
-    total = sum(found.values())
-    if total > MOST_TOTAL_BYTES:
-        findings.refuse(
-            "files", "total size", f"is {total} bytes, expected at most {MOST_TOTAL_BYTES}"
-        )
-        return {}
+        if complaint := _complaint(name, status):
+            findings.refuse(plain(name), "", complaint)
+        else:
+            sizes[name] = status.st_size
     for name in MOST_PLAIN:
-        if name in listed and name + stored_files.GZIP in listed:
-            findings.refuse(
-                name + stored_files.GZIP, "", f"is there beside {name}: expected one of the two"
-            )
+        if {name, name + GZIP} <= listed.keys():
+            findings.refuse(name + GZIP, "", f"is there beside {name}: expected one of the two")
     for name in (ENTRY, RECORDS):
-        if not {name, name + stored_files.GZIP} & listed.keys():
+        if not {name, name + GZIP} & listed.keys():
             findings.refuse(name, "", "is missing")
-    return found
-
-
-def name_in(files: Mapping[str, int], name: str) -> str:
-    """Return the name under which a file is there, plain or packed; empty if it is not."""
-    return next((n for n in (name, name + stored_files.GZIP) if n in files), "")
-
-
-def read_whole(entry: Path, name: str) -> str:
-    """Read a text file of an entry, unpacked if its name says that it is packed.
-
-    Raises
-    ------
-    ResultsError
-        When it is too large, no plain file, not packed as it should be, or not UTF-8.
-    """
-    content = read_bytes(entry / name, MOST_BYTES[name])
-    if name.endswith(stored_files.GZIP):
-        content = stored_files.decompress(content, MOST_PLAIN[name.removesuffix(stored_files.GZIP)])
-    try:
-        return content.decode()
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise ResultsError(f"is not UTF-8: {error.reason} in line {line}") from None
+    if (total := sum(sizes.values())) > MOST_TOTAL_BYTES:
+        message = f"is {total} bytes, expected at most {MOST_TOTAL_BYTES}"
+        findings.refuse("files", "total size", message)
+        return {}
+    contents = {}
+    for name in sizes:
+        with findings.reading(name):
+            contents[name] = _read(entry / name, MOST_BYTES.get(name, MOST_SCORE_BYTES))
+    return contents
 
 
 def _scan(directory: Path, prefix: str, findings: Findings) -> dict[str, os.stat_result]:
-    listed: dict[str, os.stat_result] = {}
     try:
         with os.scandir(directory) as items:
-            for item in items:
-                if len(listed) == MOST_FILES:
-                    findings.refuse(prefix or "entry", "", f"holds more than {MOST_FILES} files")
-                    return {}
-                listed[prefix + item.name] = item.stat(follow_symlinks=False)
+            first = list(islice(items, MOST_FILES + 1))
+        if len(first) <= MOST_FILES:
+            return {prefix + item.name: item.stat(follow_symlinks=False) for item in first}
+        message = f"holds more than {MOST_FILES} files"
     except OSError as error:
-        findings.refuse(prefix or "entry", "", f"cannot be listed: {error.strerror}")
-    return listed
+        message = f"cannot be listed: {error.strerror}"
+    findings.refuse(prefix or "entry", "", message)
+    return {}
 
 
-def _is_fine(name: str, status: os.stat_result, findings: Findings) -> bool:
-    where = shown(name)[1:-1]
+def _complaint(name: str, status: os.stat_result) -> str:
+    """Return what is wrong with a file before it is opened; empty if nothing is."""
     if stat.S_ISLNK(status.st_mode):
-        findings.refuse(where, "", "is a symbolic link, expected plain files")
-    elif name not in MOST_BYTES and not _SCORE_FILE.fullmatch(name):
-        findings.refuse(
-            where, "", f"is no file of an entry: expected {', '.join(MOST_BYTES)}, {SCORES}/*.h5"
-        )
-    elif not stat.S_ISREG(status.st_mode):
-        findings.refuse(where, "", "is no plain file")
-    elif status.st_size > (most := MOST_BYTES.get(name, MOST_SCORE_BYTES)):
-        findings.refuse(where, "", f"has {status.st_size} bytes, expected at most {most}")
-    else:
-        return True
-    return False
+        return "is a symbolic link, expected plain files"
+    if name not in MOST_BYTES and not _SCORE_FILE.fullmatch(name):
+        return f"is no file of an entry: expected {', '.join(MOST_BYTES)}, {SCORES}/*.h5"
+    if not stat.S_ISREG(status.st_mode):
+        return "is no plain file"
+    if status.st_size > (most := MOST_BYTES.get(name, MOST_SCORE_BYTES)):
+        return f"has {status.st_size} bytes, expected at most {most}"
+    return ""
 
 
-def read_bytes(path: Path, most: int) -> bytes:
-    """Read a plain file of at most `most` bytes, following no link and waiting for no pipe.
-
-    Raises
-    ------
-    ResultsError
-        When it is something else.
-    """
+def _read(path: Path, most: int) -> bytes:
+    """Read a plain file of at most `most` bytes, following no link and waiting for no pipe."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0))
         with os.fdopen(descriptor, "rb") as file:
@@ -143,46 +175,43 @@ def read_bytes(path: Path, most: int) -> bytes:
     return content
 
 
+def find_text(contents: Mapping[str, bytes], name: str, findings: Findings) -> tuple[str, str]:
+    """Return a text file's name, which may end in ``.gz``, and its text; both empty without it."""
+    for stored in (name, name + GZIP):
+        if stored in contents:
+            with findings.reading(stored):
+                return stored, _decoded(stored, contents[stored])
+    return "", ""
+
+
+def _decoded(name: str, content: bytes) -> str:
+    if name.endswith(GZIP):
+        content = stored_files.decompress(content, MOST_PLAIN[name.removesuffix(GZIP)])
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ResultsError(f"is not UTF-8: {error.reason} in line {line}") from None
+
+
 def check_digests(
-    entry: Path, found: Mapping[str, int], claimed: Mapping[str, Any], findings: Findings
+    contents: Mapping[str, bytes], claimed: Mapping[str, Any], findings: Findings
 ) -> None:
     """Compare the files with what ``entry.json`` says of them."""
-    for name in sorted(claimed.keys() - found.keys()):
-        findings.refuse(ENTRY, f"files.{shown(name)[1:-1]}", "names a file that is not there")
-    for name, size in found.items():
-        if name == ENTRY:
-            continue
-        field = f"files.{name}"
-        if name not in claimed:
-            findings.refuse(ENTRY, field, "is missing, but the file is there")
-            continue
-        if claimed[name]["bytes"] != size:
-            findings.refuse(
-                ENTRY, f"{field}.bytes", f"is {claimed[name]['bytes']}, but the file has {size}"
-            )
-        try:
-            content = read_bytes(entry / name, MOST_BYTES.get(name, MOST_SCORE_BYTES))
-        except ResultsError as error:
-            findings.refuse(name, "", str(error))
-            continue
-        digest = hashlib.sha256(content).hexdigest()
-        if claimed[name]["sha256"] != digest:
-            findings.refuse(
-                ENTRY,
-                f"{field}.sha256",
-                f"is {claimed[name]['sha256'][:12]}, but the file has {digest[:12]}: it was "
-                "changed after the entry was written",
-            )
+    found = contents.keys() - {ENTRY}
+    for name in sorted(claimed.keys() - found):
+        findings.refuse(ENTRY, f"files.{plain(name)}", "names a file that is not there")
+    for name in sorted(found - claimed.keys()):
+        findings.refuse(ENTRY, f"files.{name}", "is missing, but the file is there")
+    why = "it was changed after the entry was written"
+    for name in sorted(found & claimed.keys()):
+        facts = {"bytes": len(contents[name]), "sha256": hashlib.sha256(contents[name]).hexdigest()}
+        for fact, value in facts.items():
+            findings.expect(ENTRY, f"files.{name}.{fact}", value, claimed[name][fact], why)
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON without its ambiguities: no NaN, no infinity, no name twice in an object.
-
-    Raises
-    ------
-    ResultsError
-        When it cannot be parsed so.
-    """
+    """Parse JSON without its ambiguities: no NaN, no infinity, no name twice in an object."""
     try:
         return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse_constant)
     except RecursionError:
@@ -192,11 +221,9 @@ def parse_json(text: str) -> Any:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in found:
-            raise ValueError(f"the name {shown(name)} stands twice in one object")
-        found[name] = value
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"a name stands twice among {shown([name for name, _ in pairs])}")
     return found
 
 

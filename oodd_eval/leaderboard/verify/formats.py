@@ -1,0 +1,337 @@
+"""The formats of ``entry.json`` and of records, held to strictly: types, alphabets, ranges.
+
+Names are held to a safe alphabet, since they become file names, links and table cells. Text is one
+line that can be printed, without ``<`` and ``>``: whatever shows it, it cannot become markup.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import shlex
+from collections.abc import Callable, Collection, Mapping
+from datetime import date
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    TypeAdapter,
+    ValidationError,
+)
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
+from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo, Trust
+from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
+from oodd_eval.results import record as record_format
+from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.record import Record, Status
+
+MOST_RECORDS: Final = 20_000
+MOST_LINE: Final = 4 * MB
+MOST_TEST: Final = 2_000
+"""Largest number of test trajectories: with more, recomputing the intervals takes too much room."""
+
+LONGEST_COMMAND: Final = 4000
+LARGEST: Final = 2**53
+"""Whole numbers beyond are not exact in a double."""
+
+MOST_COST: Final = 1e9
+"""Seconds (thirty years) or megabytes (a thousand terabytes): nobody measured more."""
+
+_DEEPEST: Final = 5
+_MOST_ITEMS: Final = 200
+
+
+def _rule(holds: Callable[[Any], object], expected: str) -> AfterValidator:
+    """Return the rule for values of which a predicate holds."""
+
+    def check(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(f"expected {expected}")
+        return value
+
+    return AfterValidator(check)
+
+
+def _matching(pattern: str, expected: str) -> AfterValidator:
+    return _rule(re.compile(pattern, re.ASCII).fullmatch, expected)
+
+
+def _one_of(known: Collection[Any]) -> AfterValidator:
+    return _rule(lambda value: value in known, " or ".join(map(str, known)))
+
+
+def _is_text(value: str, longest: int, least: int = 0) -> bool:
+    marked = any(mark in value for mark in ("<", ">", "]("))
+    return least <= len(value) <= longest and value.isprintable() and not marked
+
+
+def _text(longest: int, least: int = 0) -> AfterValidator:
+    expected = f"one line of plain text without markup, of {least} to {longest} characters"
+    return _rule(lambda value: _is_text(value, longest, least), expected)
+
+
+def _is_day(value: str) -> bool:
+    try:
+        return date.fromisoformat(value).isoformat() == value
+    except ValueError:
+        return False
+
+
+def _is_command(value: str) -> bool:
+    """Tell commands of oodd-eval joined by ``&&`` from all else.
+
+    Whoever runs an entry again may paste its command into a shell, so that nothing else may be in
+    it: no other program, and no character that a shell would act on.
+    """
+    try:
+        parts = [(part, shlex.split(part)) for part in value.split(" && ") if value]
+    except ValueError:
+        return False
+    allowed = (["oodd-eval", "run"], ["oodd-eval", "reproduce"])
+    return all(words[:2] in allowed and shlex.join(words) == part for part, words in parts)
+
+
+def _is_free(value: Any, levels: int = _DEEPEST) -> bool:
+    """Tell a JSON value that is neither deep nor large, and holds no text with markup."""
+    if isinstance(value, dict | list):
+        items = [*value, *value.values()] if isinstance(value, dict) else value
+        small = levels > 0 and len(value) <= _MOST_ITEMS
+        return small and all(_is_free(item, levels - 1) for item in items)
+    if isinstance(value, str):
+        return _is_text(value, LONGEST_COMMAND)
+    if isinstance(value, int):
+        return abs(value) <= LARGEST
+    return value is None or math.isfinite(value)
+
+
+# fmt: off
+EntryId = Annotated[str, _matching(
+    r"(?!.*\.\.)[a-z0-9][a-z0-9._-]{0,79}",
+    "at most 80 lower-case letters, digits, '.', '_', '-', no '..'")]
+DetectorName = Annotated[str, _matching(
+    r"[a-z0-9][a-z0-9-]{0,63}(:[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7})?",
+    "a name of lower-case letters, digits and '-', at most 64, perhaps with a class behind a ':', "
+    "such as rf or pyod:IForest")]
+DetectorNames = Annotated[list[DetectorName], _rule(
+    lambda names: names and names == sorted(set(names)), "names in order, each once")]
+Name = Annotated[str, _matching(
+    r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", "a name of letters, digits, '.', '_', '-', at most 100")]
+ParameterName = Annotated[str, _matching(r"[A-Za-z_]\w{0,63}", "a parameter's name, at most 64")]
+PluginName = Annotated[str, _matching(
+    r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}:[A-Za-z0-9][A-Za-z0-9._-]{0,99}",
+    "'distribution:plug-in', both of letters, digits, '.', '_', '-'")]
+Version = Annotated[str, _matching(r"[A-Za-z0-9][A-Za-z0-9.+!_-]{0,63}", "a version such as 1.2")]
+SplitName = Annotated[str, _matching(
+    r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[0-9a-f]{8})?",
+    "a split's name of letters, digits, '.', '_', '-', with '@' and the start of its digest where "
+    "it is not the published one")]
+Strength = Annotated[str, _matching(r"[A-Za-z0-9._-]{0,64}", "a strength's name, or nothing")]
+Digest = Annotated[str, _matching(r"[0-9a-f]{64}", "a SHA-256 digest in 64 hexadecimal digits")]
+ScoreKey = Annotated[str, _matching(r"[a-z0-9][a-z0-9._-]{0,159}", "a score file's name, bare")]
+Url = Annotated[str, _matching(
+    r"(https?://[A-Za-z0-9._~:/?#@!$&*+,;=%-]{1,290})?", "an http or https address, or nothing")]
+FileName = Annotated[str, _matching(
+    r"(?!.*\.\.)(scores/)?[a-z0-9][a-z0-9._-]{0,170}",
+    "a plain name of a file, in scores/ or in the entry itself")]
+RerunBy = Annotated[str, _text(200, least=1)]
+Command = Annotated[str, _text(LONGEST_COMMAND), _rule(
+    _is_command, "'oodd-eval run' or 'oodd-eval reproduce' with plainly quoted words, or several "
+    "of these joined by ' && '")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Whole = Annotated[int, Field(ge=0, le=LARGEST)]
+Cost = Annotated[float, Field(ge=0, le=MOST_COST)] | None
+FreeValue = Annotated[Any, _rule(
+    _is_free, f"a value without markup, at most {_DEEPEST} levels deep, of at most {_MOST_ITEMS} "
+    "items each and finite numbers")]
+Parameters = dict[ParameterName, FreeValue]
+Terms = Annotated[list[Finite], FailFast(), Field(max_length=MOST_TEST)]
+Pair = Annotated[tuple[Terms, Terms], _rule(
+    lambda pair: len(pair[0]) == len(pair[1]), "as many numerators as denominators")]
+
+# fmt: on
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class _Plugin(_Strict):
+    distribution: Name
+    plugin: Name
+    version: Version
+    source_digest: Digest
+
+
+class _Environment(_Strict):
+    python: Annotated[str, _text(100, least=1)]
+    platform: Annotated[str, _text(200)]
+    packages: dict[Name, Version]
+
+
+class _Rerun(_Strict):
+    by: RerunBy
+    how: Annotated[str, _text(1000, least=1)]
+
+
+class _File(_Strict):
+    sha256: Digest
+    bytes: Whole
+
+
+class _Entry(_Strict):
+    layout: Annotated[int, _one_of([SCHEMA])] = Field(alias="schema")
+    id: EntryId
+    title: Annotated[str, _text(120, least=1)]
+    detectors: DetectorNames
+    submitter: Annotated[str, _text(120)]
+    citation: Annotated[str, _text(2000)]
+    url: Url
+    trust: Trust
+    rerun: _Rerun | None
+    split: SplitName
+    split_digest: Digest
+    protocol: Annotated[int, _one_of([PROTOCOL])]
+    plugins: Annotated[list[_Plugin], Field(max_length=100)]
+    environment: _Environment
+    created: Annotated[str, _rule(_is_day, "a date such as 2026-11-21")]
+    command: Command
+    caption: Annotated[str, _text(500)]
+    files: dict[FileName, _File]
+
+
+class _Metric(_Strict):
+    value: Finite | None
+    low: Finite | None
+    high: Finite | None
+    n: Annotated[int, Field(ge=0, le=MOST_TEST)]
+
+
+class _Counts(_Strict):
+    train: Annotated[int, Field(ge=1, le=LARGEST)]
+    calibration: Annotated[int, Field(ge=1, le=LARGEST)]
+    test: Annotated[int, Field(ge=1, le=MOST_TEST)]
+
+
+class _Provenance(BaseModel):
+    """Types that an entry's own statements are compared with; other values must be plain."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    __pydantic_extra__: Parameters
+
+    oodd_eval: Version
+    python: Version
+    numpy: Version = ""
+    packages: dict[Name, Version] = Field(default={}, max_length=_MOST_ITEMS)
+
+
+class _Record(_Strict):
+    layout: Annotated[int, _one_of([record_format.SCHEMA])] = Field(alias="schema")
+    protocol: Annotated[int, _one_of([PROTOCOL])]
+    detector: DetectorName
+    detector_version: Version
+    plugin: PluginName
+    plugin_source: Digest
+    parameters: Parameters
+    overrides: Parameters
+    inputs: Literal["observations", "observations+actions", ""]
+    environment: Annotated[str, _one_of(ENVIRONMENTS)]
+    anomaly: Annotated[str, _one_of(ANOMALIES)]
+    strength: Strength
+    group: Annotated[str, _one_of(GROUPS)]
+    horizon: Annotated[int, Field(ge=1, le=100_000)]
+    seed: Whole
+    split: SplitName
+    split_digest: Digest
+    limit: None
+    status: Status
+    reason: Annotated[str, _text(1000)]
+    metrics: dict[str, _Metric]
+    counts: _Counts
+    per_trajectory: dict[str, Pair]
+    scores: ScoreKey
+    seconds_fit: Cost
+    seconds_score: Cost
+    steps_scored: Whole | None
+    peak_rss_mb: Cost
+    provenance: _Provenance
+
+
+_adapter = functools.cache(TypeAdapter)
+
+
+def complaint(kind: Any, value: object) -> str:
+    """Return what is wrong with a value of one of this module's types; empty if nothing is."""
+    try:
+        _adapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        return _message(error.errors(include_url=False)[0])
+    return ""
+
+
+def _message(error: Any) -> str:
+    """Return one of pydantic's errors as found and expected."""
+    if error["type"] == "missing":
+        return "is missing"
+    if error["type"] == "extra_forbidden":
+        return "is no field of this format"
+    text = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
+    return f"is {shown(error['input'])}, {text}"
+
+
+def _place(parts: tuple[int | str, ...]) -> str:
+    """Return the path of a field, such as ``plugins[0].version``."""
+    text = ""
+    for part in parts:
+        # Behind the name of a dictionary's key, when the name itself is wrong.
+        if part != "[key]":
+            text += f"[{part}]" if isinstance(part, int) else f".{plain(part)}"
+    return text.removeprefix(".")
+
+
+def _holds_to(model: type[BaseModel], text: str, where: str, findings: Findings) -> bool:
+    """Tell whether a JSON text has a format; every field that has not is a problem."""
+    before = findings.count
+    try:
+        with findings.reading(where):
+            parse_json(text)
+            model.model_validate_json(text)
+    except ValidationError as error:
+        for one in error.errors(include_url=False):
+            findings.refuse(where, _place(one["loc"]), _message(one))
+    return findings.count == before
+
+
+def read_info(contents: Mapping[str, bytes], findings: Findings) -> EntryInfo | None:
+    """Read ``entry.json``; None when a field is wrong, so that nothing can be compared with it."""
+    name, text = find_text(contents, ENTRY, findings)
+    sound = name and _holds_to(_Entry, text, name, findings)
+    return EntryInfo(**parse_json(text)) if sound else None
+
+
+def read_records(contents: Mapping[str, bytes], findings: Findings) -> dict[str, Record]:
+    """Return the records whose fields are sound, by place: ``records.jsonl:3 (<cell>)``."""
+    name, text = find_text(contents, RECORDS, findings)
+    if not name:
+        return {}
+    lines = text.removesuffix("\n").split("\n")
+    if not text.endswith("\n"):
+        findings.refuse(f"{name}:{len(lines)}", "", "does not end with a new line: it is cut off")
+    if not text or len(lines) > MOST_RECORDS:
+        findings.refuse(name, "", f"has {len(lines)} lines, expected 1 to {MOST_RECORDS} records")
+        return {}
+    found = {}
+    for number, line in enumerate(lines, start=1):
+        where = f"{name}:{number}"
+        if len(line) > MOST_LINE or not line.isprintable():
+            expected = f"one record in plain JSON of at most {MOST_LINE} characters"
+            findings.refuse(where, "", f"is {shown(line)}, expected {expected}")
+        elif _holds_to(_Record, line, where, findings):
+            record = Record.from_json(line, where)
+            found[f"{where} ({record.cell})"] = record
+    return found

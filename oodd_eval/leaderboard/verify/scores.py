@@ -1,0 +1,264 @@
+"""Check score files and curves, and recompute from the scores what an entry says.
+
+HDF5 can hold more than numbers. A score file may hold the parts of one unit, each with two plain
+datasets, and nothing else: no links to other places, no objects, no data kept outside the file, no
+filter but those of this format.
+
+Curves illustrate; nobody may choose the cells or the seed that look best, so that they are of all
+cells of a row, and of its first seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.parts import CALIBRATION, TWINS
+from oodd_eval.data.split import Split
+from oodd_eval.errors import OoddError, ResultsError
+from oodd_eval.leaderboard.entry import CURVES, SCORES
+from oodd_eval.leaderboard.verify.files import Findings, find_text, parse_json, plain, shown
+from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, complaint
+from oodd_eval.leaderboard.verify.records import Records, compare_metrics, same
+from oodd_eval.plugins.contract import MAX_WARM_UP
+from oodd_eval.results import curve_file
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.record import Record
+
+MOST_VALUES: Final = 20_000_000
+"""Most scores of one file: its compressed size says little of its decompressed one."""
+
+PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
+"""Groups of a score file."""
+
+ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}
+"""Tolerance of curves, which are rounded to three digits and five decimals."""
+
+_DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
+_FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
+
+Json = dict[str, Any]
+Complaints = Iterator[tuple[str, str]]
+"""Places in a file and what is wrong with them."""
+
+_DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
+    (lambda d, _: isinstance(d, h5py.Dataset), "a dataset"),
+    (lambda d, dtype: d.dtype == dtype, "float64 scores and int64 offsets"),
+    (lambda d, _: d.shape is not None and d.ndim == 1 and d.size, "one dimension and not empty"),
+    (lambda d, _: d.size <= MOST_VALUES, f"at most {MOST_VALUES} values"),
+    (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
+    (lambda d, _: not len(d.attrs), "no attributes"),
+    (lambda d, _: _filters(d) <= _FILTERS, "no filter but gzip and shuffle"),
+)
+"""Predicates of an item and its expected type, each safe where those before hold."""
+
+
+def _filters(item: h5py.Dataset) -> set[int]:
+    pipeline = item.id.get_create_plist()
+    return {pipeline.get_filter(i)[0] for i in range(pipeline.get_nfilters())}
+
+
+def check_scores(
+    directory: Path, files: Collection[str], records: Records, findings: Findings
+) -> Records:
+    """Check an entry's score files; return the records whose scores are there and sound."""
+    present = {name for name in files if name.startswith(f"{SCORES}/")}
+    wanted: dict[str, dict[str, Record]] = {}
+    for where, record in records.items() if present else ():
+        if record.ok:
+            wanted.setdefault(f"{SCORES}/{record.scores}.h5", {})[where] = record
+    for name in sorted(present - wanted.keys()):
+        findings.refuse(name, "", "belongs to no record: the field scores of none names it")
+    sound: dict[str, Record] = {}
+    for name, own in wanted.items():
+        where, record = next(iter(own.items()))
+        before = findings.count
+        if name not in present:
+            message = f"names {name}, which is absent: an entry has all scores or none"
+            findings.refuse(where, "scores", message)
+            continue
+        try:
+            with h5py.File(directory / name, "r") as file:
+                for field, message in _file(file, record.horizon):
+                    findings.refuse(name, field, message)
+        # A damaged file makes the library raise whatever it stumbles over.
+        except (OSError, KeyError, ValueError, RuntimeError, TypeError, MemoryError) as error:
+            findings.refuse(name, "", f"is damaged or no HDF5 file: {plain(str(error))}")
+        if findings.count == before:
+            sound |= own
+    return sound
+
+
+def _file(file: h5py.File, horizon: int) -> Complaints:
+    if file.userblock_size:
+        yield "userblock", f"has {file.userblock_size} bytes, expected none"
+    for key, value in file.attrs.items():
+        cost = isinstance(value, float | np.integer) and 0 <= value <= MOST_COST
+        if complaint(ParameterName, key) or not cost:
+            yield f"attribute {plain(key)}", f"is {shown(value)}, expected a cost of the fit"
+    groups: dict[str, Any] = {}
+    yield from _children(file, "", groups)
+    if isinstance(groups.get("test"), h5py.Group):
+        yield from _children(groups.pop("test"), "test/", groups)
+    for part in sorted(groups.keys() - set(PARTS)):
+        yield plain(part), "is no part of a score file"
+    for part in PARTS:
+        if not isinstance(groups.get(part), h5py.Group):
+            yield part, "is no group" if part in groups else "is missing"
+        else:
+            yield from _part(groups[part], part, horizon)
+
+
+def _children(group: h5py.Group, prefix: str, found: dict[str, Any]) -> Complaints:
+    """Add what lies directly in a group; links that lead elsewhere are refused unfollowed."""
+    for key in group:
+        link = group.get(key, getlink=True)
+        if isinstance(link, h5py.HardLink):
+            found[prefix + key] = group[key]
+        else:
+            yield prefix + plain(key), f"is a link ({type(link).__name__}), expected data"
+    if prefix and len(group.attrs):
+        yield prefix.rstrip("/"), "has attributes, expected none"
+
+
+def _part(group: h5py.Group, part: str, horizon: int) -> Complaints:
+    items: dict[str, Any] = {}
+    found = list(_children(group, f"{part}/", items))
+    expected = {f"{part}/{key}": dtype for key, dtype in _DTYPES.items()}
+    found += [(plain(n), "is no dataset of this format") for n in sorted(items.keys() - expected)]
+    for name, dtype in expected.items():
+        item = items.get(name)
+        broken = (text for holds, text in _DATASET if not holds(item, dtype))
+        found += [(name, f"is {plain(str(item))}, expected {text}") for text in islice(broken, 1)]
+    yield from found
+    if found:
+        return
+    scores, offsets = items[f"{part}/scores"][:], items[f"{part}/offsets"][:]
+    if offsets[0] != 0 or (np.diff(offsets) < 1).any() or offsets[-1] != len(scores):
+        yield f"{part}/offsets", f"do not rise from 0 to {len(scores)}, the number of scores"
+        return
+    most = max(horizon, MAX_WARM_UP)
+    for i, sequence in enumerate(np.split(scores, offsets[1:-1])):
+        undefined = np.isnan(sequence)
+        start = len(sequence) if undefined.all() else int(np.argmin(undefined))
+        if start > most or not np.isfinite(sequence[start:]).all():
+            message = f"expected at most {most} undefined steps and then finite scores"
+            yield f"{part}/scores", f"trajectory {i} is {plain(str(sequence))}, {message}"
+            return
+
+
+def check_rescored(records: Records, directory: Path, split: Split, findings: Findings) -> bool:
+    """Recompute metrics from the entry's scores; return whether all could be, and agree."""
+    before = findings.count
+    try:
+        fresh = rescore(list(records.values()), ResultsDirectory(directory), split)
+    except (OoddError, ArithmeticError) as error:
+        findings.refuse(SCORES, "", f"cannot be scored again: {error}")
+        return False
+    for (where, record), again in zip(records.items(), fresh, strict=True):
+        for name in sorted(again.metrics.keys() - record.metrics):
+            findings.refuse(where, f"metrics.{name}", "is missing, but the scores give it")
+        for name in sorted(record.metrics.keys() - again.metrics):
+            findings.refuse(where, f"metrics.{name}", "cannot be computed from the scores")
+        compare_metrics(where, record, again.metrics, "the scores give", findings)
+        for name in sorted(record.per_trajectory.keys() & again.per_trajectory.keys()):
+            pairs = zip(record.per_trajectory[name], again.per_trajectory[name], strict=True)
+            if not all(len(a) == len(b) and all(map(same, a, b)) for a, b in pairs):
+                message = "differs from what the scores give"
+                findings.refuse(where, f"per_trajectory.{name}", message)
+    return findings.count == before
+
+
+# -- curves ---------------------------------------------------------------------------------------
+
+
+def first_seeds(records: Iterable[Record]) -> dict[Setting, int]:
+    """Return the lowest seed of each row that has an evaluated cell."""
+    found: dict[Setting, int] = {}
+    for record in records:
+        if record.ok:
+            found[record.setting] = min(found.get(record.setting, record.seed), record.seed)
+    return found
+
+
+def check_curves(
+    contents: Mapping[str, bytes], records: Records, findings: Findings
+) -> list[Json] | None:
+    """Return the units of an entry's curves; None when there are none, or something is wrong."""
+    before = findings.count
+    name, text = find_text(contents, CURVES, findings)
+    plain_json = None
+    with findings.reading(name):
+        plain_json = parse_json(text) if name else None
+    if not name or findings.count > before:
+        return None
+    try:
+        units: list[Json] = curve_file.check_curves(plain_json, CURVES)["units"]
+    except ResultsError as error:
+        # Its messages begin with the place: "curves.json: units[0].seed is False, ...".
+        place, _, message = str(error).removeprefix(f"{CURVES}: ").partition(" ")
+        findings.refuse(name, place.removeprefix(CURVES).rstrip(":"), message)
+        return None
+    undrawn = {str(record.cell): record for record in records.values() if record.ok}
+    rows: dict[tuple[Setting, int], None] = {}
+    for i, unit in enumerate(units):
+        record = undrawn.pop(unit["cell"], None)
+        if record is None:
+            message = f"is {shown(unit['cell'])}, which no record is of"
+            findings.refuse(name, f"units[{i}].cell", message)
+            continue
+        rows[record.setting, record.seed] = None
+        for field, value in curve_file.identity(record).items():
+            findings.expect(name, f"units[{i}].{field}", value, unit[field], "as in its record")
+        if unit["example"]["index"] >= record.counts["test"]:
+            findings.refuse(name, f"units[{i}].example.index", "is no test trajectory")
+    for cell, record in undrawn.items():
+        if (record.setting, record.seed) in rows:
+            message = f"lack {cell}: a row has curves of all its evaluated cells, or of none"
+            findings.refuse(name, "units", message)
+    first = first_seeds(records.values())
+    for setting, seed in rows:
+        if seed != first[setting]:
+            why = f"but a row's curves are of its first seed, {first[setting]}"
+            findings.refuse(name, "units", f"are of {setting.label(seed)}, {why}")
+    return units if findings.count == before else None
+
+
+def check_recomputed_curves(
+    units: Sequence[Json], records: Records, directory: Path, split: Split, findings: Findings
+) -> None:
+    """Recompute an entry's curves from its scores and compare."""
+    drawn = {unit["cell"] for unit in units}
+    chosen = [r for r in records.values() if str(r.cell) in drawn]
+    again = {}
+    with findings.reading(CURVES):
+        fresh = curve_file.make_curves(chosen, ResultsDirectory(directory), split)
+        again = {unit["cell"]: unit for unit in fresh["units"]}
+    for i, unit in enumerate(units):
+        if found := _difference(unit, again.get(unit["cell"], unit)):
+            path, stored, value = found
+            message = f"is {shown(stored)}, but the scores give {shown(value)}"
+            findings.refuse(f"{CURVES} ({unit['cell']})", f"units[{i}]{path}", message)
+
+
+def _difference(stored: Any, found: Any, path: str = "") -> tuple[str, Any, Any] | None:
+    """Return the first place where two JSON values differ by more than rounding, and both."""
+    if isinstance(stored, dict) and isinstance(found, dict) and stored.keys() == found.keys():
+        pairs = ((f".{k}", stored[k], found[k]) for k in stored)
+    elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
+        pairs = ((f"[{i}]", *both) for i, both in enumerate(zip(stored, found, strict=True)))
+    elif isinstance(stored, float | int) and isinstance(found, float | int):
+        close = math.isclose(stored, found, **ROUNDED)
+        return None if close else (path, stored, found)
+    else:
+        return None if stored == found else (path, stored, found)
+    return next(filter(None, (_difference(a, b, path + step) for step, a, b in pairs)), None)
