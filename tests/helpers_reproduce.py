@@ -3,6 +3,9 @@
 from helpers_plugins import install
 
 QUICK = """
+from dataclasses import dataclass
+from oodd_eval.plugins.parameters import parameter
+
 class Quick:
     '''|o_t - o_{t-h}| plus noise that shrinks with members and samples, keyed by seed.'''
     def __init__(self, name, *, seed, horizon, members=5, samples=8, **others):
@@ -27,10 +30,14 @@ SLOW = float(os.environ.get("QUICK_SECONDS", 0))
 def make(name):
     return lambda *, seed=0, horizon=1, **p: Quick(name, seed=seed, horizon=horizon, **p)
 
+@dataclass(frozen=True)
+class Sizes:
+    members: int = parameter(5)
+    samples: int = parameter(8)
+
 @hookimpl
 def oodd_detectors():
-    return [DetectorSpec(n, make(n), "a test's", parameters={"members": 5, "samples": 8})
-            for n in NOISE]
+    return [DetectorSpec(n, make(n), "a test's", parameters=Sizes) for n in NOISE]
 """
 
 

@@ -11,9 +11,10 @@ BOARD = Path(__file__).parents[1] / "leaderboard"
 RESULTS = BOARD / "results"
 COMMITTED = sorted(header.parent for header in BOARD.rglob("reproduction.json"))
 
-pytestmark = pytest.mark.parametrize(
-    "committed", COMMITTED, ids=lambda p: str(p.relative_to(BOARD))
-)  # fmt: skip
+pytestmark = [
+    pytest.mark.artefacts,
+    pytest.mark.parametrize("committed", COMMITTED, ids=lambda p: str(p.relative_to(BOARD))),
+]
 """Skipped while no reproduction is committed."""
 
 

@@ -3,28 +3,44 @@
 import csv
 import dataclasses
 import io
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_records import make_record
 
-import oodd_eval
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.bootstrap import bootstrap_weights
-from oodd_eval.paper import captions, costs, paper, returns
-from oodd_eval.paper.evidence import Estimate, Evidence, Term
-from oodd_eval.paper.experiments import ALL, EXPERIMENTS, GROUPED, RIQN, TIERS, Setup
-from oodd_eval.paper.figures import figures
-from oodd_eval.paper.header import Header
-from oodd_eval.paper.numbers import compute, csv_lines, layout, show
-from oodd_eval.paper.publish import publish
-from oodd_eval.results.tables.tables import UNDEFINED
+from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.paper.estimates import Estimate, Estimator, Side, compute
+from oodd_eval.paper.experiments import (
+    EXPERIMENTS,
+    FILE,
+    TIERS,
+    Experiment,
+    paper_number,
+    read_tables,
+    scope,
+)
+from oodd_eval.paper.inputs import KINDS, RETURNS, Reproduction, dump_returns, load_returns
+from oodd_eval.paper.page import (
+    caption,
+    front_page,
+    layout,
+    numbers_csv,
+    publish,
+    returns_caption,
+    returns_tables,
+    show,
+)
+from oodd_eval.paper.pictures import pictures_of
+from oodd_eval.paper.run import COSTS
+from oodd_eval.results.identity import Setting
 
+ALL, SENSOR, DYNAMICS = map(scope, ("all", "sensor", "dynamics"))
 BY_ID = {e.id: e for e in EXPERIMENTS}
-RF = Setup("rf")
+RIQN, RF = Setting("riqn"), Setting("rf")
 
 
 def everywhere(detector, auc, *, environments=("ant", "hopper"), **settings):
@@ -35,21 +51,25 @@ def everywhere(detector, auc, *, environments=("ant", "hopper"), **settings):
     ]
 
 
-def term(setup, weight=1.0, anomalies=tuple(ANOMALIES), metric="auc"):
-    return Term(weight, setup, anomalies, metric)
+def side(setting, weight=1.0, anomalies=tuple(ANOMALIES)):
+    return Side(weight, (setting,), anomalies)
+
+
+def combine(records, sides, environments, *others):
+    return Estimator(records).combine(sides, "auc", environments, *others)
 
 
 def header(**changes):
-    facts = {
+    given = {
         "tier": TIERS["mini"], "split": "mini", "split_digest": "ab" * 32, "protocol": 1,
         "train": 40, "calibration": 20, "test": 2, "units": 252,
     }  # fmt: skip
-    return Header(**facts | changes)
+    return Reproduction(**given | changes)
 
 
 def test_mean_over_anomalies_and_environments_is_worked_by_hand():
     records = everywhere("riqn", [0.8, 0.6]) + everywhere("rf", [0.5, 0.5])
-    estimate = Evidence(records).combine([term(RIQN)], ["ant", "hopper"])
+    estimate = combine(records, [side(RIQN)], ["ant", "hopper"])
     assert estimate.value == pytest.approx(0.7)
     assert (estimate.environments, estimate.expected, estimate.seeds) == (2, 2, 1)
 
@@ -58,37 +78,29 @@ def test_interval_is_the_bootstrap_written_out():
     # One environment: anomalies share their weights, so the mean is w . (.8, .6) / 2.
     weights = bootstrap_weights(2, key="ant")
     expected = np.percentile(weights @ np.array([0.8, 0.6]) / 2, [2.5, 97.5])
-    estimate = Evidence(everywhere("riqn", [0.8, 0.6])).combine([term(RIQN)], ["ant"])
+    estimate = combine(everywhere("riqn", [0.8, 0.6]), [side(RIQN)], ["ant"])
     assert (estimate.low, estimate.high) == pytest.approx(tuple(expected))
 
 
 def test_difference_is_paired_over_test_seeds():
     records = everywhere("riqn", [0.9, 0.3]) + everywhere("rf", [0.8, 0.2])
-    estimate = Evidence(records).combine([term(RIQN), term(RF, -1.0)], ["ant", "hopper"])
+    estimate = combine(records, [side(RIQN), side(RF, -1.0)], ["ant", "hopper"])
     assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.1, 0.1, 0.1))
 
 
 def test_difference_uses_the_detector_seeds_that_both_sides_have():
     records = everywhere("riqn", [0.9, 0.9]) + everywhere("riqn", [0.1, 0.1], seed=1)
     records += everywhere("rf", [0.5, 0.5])
-    evidence = Evidence(records)
-    assert evidence.combine([term(RIQN), term(RF, -1.0)], ["ant"]).value == pytest.approx(0.4)
-    alone = evidence.combine([term(RIQN)], ["ant"])
+    assert combine(records, [side(RIQN), side(RF, -1.0)], ["ant"]).value == pytest.approx(0.4)
+    alone = combine(records, [side(RIQN)], ["ant"])
     assert (alone.value, alone.seeds) == (pytest.approx(0.5), 2)
-    assert evidence.combine([term(RIQN)], ["ant"], [RF]).value == pytest.approx(0.9)
-
-
-def test_where_networks_computed_makes_no_other_row():
-    records = everywhere("riqn", [0.8, 0.6], overrides={"device": "cuda"}, environments=["ant"])
-    records += everywhere("riqn", [0.8, 0.6], overrides={"samples": 4}, environments=["hopper"])
-    estimate = Evidence(records).combine([term(RIQN)], ["ant", "hopper"])
-    assert (estimate.value, estimate.environments) == (pytest.approx(0.7), 1)
+    assert combine(records, [side(RIQN)], ["ant"], [RF]).value == pytest.approx(0.9)
 
 
 def test_detector_seeds_widen_the_interval():
-    one = Evidence(everywhere("riqn", [0.5, 0.5])).combine([term(RIQN)], ["ant"])
+    one = combine(everywhere("riqn", [0.5, 0.5]), [side(RIQN)], ["ant"])
     two = everywhere("riqn", [0.4, 0.4]) + everywhere("riqn", [0.6, 0.6], seed=1)
-    wide = Evidence(two).combine([term(RIQN)], ["ant"])
+    wide = combine(two, [side(RIQN)], ["ant"])
     assert one.low == one.high == 0.5
     assert (wide.low, wide.high) == pytest.approx((0.4, 0.6))
 
@@ -97,7 +109,7 @@ def test_seeds_are_resampled_independently_by_environment():
     environments = tuple(ENVIRONMENTS)
     records = everywhere("riqn", [0.4, 0.4], environments=environments)
     records += everywhere("riqn", [0.6, 0.6], environments=environments, seed=1)
-    estimate = Evidence(records).combine([term(RIQN)], environments)
+    estimate = combine(records, [side(RIQN)], environments)
     assert 0.4 < estimate.low < 0.47
     assert 0.53 < estimate.high < 0.6
 
@@ -105,29 +117,29 @@ def test_seeds_are_resampled_independently_by_environment():
 def test_an_undefined_environment_is_left_out_of_the_mean():
     records = everywhere("riqn", [None, None], environments=["ant"])
     records += everywhere("riqn", [0.6, 0.6], environments=["hopper"])
-    assert Evidence(records).combine([term(RIQN)], ["ant", "hopper"]).value == 0.6
+    assert combine(records, [side(RIQN)], ["ant", "hopper"]).value == 0.6
 
 
 def test_the_mean_over_models_needs_all_of_them():
-    both = (term(RIQN, 0.5), term(RF, 0.5))
+    both = (side(RIQN, 0.5), side(RF, 0.5))
     records = everywhere("riqn", [0.8, 0.8]) + everywhere("rf", [0.6, 0.6], environments=["ant"])
-    estimate = Evidence(records).combine(both, ["ant", "hopper"])
+    estimate = combine(records, both, ["ant", "hopper"])
     assert estimate.value == pytest.approx(0.7)
     assert (estimate.environments, estimate.expected) == (1, 2)
 
 
 def test_a_missing_cell_is_no_number():
     records = [r for r in everywhere("riqn", [0.8, 0.8]) if r.anomaly != "drift"]
-    estimate = Evidence(records).combine([term(RIQN)], ["ant"])
+    estimate = combine(records, [side(RIQN)], ["ant"])
     assert show(estimate, "auc") == "not run"
-    kept = Evidence(records).combine([term(RIQN, anomalies=("iid",))], ["ant"])
+    kept = combine(records, [side(RIQN, anomalies=("iid",))], ["ant"])
     assert show(kept, "auc") == "80.0 [80.0, 80.0]"
 
 
 def test_a_failed_cell_is_its_state():
     records = everywhere("riqn", [0.8, 0.8])
     records[3] = make_record("riqn", "ant", records[3].anomaly, status="oom", reason="too large")
-    assert show(Evidence(records).combine([term(RIQN)], ["ant", "hopper"]), "auc") == "oom"
+    assert show(combine(records, [side(RIQN)], ["ant", "hopper"]), "auc") == "oom"
 
 
 def test_what_is_printed():
@@ -140,20 +152,19 @@ def test_what_is_printed():
 def test_digits_of_the_paper_stand_where_they_belong():
     table_5 = BY_ID["table-5"]
     series = {s.label: s for s in table_5.series}
-    sensor, dynamics = GROUPED
-    assert paper.digit(table_5, series["NPN"], "walker2d", sensor, "auc") == 1.0
-    assert paper.digit(table_5, series["RIQN"], "hopper", dynamics, "delay") == 5.24
-    assert paper.digit(table_5, series["AVG"], "acrobot", sensor, "auc") == pytest.approx(0.9479)
-    assert math.isnan(paper.digit(table_5, series["RIQN"], "hopper", sensor, "auc_matched"))
+    assert paper_number(table_5, series["NPN"], "walker2d", SENSOR, "auc") == 1.0
+    assert paper_number(table_5, series["RIQN"], "hopper", DYNAMICS, "delay") == 5.24
+    assert paper_number(table_5, series["AVG"], "acrobot", SENSOR, "auc") == pytest.approx(0.9479)
+    assert math.isnan(paper_number(table_5, series["RIQN"], "hopper", SENSOR, "auc_matched"))
     table_4 = BY_ID["table-4"]
     alone = {s.label: s for s in table_4.series}["Δ = 10: e = 1"]
-    assert paper.digit(table_4, alone, "hopper", ALL, "auc") == pytest.approx(0.776)
+    assert paper_number(table_4, alone, "hopper", ALL, "auc") == pytest.approx(0.776)
     table_3 = BY_ID["table-3"]
     by_label = {s.label: s for s in table_3.series}
     n_riqn, far = by_label["Δ = 10: N-RIQN"], by_label["Δ = 20: RIQN"]
-    assert paper.digit(table_3, n_riqn, "ant", ALL, "auc") == pytest.approx(0.747)
-    assert math.isnan(paper.digit(table_3, n_riqn, "hopper", ALL, "auc"))
-    assert math.isnan(paper.digit(table_3, far, "ant", ALL, "auc"))
+    assert paper_number(table_3, n_riqn, "ant", ALL, "auc") == pytest.approx(0.747)
+    assert math.isnan(paper_number(table_3, n_riqn, "hopper", ALL, "auc"))
+    assert math.isnan(paper_number(table_3, far, "ant", ALL, "auc"))
 
 
 @pytest.mark.parametrize(("label", "mean"), [("RIQN", 89.4), ("RIQN+MS", 89.8), ("NPN", 87.6),
@@ -161,19 +172,20 @@ def test_digits_of_the_paper_stand_where_they_belong():
 def test_the_papers_means_over_table_5(label, mean):
     figure = BY_ID["figure-models"]
     series = {s.label: s for s in figure.series}[f"Δ = 1: {label}"]
-    assert 100 * paper.mean_digit(figure, series, ALL, "auc") == pytest.approx(mean, abs=0.06)
+    found = [paper_number(figure, series, e, ALL, "auc") for e in ENVIRONMENTS]
+    assert 100 * np.mean(found) == pytest.approx(mean, abs=0.06)
 
 
 def test_sweep_of_samples_has_the_papers_digit_at_eight_only():
     sweep = BY_ID["figure-samples"]
-    found = [paper.digit(sweep, s, "ant", ALL, "auc") for s in sweep.series]
+    found = [paper_number(sweep, s, "ant", ALL, "auc") for s in sweep.series]
     assert [math.isnan(x) for x in found] == [True, False, True, True]
 
 
 def test_table_has_ours_and_the_papers_below():
     records = everywhere("riqn", [0.8, 0.6])
     table = BY_ID["table-4"]
-    numbers = compute(table, Evidence(records))
+    numbers = compute(table, Estimator(records))
     [shown] = layout(table, numbers, table.metrics)
     ant = next(row for row in shown.rows if row[0] == "Ant")
     below = shown.rows[shown.rows.index(ant) + 1]
@@ -185,8 +197,8 @@ def test_table_has_ours_and_the_papers_below():
 
 def test_a_mean_without_all_environments_is_in_the_table_and_not_in_the_figure():
     table = BY_ID["table-4"]
-    numbers = compute(table, Evidence(everywhere("riqn", [0.8, 0.6])))
-    [figure] = figures(table, numbers).values()
+    numbers = compute(table, Estimator(everywhere("riqn", [0.8, 0.6])))
+    [figure] = pictures_of(table, numbers).values()
     panel = figure.panels[0]
     [drawn] = [dots for dots in panel.series if dots.label == "e = 5"]
     shown = dict(zip(panel.categories, drawn.values, strict=True))
@@ -196,9 +208,9 @@ def test_a_mean_without_all_environments_is_in_the_table_and_not_in_the_figure()
 
 
 def test_the_papers_mean_stands_only_where_it_has_every_environment():
-    numbers = compute(BY_ID["table-3"], Evidence([]))
+    numbers = compute(BY_ID["table-3"], Estimator([]))
     assert math.isnan(numbers["mean", "Δ = 1: RIQN", "all", "auc"].paper)
-    numbers = compute(BY_ID["table-4"], Evidence([]))
+    numbers = compute(BY_ID["table-4"], Estimator([]))
     seven = [89.01, 86.7, 86.0, 86.5, 87.0, 86.7, 85.1]
     mean = numbers["mean", "Δ = 1: e = 5", "all", "auc"].paper
     assert 100 * mean == pytest.approx(sum(seven) / 7)
@@ -206,7 +218,7 @@ def test_the_papers_mean_stands_only_where_it_has_every_environment():
 
 def test_every_experiment_lays_out_every_number():
     for experiment in EXPERIMENTS:
-        numbers = compute(experiment, Evidence([]))
+        numbers = compute(experiment, Estimator([]))
         metrics = (*experiment.metrics, *experiment.beyond)
         tables = layout(experiment, numbers, metrics)
         ours = [row for t in tables for row in t.rows if row[2] == "ours"]
@@ -216,8 +228,8 @@ def test_every_experiment_lays_out_every_number():
 
 def test_csv_reads_back_to_the_same_numbers():
     table = BY_ID["table-5"]
-    numbers = compute(table, Evidence(everywhere("riqn", [0.81, 0.6])))
-    header, *lines = csv_lines(numbers)
+    numbers = compute(table, Estimator(everywhere("riqn", [0.81, 0.6])))
+    header, *lines = numbers_csv(numbers)
     for line, number in zip(lines, numbers.values(), strict=True):
         row = dict(zip(header, line, strict=True))
         value = number.estimate.value
@@ -228,7 +240,7 @@ def test_csv_reads_back_to_the_same_numbers():
 
 
 def test_nothing_missing_is_printed_as_zero(tmp_path):
-    publish(tmp_path, header(), everywhere("riqn", [0.8, 0.6]), None, pictures=False)
+    publish(tmp_path, header(), everywhere("riqn", [0.8, 0.6]), None, figures=False)
     for path in tmp_path.rglob("*.csv"):
         for row in csv.DictReader(io.StringIO(path.read_text())):
             if row.get("environments") == "0":
@@ -237,7 +249,7 @@ def test_nothing_missing_is_printed_as_zero(tmp_path):
 
 def test_records_of_other_data_setups_or_seeds_are_left_out(tmp_path):
     own = everywhere("riqn", [0.8, 0.6])
-    publish(tmp_path / "a", header(), own, None, pictures=False)
+    publish(tmp_path / "a", header(), own, None, figures=False)
     others = [
         *everywhere("riqn", [0.1, 0.1], digest="cd" * 32),
         *everywhere("riqn", [0.1, 0.1], limit=5),
@@ -245,7 +257,7 @@ def test_records_of_other_data_setups_or_seeds_are_left_out(tmp_path):
         *everywhere("riqn", [0.1, 0.1], overrides={"samples": 5}),
         *everywhere("someone-elses", [0.1, 0.1]),
     ]
-    publish(tmp_path / "b", header(), [*others, *own], None, pictures=False)
+    publish(tmp_path / "b", header(), [*others, *own], None, figures=False)
     for path in (p for p in (tmp_path / "a").rglob("*") if p.is_file()):
         assert (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes() == path.read_bytes()
 
@@ -254,62 +266,75 @@ def test_caption_names_data_seeds_and_a_reduced_tier(tmp_path):
     table = BY_ID["table-3"]
     records = everywhere("riqn", [0.8, 0.6]) + everywhere("riqn", [0.8, 0.6], seed=1)
     records += everywhere("riqn", [0.8, 0.6], horizon=10)
-    numbers = compute(table, Evidence(records))
+    numbers = compute(table, Estimator(records))
     whole = header(tier=TIERS["full"], split="standard", train=500, calibration=100, test=50)
-    text = captions.caption(whole, table, numbers)
+    text = caption(whole, table, numbers)
     assert "Detector seeds: 2 for Δ = 1; 1 for Δ = 10." in text
     assert "50 test seeds" in text
     assert "reduced" not in text
     reduced = dataclasses.replace(whole, tier=TIERS["reduced"], split="reduced", calibration=50,
                                   test=20)  # fmt: skip
     less = "the first 50 of 100 calibration trajectories and 20 of 50 test seeds of split standard"
-    assert less in captions.caption(reduced, table, numbers)
-    assert less in captions.of_returns(reduced)
-    assert less in "\n".join(captions.opening(reduced, records))
-    mini = captions.caption(header(), table, numbers)
+    assert less in caption(reduced, table, numbers)
+    assert less in returns_caption(reduced)
+    assert less in front_page(reduced, records, [], [])
+    mini = caption(header(), table, numbers)
     assert "(**reduced**: split standard has 500 training trajectories, 100 calibration " in mini
     assert "and 50 test seeds, and episodes end after 300 steps here)" in mini
-    own = captions.caption(dataclasses.replace(whole, split="mine", test=10), table, numbers)
+    own = caption(dataclasses.replace(whole, split="mine", test=10), table, numbers)
     assert "(**reduced**: split standard has 50 test seeds)" in own
 
 
 def test_page_tells_how_long_networks_were_trained():
     records = everywhere("riqn", [0.8, 0.6])
-    assert "trained for" not in "\n".join(captions.opening(header(), records))
+    assert "trained for" not in front_page(header(), records, [], [])
     for number, record in enumerate(records):
         record.parameters["updates"] = 600 if number else 2400
-    text = "\n".join(captions.opening(header(), records))
-    assert "- Networks were trained for at most 600 or 2400 updates. " in text
+    text = front_page(header(), records, [], [])
+    assert "Networks were trained for at most 600 or 2400 updates. " in text
 
 
 def test_page_tells_of_failures_with_their_reasons(tmp_path):
     records = everywhere("riqn", [0.8, 0.6])
     records[0] = make_record("riqn", "ant", "iid", status="timeout", reason="not done after 5 s")
-    publish(tmp_path, header(), records, None, pictures=False)
+    publish(tmp_path, header(), records, None, figures=False)
     page = (tmp_path / "README.md").read_text()
     assert "2 of 252 fits and scorings have been run, 1 of which failed" in page
     assert "not done after 5 s" in page
 
 
 def test_returns_are_kept_and_read_back(tmp_path):
-    found = {"acrobot": {k: [-80.0, -90.0] for k in returns.KINDS}}
-    path = tmp_path / returns.FILE
-    path.write_text(returns.dump(found, "ab" * 32))
-    assert returns.load(path, "ab" * 32) == found
-    assert returns.load(path, "cd" * 32) is None
-    table = returns.table(found)
+    found = {"acrobot": {k: [-80.0, -90.0] for k in KINDS}}
+    (tmp_path / RETURNS).write_text(dump_returns(found, "ab" * 32))
+    assert load_returns(tmp_path, "ab" * 32) == found
+    assert load_returns(tmp_path, "cd" * 32) is None
+    table, _ = returns_tables(found)
     assert table.rows[0][:4] == ["Acrobot", "IQN", "ours", "-85.0 [-90.0, -80.0]"]
     assert table.rows[1][:4] == ["", "", "paper", "-78.7"]
 
 
-def test_measured_costs_cover_every_setup_in_every_environment():
-    measured = json.loads(costs.FILE.read_text())
-    assert list(measured) == list(ENVIRONMENTS)
-    assert all(measured[e]["fit"].keys() == measured["ant"]["fit"].keys() for e in measured)
-    assert all(measured[e]["score"].keys() == measured["ant"]["score"].keys() for e in measured)
+def test_measured_costs_cover_every_setting_in_every_environment():
+    settings = {str(s) for e in EXPERIMENTS for s in e.settings}
+    assert list(COSTS) == list(ENVIRONMENTS)
+    assert all(costs.keys() == settings for costs in COSTS.values())
 
 
-def test_costs_and_digits_ship_with_the_package():
-    root = Path(oodd_eval.__file__).parent
-    assert costs.FILE.is_relative_to(root)
-    assert paper.FILE.is_relative_to(root)
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("title =", "titel =", "'table-3'.*titel"),
+        ('scopes = ["all"]', 'scopes = ["al"]', "'table-3'.*unknown scope 'al'"),
+        ('["riqn"]', '["riqn[h"]', r"'table-3'.*riqn\[h"),
+        ('across = "scopes"', 'across = "scoops"', "'figure-horizon'.*scoops"),
+        ('rows = "mean"', 'rows = "means"', "'figure-models'.*means"),
+        ('axis = "scopes"', 'axis = "scoops"', "'figure-horizon'.*scoops"),
+        ("columns = 3", "column = 3", "'table-3'.*column"),
+        ("[[experiment]]", "[[experiment]", "cannot be read"),
+        ('"table-4"', '"table-3"', "'table-3'.*same id"),
+    ],
+)
+def test_a_wrong_experiment_is_named_with_what_is_wrong(tmp_path, old, new, part):
+    path = tmp_path / "experiments.toml"
+    path.write_text(FILE.read_text().replace(old, new, 1))
+    with pytest.raises(ResultsError, match=f"(?s)experiments.toml.*{part}"):
+        read_tables(path, "experiment", Experiment.of)

@@ -16,15 +16,16 @@ import pytest
 from helpers_reproduce import install_quick
 
 from oodd_eval.cli.main import main
-from oodd_eval.paper import publish
-from oodd_eval.paper.plots import Dots, Figure, Panel, draw, drawing_key
-from oodd_eval.results import files as packed
+from oodd_eval.data.files import compress
+from oodd_eval.paper import page as pages
+from oodd_eval.paper.experiments import Grid
+from oodd_eval.paper.pictures import Dots, Panel, Picture, draw, drawing_key
 from oodd_eval.results.directory import ResultsDirectory
 
 ONLY = "delays"
 """Five units in each environment, riqn at three horizons."""
 
-KILLS = 5
+KILLS = 3
 
 
 @pytest.fixture
@@ -131,7 +132,7 @@ def test_tables_are_made_from_records_that_lie_elsewhere_in_any_order(finished, 
         (entries / name / "records.jsonl").write_text("".join(part))
     # As a large entry is kept.
     whole = entries / "a" / "records.jsonl"
-    whole.with_name("records.jsonl.gz").write_bytes(packed.pack(whole.read_bytes()))
+    whole.with_name("records.jsonl.gz").write_bytes(compress(whole.read_bytes()))
     whole.unlink()
     assert render(kept, "--records", str(entries)) == 0
     mine, theirs = contents(kept), contents(finished)
@@ -159,10 +160,10 @@ def test_a_header_with_fields_of_an_earlier_version_is_read(finished, tmp_path):
 
 
 def test_figures_are_drawn_once_and_again_when_numbers_change(finished, tmp_path, monkeypatch):
-    def in_name_only(figure):
-        return {"png": b"a picture", "svg": drawing_key(figure).encode()}
+    def in_name_only(picture):
+        return {"png": b"a picture", "svg": drawing_key(picture).encode()}
 
-    monkeypatch.setattr(publish, "draw", in_name_only)
+    monkeypatch.setattr(pages, "draw", in_name_only)
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
     assert main(["reproduce", "--render-only", "--output", str(copy), "-q"]) == 0
@@ -237,7 +238,7 @@ def test_a_budget_that_is_used_up_leaves_units_and_says_so(tiny_split, quick, tm
     assert reproduce(tiny_split, tmp_path / "out", "--budget", "0.001s") == 2
     said = capsys.readouterr().out
     # A unit that was begun may end before the budget is looked at.
-    assert re.search(r"the budget is used up: (9|10) units left", said)
+    assert re.search(r"the budget is used up: \d+ units left", said)
     page = (tmp_path / "out" / "README.md").read_text()
     assert re.search(r"\b[0-8] of 72 fits and scorings have been run\.", page)
     assert "**Unfinished**" in page
@@ -280,8 +281,8 @@ def test_a_split_that_is_not_here_comes_with_the_command_that_builds_it(
         (["--tier", "mimi"], "did you mean 'mini'"),
         (["--tier", "mini", "--only", "table-6"], "unknown table or figure 'table-6'"),
         (["--tier", "mini", "--budget", "soon"], "a time such as"),
-        (["--tier", "mini", "--jobs", "0"], "--jobs is 0"),
-        (["--tier", "mini", "--device", "tpu"], "--device is 'tpu'"),
+        (["--tier", "mini", "--jobs", "0"], "--jobs is '0'"),
+        (["--tier", "mini", "--device", "tpu"], "--device: invalid choice: 'tpu'"),
         (["--tier", "mini", "--records", "x"], "--records is what --render-only reads"),
         (["--render-only"], "no reproduction in"),
     ],
@@ -317,7 +318,8 @@ def a_figure(**changes):
     dots = Dots(
         "RIQN", (50.0, float("nan")), (40.0, float("nan")), (60.0, float("nan")), (55.0,) * 2
     )
-    return Figure("A figure", (Panel("One", "AUC (%)", ("a", "b"), (dots,), 50.0),), 1, **changes)
+    panel = Panel("One", "AUC (%)", ("a", "b"), (dots,), 50.0)
+    return Picture("A figure", (panel,), Grid(columns=1, **changes))
 
 
 def test_figures_are_the_same_bytes_again_without_date_or_version():

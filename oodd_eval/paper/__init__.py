@@ -1,5 +1,4 @@
 """The paper's tables, figures and claims on a frozen split, from one command.
 
-What is run is laid out in `experiments`, in which order in `schedule`, and how long it takes in
-`costs`; `carry` does it. Everything printed is computed by `evidence` from records alone.
+`experiments` and `claims` read what the paper shows and claims; `page` renders it from records.
 """

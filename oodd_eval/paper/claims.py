@@ -1,192 +1,214 @@
 """The paper's claims, each as a number and a region in which it lies if the claim is true.
 
-A verdict is a matter of the 95 % interval alone: *confirmed* where all of it lies in the region,
-*refuted* where all of it lies outside (or where a claimed advantage is smaller than matters),
-*undecided* otherwise. Each claim is put to the paper's own measure and, where there is one, to a
-measure without its flaw: matched AUC for AUC, censored delay for delay.
+The 95 % interval alone decides a verdict: *confirmed* where all of it lies in the region, *refuted*
+where all of it lies outside (or an advantage is smaller than matters), else *undecided*. Each is
+put to the paper's measure and to one without its flaw, if there is one. ``claims.toml`` has them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
-from oodd_eval.paper.evidence import Estimate, Evidence, Term
-from oodd_eval.paper.experiments import Setup
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
+from oodd_eval.paper.experiments import check_known, read_tables
+from oodd_eval.paper.inputs import Returns
+from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables.rendering import number
+
+NOT_RUN: Final = "not run"
+RETURN: Final = "return"
+"""The measure of claims about the policies' returns, that is about data instead of detectors."""
 
 Verdict = Literal["confirmed", "refuted", "undecided", "not run"]
-
-FAIR: Final = {"auc": "auc_matched", "delay": "delay_censored"}
-"""For the paper's measures, those without their flaw."""
-
-SMALL: Final = {"auc": 0.005, "delay": 0.5, "far": 0.005, "return": 0.02}
-"""A difference within this, either way, is no advantage: half a point of AUC, half a step."""
+ORDER: Final[tuple[Verdict, ...]] = get_args(Verdict)
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
-    """The open region in which the number lies if the claim is true.
+class Region:
+    """The open interval of a true claim; numbers within `negligible` of 0 are no advantage."""
 
-    Attributes
-    ----------
-    low, high
-        Its ends, infinite where it has none.
-    small
-        Half-width of what is no advantage; 0 where that does not apply.
-    """
+    above: float = -math.inf
+    below: float = math.inf
+    negligible: float = 0.0
 
-    low: float = -math.inf
-    high: float = math.inf
-    small: float = 0.0
-
-    def __call__(self, estimate: Estimate) -> Verdict:
-        """Return the verdict on an estimate.
-
-        Examples
-        --------
-        >>> above = Rule(low=0.0, small=0.005)
-        >>> above(Estimate(0.03, 0.01, 0.05, 7, 7)), above(Estimate(0.0, -0.004, 0.004, 7, 7))
-        ('confirmed', 'refuted')
-        """
+    def verdict(self, estimate: Estimate) -> Verdict:
+        """Return the verdict on an estimate."""
         if math.isnan(estimate.low) or math.isnan(estimate.high):
-            return "not run" if not estimate.environments else "undecided"
-        if self.low < estimate.low and estimate.high < self.high:
+            return "undecided" if estimate.environments else "not run"
+        if self.above < estimate.low and estimate.high < self.below:
             return "confirmed"
-        outside = estimate.high <= self.low or estimate.low >= self.high
-        negligible = -self.small < estimate.low and estimate.high < self.small
+        outside = estimate.high <= self.above or estimate.low >= self.below
+        negligible = -self.negligible < estimate.low and estimate.high < self.negligible
         return "refuted" if outside or negligible else "undecided"
 
     def describe(self, metric: str) -> str:
         """Return the region as printed: ``"> 0"``, ``"between -0.02 and 0.02"``."""
-        unit = 100.0 if metric == "auc" else 1.0
-        low, high = (f"{unit * x:g}" for x in (self.low, self.high))
-        if math.isinf(self.high):
+        low, high = (f"{_scale(metric) * x:g}" for x in (self.above, self.below))
+        if math.isinf(self.below):
             return f"> {low}"
-        return f"< {high}" if math.isinf(self.low) else f"between {low} and {high}"
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """One side of a claim: a mean over setups and anomalies, with a weight.
-
-    The weight is that of the side; it is shared among several setups.
-    """
-
-    weight: float
-    setups: tuple[Setup, ...]
-    anomalies: tuple[str, ...]
-    metric: str = ""
+        return f"< {high}" if math.isinf(self.above) else f"between {low} and {high}"
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Something the paper says.
-
-    Attributes
-    ----------
-    id
-        Short and stable.
-    text
-        The claim, in our words, with the setups it is about.
-    place
-        Where the paper says it.
-    number
-        What is estimated, in words.
-    metric
-        The paper's measure: ``"auc"``, ``"delay"``, ``"far"`` or ``"return"``.
-    parts
-        Whose weighted sum the number is.
-    rule
-        When it is true.
-    environments
-        Over which it is a mean, or in each of which it has to hold.
-    everywhere
-        Whether it is claimed of every environment rather than of their mean.
-    offset
-        Subtracted from the sum.
-    """
+    """Something the paper says; the head of ``claims.toml`` says what the fields mean."""
 
     id: str
     text: str
     place: str
     number: str
     metric: str
-    parts: tuple[Part, ...]
-    rule: Rule
-    environments: tuple[str, ...]
+    sides: tuple[Side, ...]
+    region: Region
+    fair: str = ""
+    environments: tuple[str, ...] = tuple(ENVIRONMENTS)
     everywhere: bool = False
     offset: float = 0.0
     note: str = ""
 
-    @property
-    def setups(self) -> list[Setup]:
-        """Every setup once."""
-        return list(dict.fromkeys(s for part in self.parts for s in part.setups))
+    @classmethod
+    def of(cls, *, metric: str, plus: Mapping[str, Any], minus: Mapping[str, Any] | None = None,
+           **others: Any) -> Claim:  # fmt: skip
+        """Make a claim from a table of ``claims.toml``."""
+        ends = {k: others.pop(k) for k in ("above", "below", "negligible") if k in others}
+        sides = (Side.of(1.0, **plus), *([Side.of(-1.0, **minus)] if minus else []))
+        environments = tuple(others.pop("environments", ENVIRONMENTS))
+        check_known("environment", environments, ENVIRONMENTS)
+        check_known("metric", filter(None, (metric, others.get("fair"))), (*NAMES, RETURN))
+        if any(bool(side.settings) == (metric == RETURN) for side in sides):
+            raise ValueError("expected settings on every side, unless the metric is 'return'")
+        return cls(metric=metric, sides=sides, region=Region(**ends), environments=environments,
+                   **others)  # fmt: skip
+
+
+CLAIMS: Final = read_tables(Path(__file__).with_name("claims.toml"), "claim", Claim.of)
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """A verdict with the number it is about; for a claim about every environment, the least clear.
-
-    Attributes
-    ----------
-    metric
-        Measure it was put to.
-    by_environment
-        Verdict in each environment, for a claim about every one of them.
-    """
+class Judgement:
+    """A verdict by one measure and its number, that of the least clear environment if of each."""
 
     metric: str
     estimate: Estimate
     verdict: Verdict
-    by_environment: tuple[tuple[str, Verdict], ...] = ()
+    by_environment: Mapping[str, Verdict] = field(default_factory=dict)
 
 
-def judge(claim: Claim, metric: str, evidence: Evidence) -> Judged:
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """A claim with its judgements: by the paper's measure and by the fair one, if there is one."""
+
+    claim: Claim
+    own: Judgement
+    fair: Judgement | None = None
+
+
+def rulings(estimator: Estimator, returns: Returns | None) -> list[Ruling]:
+    """Judge every claim; None for returns that were not read."""
+    own = [judge(c, c.metric, estimator, returns) for c in CLAIMS]
+    fair = [judge(c, c.fair, estimator) if c.fair else None for c in CLAIMS]
+    return list(map(Ruling, CLAIMS, own, fair))
+
+
+def judge(
+    claim: Claim, metric: str, estimator: Estimator, returns: Returns | None = None
+) -> Judgement:
     """Put a claim to one measure."""
-    terms = [
-        Term(part.weight / len(part.setups), setup, part.anomalies, part.metric or metric)
-        for part in claim.parts
-        for setup in part.setups
-    ]
-    if claim.everywhere:
-        found = [
-            (environment, _shifted(evidence.combine(terms, [environment]), claim.offset))
-            for environment in claim.environments
-        ]
-        return everywhere(claim, metric, found)
-    return ruled(claim, metric, _shifted(evidence.combine(terms, claim.environments), claim.offset))
 
+    def estimated(environments: Sequence[str]) -> Estimate:
+        if metric == RETURN:
+            found = lost_return(returns or {}, claim.sides, environments)
+        else:
+            found = estimator.combine(claim.sides, metric, environments)
+        value, low, high = (x - claim.offset for x in found.ends)
+        return replace(found, value=value, low=low, high=high)
 
-def ruled(claim: Claim, metric: str, estimate: Estimate) -> Judged:
-    """Return the verdict on a claim about a mean; open where environments are missing from it."""
-    verdict = "undecided" if estimate.partial else claim.rule(estimate)
-    return Judged(metric, estimate, verdict)
-
-
-def everywhere(claim: Claim, metric: str, found: Sequence[tuple[str, Estimate]]) -> Judged:
-    """Return the verdict on a claim about every environment: the weakest of the environments'."""
-    verdicts = tuple((environment, claim.rule(estimate)) for environment, estimate in found)
-    said = [verdict for _, verdict in verdicts if verdict != "not run"]
-    run = [(claim.rule(e), e) for _, e in found if e.environments]
+    if not claim.everywhere:
+        mean = estimated(claim.environments)
+        return Judgement(metric, mean, "undecided" if mean.partial else claim.region.verdict(mean))
+    estimates = [estimated([e]) for e in claim.environments]
+    said = [claim.region.verdict(e) for e in estimates]
+    by_environment = dict(zip(claim.environments, said, strict=True))
+    run = [(v, e) for v, e in zip(said, estimates, strict=True) if e.environments]
     if not run:
-        return Judged(metric, Estimate(expected=len(found)), "not run", verdicts)
-    if "refuted" in said:
-        verdict: Verdict = "refuted"
-    elif len(said) < len(found) or "undecided" in said:
-        verdict = "undecided"
-    else:
-        verdict = "confirmed"
+        return Judgement(metric, Estimate(expected=len(said)), "not run", by_environment)
+    verdict: Verdict = "confirmed" if set(said) == {"confirmed"} else "undecided"
+    verdict = "refuted" if "refuted" in said else verdict
     worst = min((e for v, e in run if v == verdict), key=lambda e: e.value, default=run[0][1])
-    return Judged(metric, worst, verdict, verdicts)
+    return Judgement(metric, worst, verdict, by_environment)
 
 
-def _shifted(estimate: Estimate, offset: float) -> Estimate:
-    if not offset:
-        return estimate
-    return Estimate(
-        estimate.value - offset, estimate.low - offset, estimate.high - offset,
-        estimate.environments, estimate.expected, estimate.seeds, estimate.state,
-    )  # fmt: skip
+def summary(made: Sequence[Ruling]) -> str:
+    """Return how many claims came to which verdict, under either kind of measure."""
+
+    def counted(judged: Sequence[Judgement], claims: str) -> str:
+        count = Counter(j.verdict for j in judged)
+        counts = ", ".join(f"{count[v]} {v}" for v in ORDER if count[v])
+        return f"of {len(judged)}{claims} {counts}"
+
+    own = counted([r.own for r in made], " claims")
+    fair = counted([r.fair for r in made if r.fair], "")
+    return f"By the paper's measures, {own}; by matched AUC and censored delay, {fair}."
+
+
+def claims_table(made: Sequence[Ruling]) -> Table:
+    """Return one row per claim."""
+    header = ["Claim", "By the paper's measure", "By matched AUC or censored delay", "Number",
+              "True if", "Seeds", "Place in the paper"]  # fmt: skip
+    rows = []
+    for r in made:
+        c = r.claim
+        text, true_if = f"{c.text} ({c.note})" if c.note else c.text, c.region.describe(c.metric)
+        judged = _shown(r.own), _shown(r.fair) if r.fair else ""
+        rows.append([text, *judged, c.number, true_if, str(r.own.estimate.seeds or ""), c.place])
+    return Table("Claims", header, rows, labels=len(header))
+
+
+def claims_csv(made: Sequence[Ruling]) -> list[list[str]]:
+    """Return a line per claim and measure, the header first."""
+    lines = [["claim", "text", "place", "number", "metric", "kind", "region", "value", "low",
+              "high", "environments", "seeds", "verdict", "by_environment"]]  # fmt: skip
+    for c, kind, judged in (
+        (r.claim, kind, j) for r in made for kind, j in (("paper", r.own), ("fair", r.fair)) if j
+    ):
+        e, metric = judged.estimate, judged.metric
+        by = " ".join(f"{name}={verdict}" for name, verdict in judged.by_environment.items())
+        told = [c.id, c.text, c.place, c.number, metric, kind, c.region.describe(c.metric)]
+        counts = [str(e.environments), str(e.seeds)]
+        lines.append([*told, *map(number, e.ends), *counts, judged.verdict, by])
+    return lines
+
+
+def _shown(judged: Judgement) -> str:
+    e = judged.estimate
+    if e.state or not e.environments:
+        return e.state or NOT_RUN
+    # One digit more than in the tables: most numbers are differences. Adding 0 turns -0.0 to 0.0.
+    digits = 3 if judged.metric == "far" else 2
+    scale = _scale(judged.metric)
+    value, low, high = (f"{round(scale * x, digits) + 0.0:.{digits}f}" for x in e.ends)
+    title = RETURN if judged.metric == RETURN else metric_info(judged.metric).title
+    over = f"{e.environments} of {e.expected} environments" if e.partial else ""
+    over = _named(judged.by_environment) if judged.by_environment else over
+    return f"{judged.verdict}: {title} {value} [{low}, {high}]" + (f" ({over})" if over else "")
+
+
+def _named(by: Mapping[str, Verdict]) -> str:
+    """Return how many environments came to which verdict; those of one or two by name."""
+    names = {v: [ENVIRONMENTS[e].title for e in by if by[e] == v] for v in ORDER}
+    if len(set(by.values())) == 1:
+        return f"in all {len(by)} environments"
+    brief = {v: f": {', '.join(named)}" if len(named) <= 2 else "" for v, named in names.items()}
+    return "; ".join(f"{len(names[v])} {v}{brief[v]}" for v in ORDER if names[v])
+
+
+def _scale(metric: str) -> float:
+    """Return the factor by which numbers are printed: AUCs in percent."""
+    return 100.0 if metric != RETURN and metric_info(metric).unit == "percent" else 1.0

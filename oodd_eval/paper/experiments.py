@@ -1,56 +1,40 @@
-"""What is run and shown: the tables and figures of Danesh & Fern (2021), and the tiers.
-
-A setup is one row of a comparison, a detector with its horizon and parameters. An experiment lays
-setups out beside one another; experiments share setups, and each is run once.
-"""
+"""The paper's tables and figures, its numbers, and tiers, all from ``experiments.toml``."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
+import numpy as np
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, paper_tables
+from oodd_eval.errors import OoddError, ResultsError, UnknownNameError
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import NAN
 
+_T = TypeVar("_T")
 
-@dataclass(frozen=True, slots=True)
-class Setup:
-    """A detector with its horizon and those parameters that are not at their default."""
+FILE: Final = Path(__file__).with_name("experiments.toml")
 
-    detector: str
-    horizon: int = 1
-    parameters: tuple[tuple[str, Any], ...] = ()
-
-    @property
-    def entry(self) -> Setting:
-        """The row of a board that its records belong to."""
-        return _entry(self.detector, self.horizon, self.parameters)
-
-
-@functools.cache
-def _entry(detector: str, horizon: int, parameters: tuple[tuple[str, Any], ...]) -> Setting:
-    return Setting.of(detector, horizon, dict(parameters))
-
-
-def row_of(record: Record) -> Setting:
-    """Return the row that a record belongs to."""
-    return record.setting
+MEAN: Final = "mean"
+TABLE_2: Final = "table-2"
+"""Returns of the policies, which need no detectors."""
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A column or a colour: one setup, or the mean over several."""
+    """A column of a table or a colour of a figure: one setting, or the mean over several."""
 
     label: str
-    setups: tuple[Setup, ...]
+    settings: tuple[Setting, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """A mean over anomalies: an id that is also in the CSV file, a title, the anomalies."""
+    """A mean over anomalies: an id that is also in CSV files, a title, the anomalies."""
 
     id: str
     title: str
@@ -58,27 +42,26 @@ class Scope:
 
 
 @dataclass(frozen=True, slots=True)
-class Experiment:
-    """One table or figure.
+class Grid:
+    """The arrangement of panels: width of the figure, height of a panel, who shares an axis."""
 
-    Attributes
-    ----------
-    id, title, place
-        Its name on the command line, its heading, and where the paper has it.
-    series, environments, scopes
-        What is compared, where, and over which anomalies.
-    metrics, beyond
-        The paper's metrics, and those that it lacks.
-    across
-        What stands side by side in a table (and shares a panel): series or scopes.
-    rows
-        Whether there is a row per environment, one for the mean over them, or both.
-    same_seeds
-        Whether only those detector seeds count that all series have: where series share their fits,
-        a seed that one of them lacks would be taken for a difference.
-    note
-        What a reader should know.
-    """
+    axis: str = "rows"
+    panel: str = "{metric}, {scope} anomalies"
+    columns: int = 2
+    width: float = 9.6
+    height: float = 2.3
+    share: Literal["row", "all", "none"] = "row"
+
+
+_CHOICES: Final = {
+    "across": ("series", "scopes"), "rows": ("both", "environments", "mean"),
+    "axis": ("rows", "scopes", "horizons"), "share": ("row", "all", "none"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One table or figure; the head of ``experiments.toml`` says what the fields mean."""
 
     id: str
     title: str
@@ -87,200 +70,125 @@ class Experiment:
     scopes: tuple[Scope, ...]
     metrics: tuple[str, ...]
     beyond: tuple[str, ...] = ()
-    across: Literal["series", "scopes"] = "series"
-    rows: Literal["environments", "mean", "both"] = "both"
+    across: str = "series"
+    rows: str = "both"
     environments: tuple[str, ...] = tuple(ENVIRONMENTS)
     same_seeds: bool = False
+    picture: Grid = field(default_factory=Grid)
     note: str = ""
 
     @property
-    def setups(self) -> list[Setup]:
-        """Every setup once, in order."""
-        return list(dict.fromkeys(setup for s in self.series for setup in s.setups))
+    def settings(self) -> list[Setting]:
+        """Every setting once, in order."""
+        return list(dict.fromkeys(s for one in self.series for s in one.settings))
 
+    @property
+    def row_titles(self) -> dict[str, str]:
+        """Titles of the rows by environment, or `MEAN`."""
+        own = {} if self.rows == "mean" else {e: ENVIRONMENTS[e].title for e in self.environments}
+        return own if self.rows == "environments" else own | {MEAN: "Mean"}
 
-ALL: Final = Scope("all", "All anomalies", tuple(ANOMALIES))
-BY_GROUP: Final = {
-    group: Scope(
-        group,
-        f"{group.capitalize()}-injected",
-        tuple(a.id for a in ANOMALIES.values() if a.group == group),
-    )
-    for group in GROUPS
-}
-GROUPED: Final = tuple(BY_GROUP.values())
-SINGLE: Final = tuple(Scope(a.id, a.title, (a.id,)) for a in ANOMALIES.values())
-
-HORIZONS: Final = (1, 10, 20)
-SAMPLES: Final = (4, 8, 32, 128)
-MODELS: Final = {"riqn": "RIQN", "riqn-ms": "RIQN+MS", "npn": "NPN", "rf": "RF"}
-CONTROLS: Final = {
-    "mewma": "MEWMA",
-    "persistence": "persistence",
-    "clock": "clock",
-    "random": "random",
-}
-
-RIQN: Final = Setup("riqn")
-
-
-def with_samples(samples: int) -> Setup:
-    """Return RIQN with M samples; 8 is its default."""
-    return RIQN if samples == 8 else Setup("riqn", 1, (("samples", samples),))
-
-
-def with_members(members: int, horizon: int) -> Setup:
-    """Return RIQN with e networks; 5 is its default."""
-    return Setup("riqn", horizon, () if members == 5 else (("members", members),))
-
-
-EXPERIMENTS: Final = (
-    Experiment(
-        "table-3",
-        "Role of memory: RIQN against N-RIQN, which has a window instead",
-        "Table 3 and section 4.2",
-        tuple(
-            Series(f"Δ = {h}: {label}", (Setup(detector, h),))
-            for h in HORIZONS
-            for detector, label in (("riqn", "RIQN"), ("n-riqn", "N-RIQN"))
-        ),
-        (ALL,),
-        ("auc",),
-        ("auc_matched",),
-        note="The paper has Acrobot and Ant, Δ = 1 and 10, and says that Δ = 20 is similar.",
-    ),
-    Experiment(
-        "table-4",
-        "Ensemble size: one network against five",
-        "Table 4",
-        tuple(
-            Series(f"Δ = {h}: e = {members}", (with_members(members, h),))
-            for h in (1, 10)
-            for members in (1, 5)
-        ),
-        (ALL,),
-        ("auc",),
-        ("auc_matched",),
-    ),
-    Experiment(
-        "table-5",
-        "Models by group of anomalies, Δ = 1",
-        "Table 5",
-        (
-            *(Series(label, (Setup(detector),)) for detector, label in MODELS.items()),
-            Series("AVG", tuple(Setup(detector) for detector in MODELS)),
-        ),
-        GROUPED,
-        ("auc", "delay", "far"),
-        ("auc_matched", "auc_null", "delay_censored", "missed", "missed_at_1pct"),
-        note="At Δ = 1 RIQN and RIQN+MS are the same by the paper's definition: mean sampling "
-        "acts on the steps of a rollout, and there is one.",
-    ),
-    Experiment(
-        "figure-horizon",
-        "Horizon Δ = 1, 10, 20 of RIQN by environment and anomaly",
-        "Figure “How changing the prediction horizon affects anomaly detection”",
-        tuple(Series(f"Δ = {h}", (Setup("riqn", h),)) for h in HORIZONS),
-        (*SINGLE, ALL),
-        ("auc",),
-        ("auc_matched",),
-        across="scopes",
-        same_seeds=True,
-    ),
-    Experiment(
-        "figure-models",
-        "Models, mean over all environments and anomalies",
-        "Figure “Average AUC of different models across all settings”",
-        tuple(
-            Series(f"Δ = {h}: {label}", (Setup(detector, h),))
-            for h in HORIZONS
-            for detector, label in MODELS.items()
-        ),
-        (ALL, *GROUPED),
-        ("auc",),
-        ("auc_matched",),
-        across="scopes",
-        rows="mean",
-        note="The paper's numbers at Δ = 1 are means of its Table 5; its figure has none.",
-    ),
-    Experiment(
-        "figure-samples",
-        "Sampling size M = 4, 8, 32, 128 of RIQN, Δ = 1",
-        "Appendix A, figure “The impact of sampling size”",
-        tuple(Series(f"M = {m}", (with_samples(m),)) for m in SAMPLES),
-        (*SINGLE, ALL),
-        ("auc",),
-        ("auc_matched",),
-        across="scopes",
-        same_seeds=True,
-    ),
-    Experiment(
-        "delays",
-        "Delays and false alarms of RIQN at Δ = 1, 10, 20",
-        "Section 4.3, “not shown” in the paper",
-        tuple(Series(f"Δ = {h}", (Setup("riqn", h),)) for h in HORIZONS),
-        GROUPED,
-        ("delay", "far"),
-        ("delay_censored", "missed"),
-        same_seeds=True,
-    ),
-    Experiment(
-        "controls",
-        "Beyond the paper: rows without a learned dynamics model beside its models, Δ = 1",
-        "not in the paper",
-        tuple(Series(label, (Setup(detector),)) for detector, label in (MODELS | CONTROLS).items()),
-        GROUPED,
-        ("auc",),
-        ("auc_matched",),
-        note="The clock, s = t, has an AUC of 100 by construction: the paper's AUC rewards "
-        "whatever grows with time. Its matched AUC is 50.",
-    ),
-)
-"""All experiments but Table 2, in the order of the report."""
-
-TABLE_2: Final = "table-2"
-"""Returns of the policies: from the split's data; no detector is needed."""
-
-IDS: Final = (TABLE_2, *(e.id for e in EXPERIMENTS))
-"""What ``--only`` may name."""
+    @classmethod
+    def of(cls, *, series: Mapping[str, list[str]], scopes: list[str], **others: Any) -> Experiment:
+        """Make an experiment from a table of ``experiments.toml``."""
+        grid = others.pop("picture", {})
+        plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in others.items()}
+        check_known("environment", plain.get("environments", ()), ENVIRONMENTS)
+        for key, known in _CHOICES.items():
+            check_known(key, [(plain | grid).get(key, known[0])], known)
+        by_label = tuple(Series(k, tuple(map(Setting.parse, v))) for k, v in series.items())
+        return cls(series=by_label, scopes=tuple(map(scope, scopes)), picture=Grid(**grid), **plain)
 
 
 @dataclass(frozen=True, slots=True)
 class Tier:
-    """How much is run.
-
-    Attributes
-    ----------
-    name, split
-        On the command line; `split` is what it is meant for.
-    seeds_near, seeds_far
-        Numbers of detector seeds at Δ = 1, and where scoring is dear: at Δ > 1 and in the sweep
-        of sampling sizes.
-    """
+    """A split and numbers of detector seeds: at Δ = 1, and where scoring is expensive."""
 
     name: str
     split: str
     seeds_near: int
     seeds_far: int
 
-    def seeds(self, setup: Setup) -> range:
-        """Return the detector seeds of a setup; controls have no training to vary, and one."""
-        if setup.detector in CONTROLS:
+    def seeds(self, setting: Setting) -> range:
+        """Return the detector seeds of a setting; detectors without training have one."""
+        if setting.detector in CONTROLS:
             return range(1)
-        dear = setup.horizon > 1 or "samples" in dict(setup.parameters)
-        return range(self.seeds_far if dear else self.seeds_near)
+        expensive = setting.horizon > 1 or "samples" in setting.overrides  # a sweep of sizes
+        return range(self.seeds_far if expensive else self.seeds_near)
 
 
-TIERS: Final = {
-    tier.name: tier
-    for tier in (
-        Tier("full", "standard", 3, 3),
-        Tier("reduced", "reduced", 3, 1),
-        Tier("mini", "mini", 3, 1),
-    )
-}
+def scope(name: str) -> Scope:
+    """Return a mean over anomalies by its id: ``all``, a group, or an anomaly."""
+    if name in GROUPS:
+        within = tuple(a.id for a in ANOMALIES.values() if a.group == name)
+        return Scope(name, f"{name.capitalize()}-injected", within)
+    if name == "all":
+        return Scope(name, "All anomalies", tuple(ANOMALIES))
+    check_known("scope", [name], ("all", *GROUPS, *ANOMALIES))
+    return Scope(name, ANOMALIES[name].title, (name,))
 
 
-def setups_of(experiments: Iterable[Experiment]) -> list[Setup]:
-    """Return every setup of some experiments once."""
-    return list(dict.fromkeys(setup for e in experiments for setup in e.setups))
+def check_known(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise UnknownNameError for the first name that is not known."""
+    if unknown := [name for name in names if name not in known]:
+        raise UnknownNameError(kind, unknown[0], known)
+
+
+def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...]:
+    """Make an object of every table ``[[kind]]`` of a TOML file; ResultsError names a wrong one."""
+    try:
+        tables = tomllib.loads(file.read_text(encoding="utf-8")).get(kind, [])
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
+    made: dict[str, _T] = {}
+    for number, table in enumerate(tables, start=1):
+        name = str(table.get("id") or table.get("name") or number)
+        try:
+            if name in made:
+                raise ResultsError("an earlier one has the same id")
+            made[name] = make(**table)
+        except (OoddError, TypeError, ValueError, AttributeError) as error:
+            raise ResultsError(f"{str(file)!r}: {kind} {name!r}: {error}") from None
+    return tuple(made.values())
+
+
+# Detectors without training; all experiments but Table 2, in the order of the page.
+CONTROLS: Final[tuple[str, ...]] = tuple(tomllib.loads(FILE.read_text("utf-8"))["controls"])
+EXPERIMENTS: Final = read_tables(FILE, "experiment", Experiment.of)
+TIERS: Final = {tier.name: tier for tier in read_tables(FILE, "tier", Tier)}
+
+
+def settings_of(experiments: Iterable[Experiment]) -> list[Setting]:
+    """Return every setting of some experiments once."""
+    return list(dict.fromkeys(setting for e in experiments for setting in e.settings))
+
+
+def paper_number(
+    experiment: Experiment, series: Series, environment: str, scope: Scope, metric: str
+) -> float:
+    """Return what the paper prints for one of our numbers, AUCs as fractions; NaN for nothing.
+
+    The models' means, which a figure of the paper shows without digits, follow from Table 5.
+    """
+    first, tables = series.settings[0], paper_tables()
+    if experiment.id in ("table-5", "figure-models"):
+        if first.horizon != 1:
+            return NAN
+        by_group = tables["table5_groups_delta1"].get(environment, {}).get(metric, {})
+        models = [setting.detector for setting in series.settings]
+        rows = [by_group.get(group, {}) for group in ([scope.id] if scope.id in GROUPS else GROUPS)]
+        if len(models) == 1:
+            found = [row.get(models[0], NAN) for row in rows]
+        else:  # the table's average is over all of its models
+            found = [row["avg"] if {*models, "avg"} == row.keys() else NAN for row in rows]
+        return float(np.mean(found)) / (100 if metric == "auc" else 1)
+    if (metric, scope.id, len(series.settings)) != ("auc", "all", 1):
+        return NAN
+    if experiment.id == "table-3":
+        name, column = "table3_memory_auc", first.detector
+    elif first.detector == "riqn" and "samples" not in first.overrides:
+        name, column = "table4_ensemble_auc", str(first.overrides.get("members", 5))
+    else:
+        return NAN
+    row = tables[name].get(environment, {}).get(str(first.horizon), {})
+    return float(row.get(column, NAN)) / 100

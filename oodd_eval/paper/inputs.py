@@ -1,0 +1,143 @@
+"""The files that a reproduction is rendered from: its header, the policies' returns, its records.
+
+``returns.json`` is kept so that Table 2 can be made again without the split.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.files import GZIP, write_bytes
+from oodd_eval.data.split import Split
+from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.paper.experiments import EXPERIMENTS, Tier, settings_of
+from oodd_eval.results.directory import RECORDS, ResultsDirectory
+from oodd_eval.results.identity import Cell
+from oodd_eval.results.record import Record
+
+HEADER: Final = "reproduction.json"
+RETURNS: Final = "returns.json"
+SCHEMA: Final = 1
+KINDS: Final = ("nominal", *ANOMALIES)
+
+Returns = Mapping[str, Mapping[str, Sequence[float]]]
+"""Return of every test trajectory by environment and kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """The tier, data and sizes of a reproduction, and the number of units of all experiments."""
+
+    tier: Tier
+    split: str
+    split_digest: str
+    protocol: int
+    train: int
+    calibration: int
+    test: int
+    units: int
+
+    def own(self, records: Iterable[Record]) -> list[Record]:
+        """Return the records that belong to it: its whole data, its settings, its seeds."""
+        seeds = {setting: self.tier.seeds(setting) for setting in settings_of(EXPERIMENTS)}
+        data = self.split_digest, self.protocol, None
+        whole = (r for r in records if (r.split_digest, r.protocol, r.limit) == data)
+        return [r for r in whole if r.seed in seeds.get(r.setting, ())]
+
+    @classmethod
+    def load(cls, directory: Path) -> Reproduction:
+        """Read the header of a directory, fields of other versions left out."""
+        from pydantic import TypeAdapter  # noqa: PLC0415  only where a header is read
+
+        path = directory / HEADER
+        try:
+            plain = json.loads(path.read_text(encoding="utf-8"))
+            if plain.get("schema") != SCHEMA:
+                raise ValueError("it was written by another version of oodd-eval")  # noqa: TRY301
+            return TypeAdapter(cls).validate_python(plain)
+        except FileNotFoundError:
+            what = f"expected a file {HEADER}, written by oodd-eval reproduce"
+            raise ResultsError(f"no reproduction in {str(directory)!r}: {what}") from None
+        except (OSError, ValueError, AttributeError) as error:
+            raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
+
+    def check_same_data(self, directory: Path) -> None:
+        """Refuse a directory that holds a reproduction on other data or under other rules."""
+        if not (directory / HEADER).exists():
+            return
+        other = self.load(directory)
+        if (other.split_digest, other.protocol) != (self.split_digest, self.protocol):
+            both = f"{str(directory)!r} holds a reproduction {other}, and this is {self}"
+            raise UsageError(f"{both}: name another directory with --output")
+
+    def __str__(self) -> str:
+        data = f"digest {self.split_digest[:12]}, protocol {self.protocol}"
+        return f"of tier {self.tier.name} on split {self.split} ({data})"
+
+
+def keep_inputs(directory: Path, reproduction: Reproduction, split: Split) -> None:
+    """Write both files, the returns only where they are missing: that reads the whole test part."""
+    header = json.dumps({"schema": SCHEMA, **asdict(reproduction)}, indent=1)
+    write_changed(directory / HEADER, header + "\n")
+    if load_returns(directory, split.digest) is not None:
+        return
+    found = {}
+    for name in split.environments:
+        with contextlib.closing(split.environment(name)) as data:
+            sets = {"nominal": data.twins} | {a: data.anomalous(a) for a in data.anomalies}
+            found[name] = {kind: s.returns.tolist() for kind, s in sets.items()}
+    write_changed(directory / RETURNS, dump_returns(found, split.digest))
+
+
+def write_changed(path: Path, content: str | bytes) -> None:
+    """Write a file in one step, unless it has this content already."""
+    data = content.encode() if isinstance(content, str) else content
+    if not path.is_file() or path.read_bytes() != data:
+        write_bytes(path, data)
+
+
+def dump_returns(returns: Returns, digest: str) -> str:
+    """Return the content of ``returns.json``."""
+    whole = {"schema": SCHEMA, "split_digest": digest, "returns": returns}
+    return json.dumps(whole, sort_keys=True) + "\n"
+
+
+def load_returns(directory: Path, digest: str) -> Returns | None:
+    """Read ``returns.json``; None where it is absent or of other data."""
+    path = directory / RETURNS
+    try:
+        whole = json.loads(path.read_text(encoding="utf-8"))
+        found: Returns = whole["returns"]
+        return found if whole["split_digest"] == digest else None
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        todo = "delete it, and it will be made again"
+        raise ResultsError(f"{str(path)!r} cannot be read: {error!r}; {todo}") from None
+
+
+def load_records(reproduction: Reproduction, places: Iterable[Path]) -> list[Record]:
+    """Read a reproduction's records below some places, where no two have the same cell."""
+    origin: dict[Cell, Path] = {}
+    found: list[Record] = []
+    directories: set[Path] = set()
+    for place in places:
+        # Large entries of the leaderboard keep their records compressed.
+        below = [file.parent for name in (RECORDS, RECORDS + GZIP) for file in place.rglob(name)]
+        if not below:
+            raise ResultsError(f"no results in {str(place)!r}, expected {RECORDS} in or below it")
+        directories.update([place] if place in below else below)
+    for directory in sorted(directories):
+        for record in reproduction.own(ResultsDirectory(directory).records()):
+            if (first := origin.setdefault(record.cell, directory)) != directory:
+                twice = f"{record.cell} is in {str(first)!r} and in {str(directory)!r}"
+                todo = "name those that belong to the reproduction with --records"
+                raise ResultsError(f"{twice}: {todo}")
+            found.append(record)
+    return found

@@ -1,0 +1,293 @@
+"""Write a reproduction: tables, figures, claims and the page that joins them, from records alone.
+
+::
+
+    README.md             the claims, every figure, the paper's tables (its texts: page.toml)
+    claims.csv            every claim with its verdicts
+    tables/<id>.md, .csv  every number of an experiment; CSV in full precision
+    figures/<id>.png, .svg
+
+The same records give the same bytes.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+import string
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, paper_tables
+from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.paper.claims import NOT_RUN, Ruling, claims_csv, claims_table, rulings, summary
+from oodd_eval.paper.estimates import Estimate, Estimator, Numbers, compute, mean_return
+from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, Experiment
+from oodd_eval.paper.inputs import KINDS, Reproduction, Returns, write_changed
+from oodd_eval.paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
+from oodd_eval.results.record import Record
+from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables.rendering import markdown as padded_table
+from oodd_eval.results.tables.rendering import number
+
+TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
+
+
+def fill(name: str, /, **values: Any) -> str:
+    """Return a text of ``page.toml`` with its values; ``[[x: ...]]`` only where x is not empty."""
+    kept = re.sub(r"(?s)\[\[(\w+): (.*?)\]\]", lambda m: m[2] if values[m[1]] else "", TEXTS[name])
+    return string.Template(kept).substitute(values)
+
+
+def publish(
+    directory: Path, reproduction: Reproduction, records: Sequence[Record],
+    returns: Returns | None, *, figures: bool = True,
+) -> None:  # fmt: skip
+    """Write every table and figure of what there is; what is missing says so.
+
+    Without `figures` none is drawn, and those that are there already are linked.
+    """
+    own = reproduction.own(records)
+    estimator = Estimator(own)
+    made = rulings(estimator, returns)
+    write_changed(directory / "claims.csv", _csv(claims_csv(made)))
+    sections = [_of_returns(reproduction, returns)]
+    sections += [_of_experiment(reproduction, e, estimator) for e in EXPERIMENTS]
+    lines = [line for one in sections for line in _write(directory, one, figures=figures)]
+    write_changed(directory / "README.md", front_page(reproduction, own, made, lines))
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """A table or figure: its numbers as lines of CSV (none: not run), and what the page shows."""
+
+    id: str
+    title: str
+    caption: str = ""
+    csv: Sequence[Sequence[str]] = ()
+    tables: Sequence[str] = ()
+    pictures: Mapping[str, Picture] = field(default_factory=dict)
+    shown: Sequence[str] = ()
+
+
+def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
+    """Write a section's files, no picture twice, and return its part of the page."""
+    if not one.csv:
+        return [f"## {one.title}", "", "Not run.", ""]
+    write_changed(directory / "tables" / f"{one.id}.csv", _csv(one.csv))
+    whole = "\n".join([f"# {one.title}", "", one.caption, "", *one.tables])
+    write_changed(directory / "tables" / f"{one.id}.md", whole)
+    links = []
+    for name, picture in one.pictures.items():
+        svg, png = (directory / "figures" / f"{name}.{suffix}" for suffix in ("svg", "png"))
+        drawn = svg.is_file() and png.is_file() and svg.read_text("utf-8", "replace")[:4000]
+        if figures and not (drawn and drawing_key(picture) in drawn):
+            for suffix, content in draw(picture).items():
+                write_changed(svg.with_suffix(f".{suffix}"), content)
+        if png.exists():
+            links += [fill("figure", title=picture.title, name=name), ""]
+    return [f"## {one.title}", "", one.caption, "", *links, *one.shown, ""]
+
+
+def _of_experiment(r: Reproduction, experiment: Experiment, estimator: Estimator) -> _Section:
+    name = experiment.id
+    title = f"{name.replace('-', ' ').capitalize()}: {experiment.title}"
+    if not estimator.has(experiment.settings):
+        return _Section(name, title)
+    numbers = compute(experiment, estimator)
+    tables: list[str] = []
+    parts = {"As in the paper": experiment.metrics, "Beyond": experiment.beyond}
+    for heading, metrics in parts.items():
+        set_out = layout(experiment, numbers, metrics)
+        tables += [f"## {heading}", "", *map(markdown_table, set_out)] if metrics else []
+    # Wide tables stand on the page without their intervals.
+    wide = experiment.across == "scopes" and experiment.rows != "mean"
+    brief = layout(experiment, numbers, experiment.metrics, intervals=not wide)
+    shown = [*map(markdown_table, brief), fill("files", name=name)]
+    text, pictures = caption(r, experiment, numbers), pictures_of(experiment, numbers)
+    return _Section(name, title, text, numbers_csv(numbers), tables, pictures, shown)
+
+
+def _of_returns(r: Reproduction, returns: Returns | None) -> _Section:
+    name, title = TABLE_2, "Table 2: returns of the policies, nominal and under each anomaly"
+    if not returns:
+        return _Section(name, title)
+    table, lines = returns_tables(returns)
+    text, pictures = markdown_table(table), {name: returns_picture(returns)}
+    shown = [text, f"[{name}.csv](tables/{name}.csv)"]
+    return _Section(name, title, returns_caption(r), lines, [text], pictures, shown)
+
+
+def layout(
+    experiment: Experiment, numbers: Numbers, metrics: Sequence[str], *, intervals: bool = True
+) -> list[Table]:
+    """Set numbers out as the paper does: a table per scope, or per metric where scopes go across.
+
+    Rows are by environment and metric, or by environment and series, with the paper's digits below.
+    """
+    labels = {s.label: s.label for s in experiment.series}
+    scopes = {s.id: s.title for s in experiment.scopes}
+    infos = {metric: metric_info(metric) for metric in metrics}
+    titles = {m: i.title + (" (%)" if i.unit == "percent" else "") for m, i in infos.items()}
+    side_by_side = experiment.across == "series"
+    lines, columns = (titles, labels) if side_by_side else (labels, scopes)
+    header = ["Environment", "Result" if side_by_side else "Setting", "", *columns.values()]
+    tables = []
+    for name, title in (scopes if side_by_side else titles).items():
+        rows: list[list[str]] = []
+        for row, first in experiment.row_titles.items():
+            for i, (line, label) in enumerate(lines.items()):
+                keys = [(c, name, line) if side_by_side else (line, c, name) for c in columns]
+                own = [numbers[row, *key] for key in keys]
+                ours = [show(n.estimate, n.metric, intervals=intervals) for n in own]
+                rows.append(["" if i else first, label, "ours", *ours])
+                paper = [(n.paper, infos[n.metric]) for n in own]
+                theirs = ["" if math.isnan(value) else info.text(value) for value, info in paper]
+                if any(theirs):
+                    rows.append(["", "", "paper", *theirs])
+        tables.append(Table(title, header, rows, labels=3))
+    return tables
+
+
+def show(estimate: Estimate, metric: str, *, intervals: bool = True) -> str:
+    """Return an estimate as printed: what failed or was not run says so and is never a number."""
+    if estimate.state or not estimate.environments:
+        return estimate.state or NOT_RUN
+    text, low, high = map(metric_info(metric).text, estimate.ends)
+    if intervals and not math.isnan(estimate.low):
+        text += f" [{low}, {high}]"
+    return text + (f" ({estimate.environments} of {estimate.expected})" if estimate.partial else "")
+
+
+def numbers_csv(numbers: Numbers) -> list[list[str]]:
+    """Return the numbers as lines of a CSV file, the header first; what was not run is empty."""
+    lines = [["environment", "series", "detectors", "horizon", "parameters", "anomalies", "metric",
+              "value", "low", "high", "environments", "seeds", "state", "paper"]]  # fmt: skip
+    for n in numbers.values():
+        first, e = n.series.settings[0], n.estimate
+        detectors = "+".join(setting.detector for setting in n.series.settings)
+        parameters = json.dumps(first.overrides) if first.overrides else ""
+        told = [n.environment, n.series.label, detectors, str(first.horizon), parameters]
+        state = e.state or ("" if e.environments else NOT_RUN)
+        lines.append([*told, n.scope.id, n.metric, *map(number, e.ends), str(e.environments),
+                      str(e.seeds), state, number(n.paper)])  # fmt: skip
+    return lines
+
+
+def returns_tables(returns: Returns) -> tuple[Table, list[list[str]]]:
+    """Return Table 2, ours with intervals and the paper's below it, and its lines of CSV."""
+    header = ["Environment", "Policy", "", "Nominal", *(a.title for a in ANOMALIES.values())]
+    rows = []
+    lines = [["environment", "kind", "group", "value", "low", "high", "n", "paper"]]
+    for environment in (e for e in ENVIRONMENTS if e in returns):
+        info, paper = ENVIRONMENTS[environment], paper_tables()["table2_policy_return"][environment]
+        ours, theirs = [info.title, info.policy, "ours"], ["", "", "paper"]
+        for kind in KINDS:
+            e, n = mean_return(returns, environment, kind), len(returns[environment].get(kind, ()))
+            group, digits = ANOMALIES[kind].group if kind in ANOMALIES else "", float(paper[kind])
+            numbers = *map(number, e.ends), str(n), number(digits)
+            lines.append([environment, kind, group, *numbers])
+            printed = f"{e.value:.1f} [{e.low:.1f}, {e.high:.1f}]"
+            ours.append(printed if e.environments else "not recorded")
+            theirs.append(f"{digits:.1f}")
+        rows += [ours, theirs]
+    return Table("Mean return", header, rows, labels=3), lines
+
+
+def front_page(
+    reproduction: Reproduction, records: Sequence[Record], made: Sequence[Ruling],
+    sections: Sequence[str],
+) -> str:  # fmt: skip
+    """Return the page: the run, the claims, the sections, and what failed."""
+    tier = reproduction.tier
+    done = {(r.setting, r.environment, r.seed) for r in records}
+    failed = {(str(r.setting), r.environment, r.seed): r for r in records if not r.ok}
+    updates = sorted({int(r.parameters["updates"]) for r in records if "updates" in r.parameters})
+    names = ("oodd_eval", "python", "numpy")
+    made_by = ([f"{n} {r.provenance[n]}" for n in names if n in r.provenance] for r in records)
+    software = sorted({", ".join(versions) or "unknown versions" for versions in made_by})
+    devices = sorted({str(r.provenance["device"]) for r in records if "device" in r.provenance})
+    software += [f"networks on {device}" for device in devices]
+    if failed:
+        rows = [[*map(str, key), failed[key].status, failed[key].reason] for key in sorted(failed)]
+        header = ["Detector", "Environment", "Seed", "State", "Reason"]
+        failures = markdown_table(Table("What failed", header, rows, labels=5))
+        sections = [*sections, "## Failures", "", failures]
+    return fill(
+        "page", tier=tier.name, data=_data(reproduction), near=tier.seeds_near,
+        far="" if tier.seeds_far == tier.seeds_near else tier.seeds_far,
+        done=len(done), units=reproduction.units, failed=len(failed),
+        unfinished=len(done) < reproduction.units,
+        split="" if reproduction.split == tier.split else reproduction.split,
+        made="".join(f"- Made with {one}.\n" for one in software),
+        updates=" or ".join(map(str, updates)), summary=summary(made),
+        claims=markdown_table(claims_table(made)).split("\n", 2)[2],
+        sections="\n".join(sections),
+    )  # fmt: skip
+
+
+def caption(reproduction: Reproduction, experiment: Experiment, numbers: Numbers) -> str:
+    """Return the text above an experiment's tables and figures."""
+    used: dict[str, set[int]] = {}
+    for n in numbers.values():
+        if n.estimate.seeds:
+            used.setdefault(n.series.label, set()).add(n.estimate.seeds)
+    return fill("caption", place=experiment.place, data=_data(reproduction), seeds=_seeds(used),
+                note=experiment.note)  # fmt: skip
+
+
+def returns_caption(r: Reproduction) -> str:
+    """Return the text above Table 2."""
+    return fill("returns", data=_data(r), cut=r.split in SPLITS and SPLITS[r.split].episode_cap)
+
+
+def _data(r: Reproduction) -> str:
+    """Describe the data, and what it lacks beside split standard."""
+    whole, own = SPLITS["standard"], SPLITS.get(r.split)
+    all_of = {"training trajectories": (r.train, whole.train),
+              "calibration trajectories": (r.calibration, whole.calibration),
+              "test seeds": (r.test, whole.test)}  # fmt: skip
+    part_of = own is not None and own.seed_base == whole.seed_base
+    fewer = [(f"{few} of " if part_of else "") + f"{most} {part}"
+             for part, (few, most) in all_of.items() if few < most]  # fmt: skip
+    listed = " and ".join(filter(None, [", ".join(fewer[:-1]), *fewer[-1:]]))
+    lacks = [f"split standard has {listed}"] if fewer else []
+    if own and own.episode_cap:
+        lacks.append(f"episodes end after {own.episode_cap} steps here")
+    return fill(
+        "data", split=r.split, digest=r.split_digest[:12], protocol=r.protocol,
+        train=r.train, calibration=r.calibration, test=r.test,
+        first=listed if part_of else "", lacks="" if part_of else ", and ".join(lacks),
+    )  # fmt: skip
+
+
+def _seeds(used: Mapping[str, set[int]]) -> str:
+    """Say on how many detector seeds each series rests; briefly where those of a horizon agree."""
+    spans: dict[str, set[str]] = {}
+    for label, seeds in used.items():
+        span = str(min(seeds)) if len(seeds) == 1 else f"{min(seeds)} to {max(seeds)}"
+        spans.setdefault(label.rpartition(": ")[0], set()).add(span)
+    if any(len(different) > 1 for different in spans.values()):
+        return _seeds({f"{label}: ": seeds for label, seeds in used.items()})
+    by_span: dict[str, list[str]] = {}
+    for name, (span,) in spans.items():
+        by_span.setdefault(span, []).append(name)
+    each = [f"{span} for {', '.join(names)}" for span, names in by_span.items()]
+    return "; ".join(each if len(each) != 1 else by_span)
+
+
+def markdown_table(table: Table) -> str:
+    """Return a table as Markdown without the padding, which would make up most of the page."""
+    return re.sub(r"-{3,}", "---", re.sub(r" {2,}", " ", padded_table(table)))
+
+
+def _csv(lines: Sequence[Sequence[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
