@@ -1,7 +1,5 @@
 """An evaluation harness for detectors of out-of-distribution dynamics.
 
-Does a detector notice when the dynamics of a controlled system change?
-
 The names below are all that a plug-in or a script needs. They are imported when first used, so
 that ``oodd-eval --help`` and the listing of plug-ins stay quick.
 """
@@ -15,28 +13,20 @@ if TYPE_CHECKING:
     from oodd_eval.api import evaluate
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
-    from oodd_eval.plugins.conformance import check_detector
+    from oodd_eval.plugins import hookimpl
     from oodd_eval.plugins.contract import Detector, DetectorSpec
-    from oodd_eval.plugins.hooks import hookimpl
+    from oodd_eval.testing import check_detector
 
-__all__ = [
-    "Detector",
-    "DetectorSpec",
-    "Trajectory",
-    "__version__",
-    "check_detector",
-    "evaluate",
-    "hookimpl",
-    "load_split",
-]
+__all__ = ["Detector", "DetectorSpec", "Trajectory", "__version__", "check_detector", "evaluate",
+           "hookimpl", "load_split"]  # fmt: skip
 
 _HOMES = {
     "Detector": "plugins.contract",
     "DetectorSpec": "plugins.contract",
     "Trajectory": "data.trajectory",
-    "check_detector": "plugins.conformance",
+    "check_detector": "testing",
     "evaluate": "api",
-    "hookimpl": "plugins.hooks",
+    "hookimpl": "plugins",
     "load_split": "data.split",
 }
 

@@ -12,11 +12,12 @@ from oodd_eval.names import select
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import Offer, discover
 from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import Settings, run
-from oodd_eval.scoring.unit import LOCAL
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.runner import run
 
 
 def evaluate(
@@ -43,12 +44,10 @@ def evaluate(
         Name or path of a split, or an opened one.
     environments, anomalies
         Names as on the command line: comma lists, globs or ``"all"``.
-    horizon
-        Prediction horizon in steps, at least 1.
-    seed
-        Seed of the detector.
+    horizon, seed
+        Prediction horizon in steps, at least 1, and seed of the detector.
     parameters
-        Handed to the factory.
+        Arguments of the factory besides seed and horizon.
     limit
         Use the first so many trajectories of each part.
     output
@@ -58,7 +57,7 @@ def evaluate(
     -------
     list of Record
         In the order environments x anomalies. An installed detector that fails gives records with
-        another status than ``"ok"``; what a factory's detector raises passes through.
+        another status than ``"ok"``; exceptions of a factory's detector pass through.
 
     Raises
     ------
@@ -81,22 +80,16 @@ def evaluate(
         plugins = discover(only=())
         if not isinstance(detector, DetectorSpec):
             shown = getattr(detector, "__name__", type(detector).__name__).lower()
-            detector = DetectorSpec(shown, detector, "", parameters=given)
+            detector = DetectorSpec(shown, detector, "", parameters=declared_by(given))
         name = detector.name
-        plugins.offers[name] = Offer(detector, LOCAL, "", "local", "")
+        plugins.add(Offer(detector, "", "", "local", ""))
     plan = make_plan(
-        plugins,
-        split=opened.name,
-        split_digest=opened.digest,
-        detectors=[name],
+        plugins, split=opened.name, split_digest=opened.digest, detectors=[name],
         environments=select("environment", environments, opened.environments),
         anomalies=select("anomaly", anomalies, ANOMALIES),
-        horizons=[horizon],
-        seeds=[seed],
-        parameters=given,
-        limit=limit,
-    )
+        horizons=[horizon], seeds=[seed], parameters=given, limit=limit,
+    )  # fmt: skip
     # One at a time: a factory's detector need not be able to share this process with another.
-    settings = Settings(jobs=1, limits=Limits())
+    settings = RunSettings(jobs=1, limits=Limits())
     results = ResultsDirectory(output) if output is not None else None
     return run(plan, opened, plugins, settings, results).records

@@ -1,4 +1,4 @@
-"""Every error that oodd-eval raises on purpose: one tree, each also the nearest builtin.
+"""The errors that oodd-eval raises on purpose, in one tree; each is also a built-in exception.
 
 A message says what went wrong, in which object, what was expected, what was found and what to do.
 """
@@ -23,7 +23,7 @@ class UnknownNameError(UsageError, LookupError):
     Parameters
     ----------
     kind
-        What is named, in the singular: ``"detector"``, ``"environment"``.
+        Kind of the named thing, in the singular: ``"detector"``, ``"environment"``.
     name
         The unknown name.
     known
@@ -48,7 +48,7 @@ class TrajectoryError(OoddError, ValueError):
 
 
 class SplitError(OoddError, ValueError):
-    """A split that cannot be read as what it claims to be."""
+    """A split that is damaged, or does not have the layout of a split."""
 
 
 class SplitNotFoundError(SplitError, FileNotFoundError):
@@ -56,7 +56,7 @@ class SplitNotFoundError(SplitError, FileNotFoundError):
 
 
 class DigestError(SplitError):
-    """Content whose digest differs from the manifest."""
+    """The digest of a split's content differs from its manifest."""
 
 
 class ContractError(OoddError, ValueError):
@@ -68,7 +68,7 @@ class NotFittedError(OoddError, RuntimeError):
 
 
 class FittedStateError(OoddError, ValueError):
-    """Files that are not a fitted detector's, or not this one's."""
+    """Files that do not hold a fitted detector, or hold another one."""
 
 
 class PluginError(OoddError, ImportError):
@@ -92,8 +92,8 @@ class ResultsError(OoddError, ValueError):
 
 
 class ExecutorError(OoddError, RuntimeError):
-    """A place where units are to be carried out that cannot be reached or used."""
+    """An executor that cannot be reached or used."""
 
 
 class OutputError(OoddError, OSError):
-    """A place that cannot be written to."""
+    """A file or directory that cannot be written."""

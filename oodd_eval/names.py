@@ -1,39 +1,25 @@
-"""How users name things: comma lists, globs, ``all``, and boolean expressions over cell ids."""
+"""Read what users write: lists of names, numbers, times, parameters, expressions of ``-k``."""
 
 from __future__ import annotations
 
+import ast
 import fnmatch
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Final
 
 from oodd_eval.errors import UnknownNameError, UsageError
 
 Predicate = Callable[[str], bool]
 
+_TIMES: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
+_AMOUNTS: Final = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9,
+                   "kib": 2**10, "mib": 2**20, "gib": 2**30}  # fmt: skip
+
 
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that a comma list of names and globs selects.
-
-    Parameters
-    ----------
-    kind
-        What is named, in the singular, for messages.
-    patterns
-        Such as ``"hopper,walker2d"``, ``"*iqn*"`` or ``"all"``.
-    known
-        The names that exist, in their order.
-
-    Returns
-    -------
-    list of str
-        In the order of the patterns, then of `known`; each name once.
-
-    Raises
-    ------
-    UnknownNameError
-        When a name does not exist or a glob matches nothing.
+    """Return the known names that a comma list of names and globs, or ``"all"``, selects, in order.
 
     Examples
     --------
@@ -54,75 +40,49 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     return list(chosen)
 
 
-def whole_numbers(option: str, text: str, *, least: int) -> list[int]:
-    """Return the numbers of a comma list, each once.
-
-    Raises
-    ------
-    UsageError
-        When one is not a whole number of at least `least`.
-    """
-    numbers: dict[int, None] = {}
-    for part in text.split(","):
-        try:
-            number = int(part)
-        except ValueError:
-            number = least - 1
-        if number < least:
-            raise UsageError(
-                f"{option} is {text!r}, expected whole numbers of at least {least}, "
-                "separated by commas"
-            )
-        numbers[number] = None
-    return list(numbers)
+def whole_numbers(text: str, *, least: int) -> list[int]:
+    """Return the numbers of a comma list, each once; `UsageError` when one is below `least`."""
+    try:
+        numbers = list(dict.fromkeys(map(int, text.split(","))))
+    except ValueError:
+        numbers = []
+    if numbers and min(numbers) >= least:
+        return numbers
+    raise UsageError(f"{text!r}, expected whole numbers of at least {least}, separated by commas")
 
 
 def seconds(text: str) -> float:
     """Return a time such as ``"90"``, ``"90s"``, ``"30m"`` or ``"2h"`` in seconds."""
-    return _quantity(text, {"": 1, "s": 1, "m": 60, "h": 3600}, "a time such as 90s, 30m or 2h")
+    return _quantity(text, _TIMES, "a time such as 90s, 30m or 2h")
 
 
 def memory_bytes(text: str) -> int:
     """Return an amount of memory such as ``"500MB"``, ``"8GB"`` or ``"8GiB"`` in bytes."""
-    units = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9,
-             "kib": 2**10, "mib": 2**20, "gib": 2**30}  # fmt: skip
-    return int(_quantity(text, units, "an amount of memory such as 500MB or 8GB"))
+    return int(_quantity(text, _AMOUNTS, "an amount of memory such as 500MB or 8GB"))
 
 
 def _quantity(text: str, units: dict[str, int], expected: str) -> float:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     if not match or match[2].lower() not in units or float(match[1]) == 0:
-        raise UsageError(f"{text!r} is not {expected}")
+        raise UsageError(f"{text!r}, expected {expected}")
     return float(match[1]) * units[match[2].lower()]
 
 
-def assignments(option: str, given: Iterable[str]) -> dict[str, str]:
-    """Return texts of the form ``NAME=VALUE`` as names and values.
-
-    Raises
-    ------
-    UsageError
-        When one has another form.
-    """
-    found = {}
-    for text in given:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise UsageError(f"{option} {text!r}, expected NAME=VALUE")
-        found[name] = value
-    return found
+def assignment(text: str) -> tuple[str, str]:
+    """Return the two sides of ``NAME=VALUE``."""
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise UsageError(f"{text!r}, expected NAME=VALUE")
+    return name, value
 
 
-def parameters(given: Iterable[str]) -> dict[str, Any]:
-    """Return what ``--param NAME=VALUE`` gives, values in JSON or else plain text."""
-    return {name: _plain(value) for name, value in assignments("--param", given).items()}
-
-
-def _plain(text: str) -> Any:
+def parameter(text: str) -> tuple[str, Any]:
+    """Return a name and a value, which is JSON or else plain text."""
+    name, value = assignment(text)
     try:
-        return json.loads(text)
+        return name, json.loads(value)
     except json.JSONDecodeError:
-        return text
+        return name, value
 
 
 def expression(text: str) -> Predicate:
@@ -130,55 +90,39 @@ def expression(text: str) -> Predicate:
 
     Words are substrings, regardless of case; ``and``, ``or``, ``not`` and round brackets join them.
 
-    Raises
-    ------
-    UsageError
-        When the expression cannot be read.
-
     Examples
     --------
     >>> wanted = expression("hopper and not (iid or drift)")
     >>> wanted("mini/hopper/gravity::rf[h=1,seed=0]"), wanted("mini/hopper/iid::rf[h=1,seed=0]")
     (True, False)
     """
-    tokens = re.findall(r"[()]|[^\s()]+", text)
-    test, rest = _either(tokens, text)
-    if rest:
-        raise UsageError(f"-k {text!r} cannot be read from {rest[0]!r} on")
-    return test
+    words: list[str] = []
+
+    def named(match: re.Match[str]) -> str:
+        if match[0] in {"and", "or", "not"}:
+            return match[0]
+        words.append(match[0].lower())
+        return f"_{len(words) - 1}"
+
+    # With a name in place of each word, this is the grammar of Python.
+    source = " ".join(re.sub(r"[^\s()]+", named, text).split())
+    try:
+        return _test(ast.parse(source, mode="eval").body, words)
+    except SyntaxError:
+        expected = "words joined by and, or, not and round brackets"
+        raise UsageError(f"-k {text!r} cannot be read, expected {expected}") from None
 
 
-def _either(tokens: Sequence[str], text: str) -> tuple[Predicate, Sequence[str]]:
-    left, rest = _both(tokens, text)
-    while rest and rest[0] == "or":
-        right, rest = _both(rest[1:], text)
-        left = _join(any, left, right)
-    return left, rest
-
-
-def _both(tokens: Sequence[str], text: str) -> tuple[Predicate, Sequence[str]]:
-    left, rest = _one(tokens, text)
-    while rest and rest[0] == "and":
-        right, rest = _one(rest[1:], text)
-        left = _join(all, left, right)
-    return left, rest
-
-
-def _one(tokens: Sequence[str], text: str) -> tuple[Predicate, Sequence[str]]:
-    if not tokens or tokens[0] in ("and", "or", ")"):
-        found = repr(tokens[0]) if tokens else "the end"
-        raise UsageError(f"-k {text!r} cannot be read: expected a word, found {found}")
-    word, rest = tokens[0], tokens[1:]
-    if word == "not":
-        inner, rest = _one(rest, text)
-        return lambda cell: not inner(cell), rest
-    if word == "(":
-        inner, rest = _either(rest, text)
-        if not rest or rest[0] != ")":
-            raise UsageError(f"-k {text!r} cannot be read: a bracket is not closed")
-        return inner, rest[1:]
-    return lambda cell: word.lower() in cell.lower(), rest
-
-
-def _join(how: Callable[[Iterable[bool]], bool], left: Predicate, right: Predicate) -> Predicate:
-    return lambda cell: how(test(cell) for test in (left, right))
+def _test(node: ast.expr, words: list[str]) -> Predicate:
+    match node:
+        case ast.Name(id=name):
+            word = words[int(name[1:])]
+            return lambda cell: word in cell.lower()
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            inner = _test(operand, words)
+            return lambda cell: not inner(cell)
+        case ast.BoolOp(op=operator, values=values):
+            parts = [_test(value, words) for value in values]
+            join = all if isinstance(operator, ast.And) else any
+            return lambda cell: join(part(cell) for part in parts)
+    raise SyntaxError

@@ -2,10 +2,10 @@
 
 ::
 
-    pytest --oodd-detector mine --oodd-reference reference.json
+    pytest --oodd-detector mine --oodd-reference reference.jsonl
 
 adds one test per cell. Without ``--oodd-detector`` nothing happens: pytest loads this module in
-every environment in which oodd-eval is installed, so it imports nothing of the harness until asked.
+every environment in which oodd-eval is installed, so the harness is imported only when asked for.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ _OTHERS: Final = ("reference", "env", "fail", "two_sided", "output")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
-    group = parser.getgroup("oodd-eval", "regression check of detectors (oodd-eval)")
-    add = group.addoption
+    # fmt: off
+    add = parser.getgroup("oodd-eval", "regression check of detectors (oodd-eval)").addoption
     add("--oodd-detector", metavar="NAMES",
-        help="add a test per cell of these installed detectors: comma lists or globs")  # fmt: skip
+        help="add a test per cell of these installed detectors: comma lists or globs")
     add("--oodd-reference", metavar="FILE",
         help="what the figures must come up to, written by oodd-eval compare --write-reference; "
-             "without it a test passes when its cell does not fail")  # fmt: skip
+             "without it a test passes when its cell does not fail")
     add("--oodd-split", default="mini", metavar="NAME", help="split (default: mini)")
     add("--oodd-env", metavar="NAMES",
-        help="environments (default: those of the reference, or all)")  # fmt: skip
+        help="environments (default: those of the reference, or all)")
     add("--oodd-fail", action="append", default=[], metavar="METRIC:[+-]NUMBER[%]",
         help="fail when the metric changed by more in the direction of the sign, such as "
-             "auc:-0.01 (default: when any metric is worse at all)")  # fmt: skip
+             "auc:-0.01 (default: when any metric is worse at all)")
     add("--oodd-two-sided", action="store_true",
-        help="fail for improvements beyond the tolerance, too")  # fmt: skip
+        help="fail for improvements beyond the tolerance, too")
     add("--oodd-output", metavar="DIR", help="results directory to keep and to resume from")
+    # fmt: on
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin, if asked."""
+    """Register the check if a detector is named."""
     if config.getoption("oodd_detector"):
-        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415  only now the harness is needed
+        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415  see above
 
         config.pluginmanager.register(Cells(config), "oodd-eval-cells")
         return

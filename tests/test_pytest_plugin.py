@@ -1,7 +1,7 @@
 """The pytest plug-in: off unless asked, one run of the harness, one test per cell."""
 
-import json
 import os
+from dataclasses import replace
 from importlib.metadata import entry_points
 from types import SimpleNamespace
 
@@ -10,7 +10,8 @@ from helpers_plugins import install
 
 from oodd_eval import evaluate
 from oodd_eval.pytest_cells import Cells, Regression
-from oodd_eval.results.regression.figures import write_reference
+from oodd_eval.results.record import Metric
+from oodd_eval.results.regression.reference import read_record_set, write_reference
 
 pytest_plugins = ["pytester"]
 
@@ -23,7 +24,7 @@ OPTIONS = {
 @pytest.fixture(scope="module")
 def reference(tiny_split, tmp_path_factory):
     """Reference of persistence on the tiny split."""
-    path = tmp_path_factory.mktemp("reference") / "reference.json"
+    path = tmp_path_factory.mktemp("reference") / "reference.jsonl"
     write_reference(evaluate("persistence", tiny_split), path)
     return path
 
@@ -48,12 +49,14 @@ def cells(tiny_split, monkeypatch):
 
 
 def altered(reference, path, **figures):
-    """Write the reference with other figures of hopper/iid, and without those that are None."""
-    plain = json.loads(reference.read_text())
-    board = plain["boards"][0]["cells"]
+    """Write the reference with other figures of hopper/iid."""
     cell = "tiny/hopper/iid::persistence[h=1,seed=0]"
-    board[cell] |= figures
-    path.write_text(json.dumps(plain))
+    changed = {name: Metric(value) for name, value in figures.items()}
+    records = [
+        replace(r, metrics=r.metrics | changed) if str(r.cell) == cell else r
+        for r in read_record_set(reference).records
+    ]
+    write_reference(records, path)
     return path
 
 
@@ -95,7 +98,7 @@ def test_equal_figures_pass_beside_the_repositorys_own_tests(run, pytester, refe
 
 
 def test_a_regression_is_a_failure_with_a_readable_message(run, pytester, reference):
-    worse = altered(reference, pytester.path / "worse.json", auc=1.5, far=1.0)
+    worse = altered(reference, pytester.path / "worse.jsonl", auc=1.5, far=1.0)
     result = run(
         "--oodd-detector", "persistence", "--oodd-reference", worse, "--oodd-split", "tiny",
         "--oodd-env", "hopper", "--oodd-fail", "auc:-0.01", "--oodd-fail", "far:0",
@@ -106,7 +109,7 @@ def test_a_regression_is_a_failure_with_a_readable_message(run, pytester, refere
         [
             r"_+ tiny/hopper/iid::persistence\[h=1,seed=0\] _+",
             r"auc worse: reference 1\.5, now 0\.\d+, ↓ 1\.\d+, tolerance -0\.01",
-            "the reference is .*worse.json; to run this cell alone:",
+            "the reference is .*worse.jsonl; to run this cell alone:",
             "oodd-eval run --detector persistence --env hopper --anomaly iid --split tiny .*",
         ],
         consecutive=True,
@@ -117,10 +120,10 @@ def test_a_regression_is_a_failure_with_a_readable_message(run, pytester, refere
 
 
 def test_an_improvement_fails_only_when_both_sides_count(cells, pytester, reference):
-    better = altered(reference, pytester.path / "better.json", far=1.0)
+    better = altered(reference, pytester.path / "better.jsonl", far=1.0)
     for two_sided in (False, True):
         own = cells(oodd_reference=str(better), oodd_env="hopper", oodd_two_sided=two_sided)
-        own._run(set(own.plan.cells))
+        own.run(set(own.cells))
         failing = {d.metric for found in own._differences.values() for d in found if d.fails}
         assert failing == ({"far"} if two_sided else set())
 
@@ -138,8 +141,8 @@ def oodd_detectors():
 def test_a_detector_that_fails_is_reported_with_its_state(cells, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "fails", FAILING)
     own = cells(oodd_detector="fails", oodd_env="hopper")
-    own._run(set(own.plan.cells))
-    for cell in own.plan.cells:
+    own.run(set(own.cells))
+    for cell in own.cells:
         with pytest.raises(
             Regression, match=r"^error: RuntimeError: no mood \(oodd_fails.py:\d+\)"
         ):
@@ -157,26 +160,22 @@ def test_collecting_fits_nothing(run, pytester, reference):
 
 
 def test_a_new_cell_is_skipped(cells, reference, tmp_path):
-    plain = json.loads(reference.read_text())
-    board = plain["boards"][0]["cells"]
-    del board["tiny/hopper/iid::persistence[h=1,seed=0]"]
-    (tmp_path / "less.json").write_text(json.dumps(plain))
-    own = cells(oodd_reference=str(tmp_path / "less.json"), oodd_env="hopper")
-    own._run(set(own.plan.cells))
-    first, *others = own.plan.cells
-    with pytest.raises(pytest.skip.Exception, match=r"not in .*less.json: nothing to compare with"):
+    cell = "tiny/hopper/iid::persistence[h=1,seed=0]"
+    less = [r for r in read_record_set(reference).records if str(r.cell) != cell]
+    write_reference(less, tmp_path / "less.jsonl")
+    own = cells(oodd_reference=str(tmp_path / "less.jsonl"), oodd_env="hopper")
+    own.run(set(own.cells))
+    first, *others = own.cells
+    with pytest.raises(pytest.skip.Exception, match=r"not in .*less.jsonl: nothing"):
         own.check(first, None)
     for cell in others:
         own.check(cell, None)
 
 
 def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, reference, tmp_path):
-    text = reference.read_text().replace("[h=1,seed=0]", "[h=10,seed=3]")
-    plain = json.loads(text)
-    board = plain["boards"][0]["cells"]
-    plain["boards"][0]["cells"] = {c: f for c, f in board.items() if "/hopper/" in c}
-    (tmp_path / "r.json").write_text(json.dumps(plain))
-    found = cells(oodd_reference=str(tmp_path / "r.json")).plan.cells
+    own = [r for r in read_record_set(reference).records if r.environment == "hopper"]
+    write_reference([replace(r, horizon=10, seed=3) for r in own], tmp_path / "r.jsonl")
+    found = cells(oodd_reference=str(tmp_path / "r.jsonl")).cells
     assert len(found) == 8
     assert found[0] == "tiny/hopper/iid::persistence[h=10,seed=3]"
 
@@ -186,7 +185,7 @@ def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, refer
     [
         ({"oodd_detector": "persistenc"}, "unknown detector 'persistenc': did you mean 'persis"),
         ({"oodd_detector": "clock"}, "has no cell of clock, only of persistence: write one with"),
-        ({"oodd_reference": "none.json"}, "no results or reference at 'none.json'"),
+        ({"oodd_reference": "none.jsonl"}, "no results or reference at 'none.jsonl'"),
         ({"oodd_split": "mini"}, r"nothing in common: .* has split tiny \w+, protocol 1, expected"),
         ({"oodd_split": "huge"}, "huge"),
         ({"oodd_env": "hoper"}, "unknown environment 'hoper': did you mean 'hopper'"),
@@ -200,10 +199,10 @@ def test_what_cannot_be_done_is_a_usage_error(cells, reference, options, message
 
 
 def test_a_reference_of_other_parameters_only_is_a_usage_error(cells, reference, tmp_path):
-    text = reference.read_text().replace("seed=0]", "seed=0,size=3]")
-    (tmp_path / "r.json").write_text(text)
+    others = [replace(r, overrides={"size": 3}) for r in read_record_set(reference).records]
+    write_reference(others, tmp_path / "r.jsonl")
     with pytest.raises(pytest.UsageError, match="only cells with parameters of their own"):
-        cells(oodd_reference=str(tmp_path / "r.json"))
+        cells(oodd_reference=str(tmp_path / "r.jsonl"))
 
 
 def test_a_broken_plugin_is_named_when_a_detector_is_unknown(cells, monkeypatch, tmp_path):

@@ -3,75 +3,76 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
+from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UsageError
+from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression
-from oodd_eval.results.record import Record
-from oodd_eval.results.regression import junit
-from oodd_eval.results.regression import rendering as differences
-from oodd_eval.results.regression.differences import Comparison, NothingInCommonError, compare
-from oodd_eval.results.regression.figures import read_figures, read_records, write_reference
-from oodd_eval.results.regression.tolerance import KNOWN, parse_tolerances
+from oodd_eval.results import regression
+from oodd_eval.results.regression import rendering
+from oodd_eval.results.regression.reference import RecordSet, read_record_set, write_reference
+
+
+def define(parser: Parser) -> None:
+    """Add the options."""
+    # fmt: off
+    add = parser.options(run)
+    add("results", metavar="DIR", help="results directory or file of records")
+    add("--against", metavar="REFERENCE", help="likewise: what the results should come up to")
+    add("--fail", action="append", default=[], metavar="METRIC:[+-]NUMBER[%]",
+        help="fail when the metric changed by more in the direction of the sign: auc:-0.01, "
+             "delay:+10%% (default: when any metric is worse at all)")
+    add("--two-sided", action="store_true",
+        help="fail for improvements beyond the tolerance, too")
+    add("--by", choices=("cell", "group", "mean"), default="cell",
+        help="compare cells, means over the anomalies of a group in an environment, or means "
+             "over all cells (default: cell)")
+    add("-k", dest="expression", metavar="EXPR", help=EXPRESSION)
+    add("--junit", metavar="FILE", help="write JUnit XML, a test case per cell and metric")
+    add("--markdown", metavar="FILE", help="write Markdown, for a pull request")
+    add("--write-reference", metavar="FILE",
+        help="write a small file of records to compare with later")
+    # fmt: on
 
 
 def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval compare``: 1 when the comparison fails, 5 when there is nothing in it.
-
-    A reference is written last, so that a file can be compared with and then replaced.
-    """
+    """Carry out ``oodd-eval compare``; 1 when the comparison fails, 5 when nothing is in it."""
     if not options.against and not options.write_reference:
         raise UsageError("nothing to do: expected --against REFERENCE or --write-reference FILE")
-    code = _compare(options) if options.against else 0
+    wanted = expression(options.expression) if options.expression else None
+    now = read_record_set(options.results).selected(wanted)
+    code = 0
+    if options.against:
+        code = _compare(now, read_record_set(options.against).selected(wanted), options)
+    # Last, so that a file can be compared with and then replaced.
     if options.write_reference:
-        records = _selected(read_records(options.results), options.expression)
-        if not records:
-            return _nothing(f"no record of {options.results} is selected: no reference written")
-        write_reference(records, options.write_reference)
+        if not now.records:
+            return say(f"no record of {options.results} is selected: no reference written", 5)
+        write_reference(now.records, options.write_reference)
         if options.verbosity >= 0:
-            make_console().print(f"{len(records)} cells written to {options.write_reference}")
+            print(f"{len(now.records)} cells written to {options.write_reference}")
     return code
 
 
-def _compare(options: argparse.Namespace) -> int:
-    wanted = expression(options.expression) if options.expression else None
-    now = read_figures(options.results).selected(wanted)
-    reference = read_figures(options.against).selected(wanted)
-    known = dict.fromkeys((*KNOWN, *reference.metrics()))
-    tolerances = parse_tolerances(options.fail, known)
+def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) -> int:
+    known = dict.fromkeys((*NAMES, *reference.metrics()))
+    tolerances = regression.parse_tolerances(options.fail, known)
+    judged_by = {"by": options.by, "two_sided": options.two_sided}
     try:
-        found = compare(
-            now, reference, tolerances, by=options.by, two_sided=options.two_sided
-        )  # fmt: skip
-    except NothingInCommonError as error:
-        return _nothing(str(error))
-    _write(found, options)
-    console = make_console()
-    if options.verbosity < 0:
-        console.print(differences.summary(found))
-    else:
-        differences.show(found, console, everything=options.verbosity > 0)
-    return int(bool(found.failures))
-
-
-def _write(comparison: Comparison, options: argparse.Namespace) -> None:
-    for path, render in ((options.junit, junit.render), (options.markdown, differences.render)):
-        if not path:
-            continue
+        found = regression.compare(now, reference, tolerances, **judged_by)
+    except regression.NothingInCommonError as error:
+        return say(str(error), 5)
+    for path, render in ((options.junit, rendering.junit), (options.markdown, rendering.markdown)):
         try:
-            Path(path).write_text(render(comparison), encoding="utf-8")
+            if path:
+                Path(path).write_text(render(found), encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{path!r} cannot be written: {error.strerror}") from None
-
-
-def _selected(records: Sequence[Record], text: str | None) -> list[Record]:
-    wanted = expression(text) if text else None
-    return [r for r in records if wanted is None or wanted(str(r.cell))]
-
-
-def _nothing(message: str) -> int:
-    print(f"oodd-eval: {message}", file=sys.stderr)  # noqa: T201  the program's voice
-    return 5
+    console = make_console()
+    if options.verbosity < 0:
+        console.print(rendering.summary(found))
+    else:
+        rendering.show(found, console, everything=options.verbosity > 0)
+    return int(bool(found.failures))

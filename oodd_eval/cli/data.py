@@ -1,13 +1,19 @@
-"""``oodd-eval data``: build, verify, fetch, export and describe splits."""
+"""``oodd-eval data``: build, verify, fetch and export splits, and describe them."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from oodd_eval.cli import Parser, at_least
 from oodd_eval.cli.terminal import make_console
+from oodd_eval.data.export import export as export_split
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.fetch import fetch as fetch_split
+from oodd_eval.data.info import describe
+from oodd_eval.data.simulate.build import build_split
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import select
@@ -16,127 +22,116 @@ SEED_BASES: Final = range(4, 900)
 """Free bases: published splits have those below, policies are trained and evaluated above."""
 
 
+def define(parser: Parser) -> None:
+    """Add the actions and their options."""
+    # fmt: off
+    action = parser.nested("action")
+    split = "name or path of a split"
+    place = "directory of the split (default: where splits are found)"
+    add = action("build", "record a split (needs the extra sim)").options(build)
+    add("name", help="a published split, or a new name with sizes and a seed base of its own")
+    add("--train", type=int, metavar="N", help="training trajectories per environment")
+    add("--calibration", type=int, metavar="N", help="calibration trajectories per environment")
+    add("--test", type=int, metavar="N", help="test seeds per environment")
+    add("--cap", type=int, metavar="T", help="longest episode (default: the simulator's)")
+    add("--seed-base", type=int, metavar="K", help="base of the seeds, apart from published ones")
+    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
+    add("--output", type=Path, metavar="DIR", help=place)
+    action("verify", "compare a split with its digests").options(verify)("name", help=split)
+    add = action("fetch", "verify a copy of a split and install it").options(fetch)
+    add("place", metavar="FILE|DIR|URL", help="a split's directory, or a tar or zip archive of it")
+    add("--digest", metavar="SHA256", help="the split's digest; another one is refused")
+    add("--output", type=Path, metavar="DIR", help=place)
+    add = action("export", "write a split in another project's format").options(export)
+    add("name", help=split)
+    add("--format", required=True, choices=["minari"], help="minari: one dataset a part")
+    add("--output", required=True, type=Path, metavar="DIR", help="root of the datasets")
+    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    action("info", "describe a split").options(info)("name", help=split)
+    # fmt: on
+
+
 def build(options: argparse.Namespace) -> int:
     """Carry out ``data build``; what an earlier call has recorded is kept."""
-    definition = _definition(options)
     environments = select("environment", options.env, ENVIRONMENTS)
-    if options.jobs is not None and options.jobs < 1:
-        raise UsageError(f"--jobs is {options.jobs}, expected at least 1")
-    directory = Path(options.output) if options.output else data_home() / definition.name
-    console = make_console()
-
-    def progress(done: int, total: int, what: str) -> None:
-        if options.verbosity >= 0:
-            console.print(f"{done}/{total}  {what}")
-
-    from oodd_eval.data.simulate.build import build_split  # noqa: PLC0415  an extra
-
-    build_split(
-        definition, directory, environments=environments, jobs=options.jobs, progress=progress
-    )
-    split = load_split(directory)
-    console.print(f"split {split.name}, digest {split.digest}, in {directory}")
+    record_split(_definition(options), options, environments, options.output)
     return 0
 
 
+def record_split(
+    definition: SplitDefinition, options: argparse.Namespace,
+    environments: Sequence[str] = tuple(ENVIRONMENTS), output: Path | None = None,
+) -> None:  # fmt: skip
+    """Record a split, by default of all environments and where splits are found."""
+    directory = output or data_home() / definition.name
+    notes = make_console(quiet=options.verbosity < 0)
+    build_split(definition, directory, environments=environments, jobs=options.jobs,
+                progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"))  # fmt: skip
+    split = load_split(directory)
+    make_console().print(f"split {split.name}, digest {split.digest}, in {directory}")
+
+
 def _definition(options: argparse.Namespace) -> SplitDefinition:
+    """Return the definition of a published split, or of one with sizes of its own."""
+    name, cap = options.name, options.cap
     sizes = {"train": options.train, "calibration": options.calibration, "test": options.test,
              "seed-base": options.seed_base}  # fmt: skip
-    if options.name in SPLITS:
-        given = [n for n, v in {**sizes, "cap": options.cap}.items() if v is not None]
-        if given:
-            raise UsageError(
-                f"split {options.name!r} is published: --{given[0]} would make another; give that "
-                "a name of its own"
-            )
-        return SPLITS[options.name]
-    missing = [f"--{name}" for name, value in sizes.items() if value is None]
-    if missing:
+    if name in SPLITS:
+        if given := [n for n, size in {**sizes, "cap": cap}.items() if size is not None]:
+            other = f"--{given[0]} would make another; give that a name of its own"
+            raise UsageError(f"split {name!r} is published: {other}")
+        return SPLITS[name]
+    if missing := [f"--{n}" for n, size in sizes.items() if size is None]:
+        known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
+        raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
+    train, calibration, test, seed_base = sizes.values()
+    if seed_base not in SEED_BASES:
         raise UsageError(
-            f"split {options.name!r} is not a published one ({', '.join(SPLITS)}): to define it, "
-            f"{', '.join(missing)} must be given"
+            f"--seed-base is {seed_base}, expected {SEED_BASES.start} to {SEED_BASES.stop - 1}: "
+            "other bases are those of published splits and policies"
         )
-    if options.seed_base not in SEED_BASES:
-        raise UsageError(
-            f"--seed-base is {options.seed_base}, expected {SEED_BASES.start} to "
-            f"{SEED_BASES.stop - 1}: other bases are those of published splits and policies"
-        )
-    if not options.name.isprintable() or set(options.name) & set("/@: "):
-        raise UsageError(f"{options.name!r} cannot be a split's name: it holds one of '/@: '")
-    return SplitDefinition(
-        options.name,
-        options.train,
-        options.calibration,
-        options.test,
-        options.cap,
-        options.seed_base,
-    )
+    if not name.isprintable() or set(name) & set("/@: "):
+        raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
+    return SplitDefinition(name, train, calibration, test, cap, seed_base)
 
 
 def verify(options: argparse.Namespace) -> int:
     """Carry out ``data verify``; 1 when a group's content is not what the manifest names."""
     console = make_console()
-    split = load_split(_place(options.name))
+    split = load_split(options.name)
     checks = list(split.verify())
     for check in checks:
-        if not check.ok:
-            console.print(
-                f"{check.file}, {check.group}: expected {check.expected}, found {check.found}"
-            )
-        elif options.verbosity > 0:
-            console.print(f"{check.file}, {check.group}: {check.found}")
-    wrong = sum(not check.ok for check in checks)
-    console.print(
-        f"split {split.name}, digest {split.digest}: {len(checks) - wrong} of {len(checks)} groups "
-        "as they should be"
-    )
-    return int(wrong > 0)
+        if options.verbosity > 0 or not check.ok:
+            expected = "" if check.ok else f"expected {check.expected}, found "
+            console.print(f"{check.file}, {check.group}: {expected}{check.found}")
+    good = f"{sum(check.ok for check in checks)} of {len(checks)} groups as they should be"
+    console.print(f"split {split.name}, digest {split.digest}: {good}")
+    return int(not all(check.ok for check in checks))
 
 
 def fetch(options: argparse.Namespace) -> int:
     """Carry out ``data fetch``; what an earlier call has brought is kept."""
-    from oodd_eval.data.fetch import fetch as bring  # noqa: PLC0415  reads archives and the web
-
-    console = make_console()
-
-    def progress(file: str) -> None:
-        if options.verbosity >= 0:
-            console.print(f"{file}  verified")
-
-    output = Path(options.output) if options.output else None
-    found = bring(options.place, output=output, digest=options.digest, progress=progress)
+    notes = make_console(quiet=options.verbosity < 0)
+    found = fetch_split(options.place, output=options.output, digest=options.digest,
+                        progress=lambda file: notes.print(f"{file}  verified"))  # fmt: skip
     split, there = found.split, " already" if found.already else ""
-    console.print(f"split {split.name}, digest {split.digest}, is{there} in {split.path}")
+    make_console().print(f"split {split.name}, digest {split.digest}, is{there} in {split.path}")
     return 0
 
 
 def export(options: argparse.Namespace) -> int:
     """Carry out ``data export``."""
-    from oodd_eval.data import export as minari  # noqa: PLC0415  writes HDF5
-
-    console = make_console()
-    split = load_split(_place(options.name))
-    written = minari.export(
-        split,
-        Path(options.output),
-        environments=select("environment", options.env, split.environments),
-        progress=lambda name: console.print(name) if options.verbosity >= 0 else None,
-    )
-    console.print(
-        f"{len(written)} datasets in {options.output}: Minari finds them with "
-        f"MINARI_DATASETS_PATH={options.output}"
-    )
+    split = load_split(options.name)
+    environments = select("environment", options.env, split.environments)
+    notes = make_console(quiet=options.verbosity < 0)
+    written = export_split(split, options.output, environments=environments, progress=notes.print)
+    told = f"Minari finds them with MINARI_DATASETS_PATH={options.output}"
+    make_console().print(f"{len(written)} datasets in {options.output}: {told}")
     return 0
 
 
 def info(options: argparse.Namespace) -> int:
     """Carry out ``data info``."""
-    from oodd_eval.results.tables.split_info import describe  # noqa: PLC0415  reads all returns
-
-    make_console().print(describe(load_split(_place(options.name))))
+    make_console().print(describe(load_split(options.name)))
     return 0
-
-
-def _place(name: str) -> str | Path:
-    """Take a text as a path when it is a directory and no name."""
-    return Path(name) if "/" in name or (Path(name) / "manifest.json").is_file() else name

@@ -1,48 +1,109 @@
-"""``oodd-eval leaderboard submit`` and ``verify``."""
+"""``oodd-eval leaderboard``: build the board, verify entries and submit one."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import tempfile
 from pathlib import Path
 from typing import Final
 
 from rich.console import Console
 
+from oodd_eval.cli import EXPRESSION, NAMES, Parser, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.entry import ENTRY
-from oodd_eval.leaderboard.verify import verify as verification
-from oodd_eval.leaderboard.verify.grant import grant
+from oodd_eval.leaderboard.build import STALE, differences, stale
+from oodd_eval.leaderboard.build import build as build_board
+from oodd_eval.leaderboard.entry import ENTRY, read_entries
+from oodd_eval.leaderboard.verify import verify as check
+from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
 from oodd_eval.results.directory import ResultsDirectory
+
+RESULTS: Final = "leaderboard/results"
+"""Directory of the entries, from the root of a checkout."""
+
+SPLIT: Final = "where the split is, if not at its usual place"
 
 MOST_SHOWN: Final = 30
 """Problems of an entry that are printed without -v."""
 
 
+def define(parser: Parser) -> None:
+    """Add the command, its actions and their options."""
+    # fmt: off
+    action = parser.nested("action")
+    add = action("build", "render tables and site from the entries").options(build)
+    add("results", nargs="?", default=RESULTS, metavar="RESULTS_DIR",
+        help=f"directory of the entries (default: {RESULTS})")
+    add("--output", default="leaderboard", metavar="DIR",
+        help="where to write (default: leaderboard)")
+    add("--check", action="store_true", help="write nothing, exit 1 where something would change")
+    add = action("verify", "check entries as data, running none of their code").options(verify)
+    add("paths", nargs="+", metavar="PATH", help="an entry, or a directory of entries")
+    add("--split", metavar="PATH", help=SPLIT)
+    add("--rerun", metavar="DIR", help="results of a run of your own to compare one entry with")
+    add("--grant", default="", metavar="NAME",
+        help="write the trust level that was reached into the entry, in this name")
+    add = action("submit", "write an entry from a results directory").options(submit)
+    add("directory", metavar="DIR", help="results directory, written by oodd-eval run or reproduce")
+    add("--results", default=RESULTS, metavar="RESULTS_DIR",
+        help=f"directory of the entries (default: {RESULTS})")
+    add("--detector", dest="detectors", default="all", metavar="NAMES",
+        help=f"{NAMES} (default: all)")
+    add("-k", dest="cells", default="", metavar="EXPR", help=EXPRESSION)
+    add("--complete", action="store_true",
+        help="leave out those seeds of a row that lack cells which others have")
+    add("--id", default="", metavar="ID",
+        help="name of the entry's directory (default: detectors and split)")
+    add("--title", default="", metavar="TEXT", help="one line, shown on the board")
+    add("--submitter", default="", metavar="TEXT", help="who stands behind the results")
+    add("--citation", default="", metavar="TEXT", help="how to cite the method")
+    add("--url", default="", metavar="URL", help="page of the method or its code")
+    add("--caption", default="", metavar="TEXT",
+        help="a note above the tables, such as a reduced setting")
+    add("--scores", action="store_true",
+        help="include every score, so that others can recompute the metrics")
+    add("--split", metavar="PATH", help=SPLIT)
+    add("--trust", default="reported", choices=("reported", "re-scored"),
+        help="trust level to claim; re-scored needs --scores (default: reported)")
+    add("--curves", default="rows", choices=("rows", "detectors", "none"),
+        help="curves for the site: of every row, of each detector's plainest row, or none "
+             "(default: rows)")
+    # fmt: on
+
+
+def build(options: argparse.Namespace) -> int:
+    """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
+    entries = read_entries(options.results)
+    if not entries:
+        return say(f"no entries in {options.results}", 5)
+    output = Path(options.output)
+    if not options.check:
+        written = build_board(entries, output)
+        if options.verbosity >= 0:
+            print("\n".join(str(output / name) for name in written))
+        for name in stale(output, written):
+            say(f"{output / name} is {STALE}: delete it", 0)
+        return 0
+    with tempfile.TemporaryDirectory() as fresh:
+        build_board(entries, Path(fresh))
+        lines = differences(Path(fresh), output)
+    print("\n".join(lines) if lines else f"{output} is up to date")
+    if not lines:
+        return 0
+    advice = "run leaderboard build, delete what is no part of it, and commit"
+    return say(f"{output} is not what its entries say: {advice}", 1)
+
+
 def submit(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard submit``; 1 when what was written did not pass."""
-    statement = submission.Statement(
-        id=options.id or "",
-        title=options.title,
-        submitter=options.submitter,
-        citation=" ".join(options.citation.split()),
-        url=options.url,
-        caption=options.caption,
-        trust=options.trust,
-    )
-    made = submission.submit(
-        options.directory,
-        options.results,
-        statement,
-        detectors=options.detector,
-        cells=options.expression,
-        complete=options.complete,
-        scores=options.scores,
-        curves=options.curves,
-        split=options.split,
-    )
+    options.citation = " ".join(options.citation.split())
+    texts = ("id", "title", "submitter", "citation", "url", "caption", "trust")
+    statement = submission.Statement(**{name: getattr(options, name) for name in texts})
+    chosen = ("detectors", "cells", "complete", "scores", "curves", "split")
+    how = {name: getattr(options, name) for name in chosen}
+    made = submission.submit(options.directory, options.results, statement, **how)
     console, place = make_console(), made.place
     for line in made.left_out if options.verbosity >= 0 else ():
         console.print(f"left out: {line}")
@@ -51,13 +112,12 @@ def submit(options: argparse.Namespace) -> int:
         console.print(f"nothing was written to {place}")
         return 1
     if options.verbosity >= 0:
-        if made.size > submission.LARGE:
-            console.print(
-                "  note: an entry as large as this is a burden to the repository: leave the "
-                "scores or some curves out (--curves), or submit fewer rows"
-            )
+        size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file())
+        if size > submission.LARGE:
+            advice = "leave the scores or some curves out (--curves), or submit fewer rows"
+            console.print(f"  note: so large an entry is a burden to the repository: {advice}")
         console.print(
-            f"\nwritten to {place}, {made.size / 1e6:.2g} MB; next:\n"
+            f"\nwritten to {place}, {size / 1e6:.2g} MB; next:\n"
             f"  oodd-eval leaderboard build {place.parent}\n"
             f"  git add {place}\n"
             "look at the tables, commit both, and open a pull request (docs/submitting.md)"
@@ -73,19 +133,13 @@ def verify(options: argparse.Namespace) -> int:
         raise UsageError(f"--rerun: {options.rerun!r} has no records")
     if (options.rerun or options.grant) and len(options.paths) > 1:
         raise UsageError("--rerun and --grant are for one entry: name a single PATH")
-    verdicts = [
-        verdict
-        for path in options.paths
-        for verdict in verification.verify(
-            path,
-            split=options.split,
-            rerun=fresh,
-            progress=lambda verdict: report(console, verdict, options.verbosity),
-        )
-    ]
+    verdicts = []
+    for path in options.paths:
+        for verdict in check(path, split=options.split, rerun=fresh):
+            verdicts.append(verdict)
+            report(console, verdict, options.verbosity)
     if not verdicts:
-        print(f"oodd-eval: no entries in {', '.join(options.paths)}", file=sys.stderr)  # noqa: T201
-        return 5
+        return say(f"no entries in {', '.join(options.paths)}", 5)
     if options.grant:
         if len(verdicts) > 1:
             raise UsageError("--grant is for one entry: name it, not the directory of entries")
@@ -98,26 +152,21 @@ def verify(options: argparse.Namespace) -> int:
     return int(refused > 0)
 
 
-def report(console: Console, verdict: verification.Verdict, verbosity: int) -> None:
+def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     """Print what was found for one entry, every problem with its entry, place and field."""
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
-        cells = len(verdict.records or {})
-        console.print(
-            f"{verdict.name}: valid, {cells} cells of {', '.join(entry.detectors)} on "
-            f"{entry.split}, trust {entry.trust}"
-        )
+        cells = f"{len(verdict.records)} cells of {', '.join(entry.detectors)}"
+        console.print(f"{verdict.name}: valid, {cells} on {entry.split}, trust {entry.trust}")
         if verdict.rerun is not None or verdict.rescored:
             console.print(f"  trust level established here: {verdict.reached}")
     else:
         console.print(f"{verdict.name}: refused, {findings.count} problems")
     shown = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
-    for problem in shown:
-        console.print(f"  {verdict.name}: {problem.text}")
+    lines = [f"{verdict.name}: {problem.text}" for problem in shown]
     if findings.count > len(shown):
-        console.print(f"  and {findings.count - len(shown)} more")
-    for line in verdict.rerun.lines if verdict.rerun is not None else ():
-        console.print(f"  re-run: {line}")
-    if verbosity >= 0:
-        for note in findings.notes:
-            console.print(f"  note: {note}")
+        lines.append(f"and {findings.count - len(shown)} more")
+    lines += [f"re-run: {line}" for line in (verdict.rerun.lines if verdict.rerun else ())]
+    lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]
+    for line in lines:
+        console.print(f"  {line}")

@@ -3,88 +3,82 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
-from typing import Final
+from collections.abc import Iterable
+from dataclasses import asdict
 
-from oodd_eval.cli.discovery import discovered
+from oodd_eval.cli import Parser
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins.discovery import Plugins
+from oodd_eval.metrics.catalogue import CALIBRATED, METRICS, TARGETS
+from oodd_eval.plugins.discovery import Plugins, discover
+
+Rows = Iterable[tuple[str, ...]]
+
+
+def define(parser: Parser) -> None:
+    """Add the options."""
+    add = parser.options(run, plugins=True)
+    add("what", metavar="detectors|envs|anomalies|splits|metrics")
 
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval list``; 1 when a plug-in is broken."""
-    if options.what == "detectors":
-        plugins = discovered(options.plugins)
-        _print(_detectors(plugins))
-        return int(bool(plugins.broken))
-    if options.what not in _KINDS:
-        raise UnknownNameError("thing to list", options.what, ["detectors", *_KINDS])
-    _print(_KINDS[options.what]())
-    return 0
-
-
-def _detectors(plugins: Plugins) -> Iterable[tuple[str, ...]]:
-    for name, offer in plugins.offers.items():
-        reason = offer.unavailable()
-        note = f"[unavailable: {reason}] " if reason else ""
-        yield name, offer.origin, note + offer.spec.summary
-    for plugin, origin, forms in plugins.spec_forms():
-        yield f"({plugin})", origin, forms
-    for broken in plugins.broken:
-        yield broken.plugin, broken.distribution, f"[broken plug-in] {broken.reason}"
-
-
-def _environments() -> Iterable[tuple[str, ...]]:
-    for e in ENVIRONMENTS.values():
-        yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
-
-
-def _anomalies() -> Iterable[tuple[str, ...]]:
-    for a in ANOMALIES.values():
-        yield a.id, a.group, a.summary
-
-
-def _splits() -> Iterable[tuple[str, ...]]:
-    # h5py is imported here only: the other listings stay quick.
-    from oodd_eval.data.split import load_split, split_directories  # noqa: PLC0415
-
-    here = split_directories()
-    for name in dict.fromkeys([*SPLITS, *here]):
-        if name in here:
-            split = load_split(name)
-            d = split.manifest["definition"]
-            where = f"{len(split.environments)} environments, digest {split.digest[:12]}"
-        else:
-            s = SPLITS[name]
-            d = {"train": s.train, "calibration": s.calibration, "test": s.test}
-            where = f"not here: oodd-eval data build {name}"
-        sizes = f"{d['train']} train, {d['calibration']} calibration, {d['test']} test seeds"
-        yield name, sizes, where
-
-
-def _metrics() -> Iterable[tuple[str, ...]]:
-    from oodd_eval.metrics.alarms import CALIBRATED, TARGETS  # noqa: PLC0415  likewise
-    from oodd_eval.metrics.auc import METRICS, POOLED  # noqa: PLC0415  likewise
-
-    yield from (METRICS | POOLED).items()
-    for suffix, target in TARGETS.items():
-        at = f"alarms at a calibrated false-alarm rate of {100 * target:g} %"
-        yield f"..._{suffix}", f"{', '.join(CALIBRATED)}: {at}"
-        yield f"threshold_{suffix}", "the CUSUM threshold of that rate"
-
-
-_KINDS: Final[dict[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
-    "envs": _environments,
-    "anomalies": _anomalies,
-    "splits": _splits,
-    "metrics": _metrics,
-}
-
-
-def _print(rows: Iterable[tuple[str, ...]]) -> None:
+    rows: Rows
+    code = 0
+    match options.what:
+        case "detectors":
+            plugins = discover(options.disabled)
+            rows = list(_detectors(plugins))
+            code = int(bool(plugins.broken))
+        case "envs":
+            rows = [(e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy")
+                    for e in ENVIRONMENTS.values()]  # fmt: skip
+        case "anomalies":
+            rows = [(a.id, a.group, a.summary) for a in ANOMALIES.values()]
+        case "splits":
+            rows = _splits()
+        case "metrics":
+            rows = _metrics()
+        case _:
+            kinds = "detectors", "envs", "anomalies", "splits", "metrics"
+            raise UnknownNameError("thing to list", options.what, kinds)
     lines = list(rows)
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
-        print("  ".join(cells).rstrip())  # noqa: T201  the program's voice
+        print("  ".join(cells).rstrip())
+    return code
+
+
+def _detectors(plugins: Plugins) -> Rows:
+    for name, offer in plugins.offers.items():
+        why = offer.unavailable()
+        yield name, offer.origin, (f"[unavailable: {why}] " if why else "") + offer.spec.summary
+    for name, origin, forms in plugins.spec_forms():
+        yield f"({name})", origin, forms
+    yield from ((b.plugin, b.distribution, f"[broken plug-in] {b.reason}") for b in plugins.broken)
+
+
+def _splits() -> Rows:
+    # Listing is quick: these need numpy.
+    from oodd_eval.data.layout import read_manifest
+    from oodd_eval.data.split import split_directories
+
+    here = split_directories()
+    for name in dict.fromkeys([*SPLITS, *here]):
+        if name in here:
+            manifest = read_manifest(here[name])
+            sizes, digest = manifest["definition"], manifest["digest"][:12]
+            where = f"{len(manifest['environments'])} environments, digest {digest}"
+        else:
+            sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"
+        text = "{train} train, {calibration} calibration, {test} test seeds"
+        yield name, text.format_map(sizes), where
+
+
+def _metrics() -> Rows:
+    yield from ((name, info.summary) for name, info in METRICS.items())
+    for suffix, target in TARGETS.items():
+        at = f"alarms at a calibrated false-alarm rate of {100 * target:g} %"
+        yield f"..._{suffix}", f"{', '.join(CALIBRATED)}: {at}"
+        yield f"threshold_{suffix}", "the CUSUM threshold of that rate"

@@ -1,119 +1,92 @@
-"""The command line: what can be asked, and which exit code is the answer.
-
-Handlers live in `oodd_eval.cli` and are imported when called, so that help is quick.
-"""
+"""The entry point: read the command line, carry it out, and return its exit code."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import os
+import shlex
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Container, Sequence
 from importlib import import_module
-from types import ModuleType
 from typing import Final
 
 from oodd_eval._version import __version__
-from oodd_eval.cli.options import (
-    Parser,
-    check,
-    choices,
-    compare,
-    data,
-    leaderboard,
-    new,
-    policies,
-    reproduce,
-    running,
-)
-from oodd_eval.errors import OoddError, UnknownNameError
+from oodd_eval.cli import Parser, say
+from oodd_eval.errors import OoddError
 
 EXIT_CODES: Final = """exit codes:
   0  ok
   1  a cell, check or comparison failed, or a plug-in is broken
-  2  interrupted, or nobody reads the output any more
+  2  interrupted (Ctrl-C), or output pipe closed
   3  internal error
   4  the request cannot be carried out: unknown name, missing data, no place to write
   5  nothing was selected or compared"""
 
-FAMILIES: Final = (running, check, compare, leaderboard, data, policies, reproduce, new)
-"""Modules of options, in the order of the help."""
+COMMANDS: Final = (
+    ("run", "run", "fit and score every selected cell"),
+    ("list", "listing", "list what there is, one line each"),
+    ("show", "show", "print the tables of earlier results from stored scores"),
+    ("check", "check", "check that a detector honours the contract"),
+    ("compare", "compare", "compare results with a reference"),
+    ("leaderboard", "leaderboard", "submit, verify and show entries of the board"),
+    ("data", "data", "build, verify, fetch and export splits"),
+    ("policies", "policies", "train and evaluate nominal policies"),
+    ("reproduce", "reproduce",
+     "regenerate the paper's tables, figures and claims; resumes where it was"),
+    ("new", "new", "write a ready plug-in project"),
+)  # fmt: skip
 
 
-def build_parser() -> Parser:
-    """Return the parser of the whole command line."""
+def build_parser(named: Container[str] | None = None) -> Parser:
+    """Return the parser of the command line: with the options of all commands, or of some."""
     parser = Parser(
         prog="oodd-eval",
         description="Evaluate detectors of out-of-distribution dynamics on frozen trajectories.",
         epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"oodd-eval {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for family in FAMILIES:
-        family.add(commands)
+    add_command = parser.nested("command")
+    for name, module, summary in COMMANDS:
+        command = add_command(name, summary)
+        if named is None or name in named:
+            import_module(f"oodd_eval.cli.{module}").define(command)
     return parser
 
 
-def _check_command(parser: Parser, arguments: Sequence[str]) -> None:
-    """Name the nearest command for an unknown one, which argparse does not."""
-    what = "command"
-    for argument in arguments:
-        known = choices(parser)
-        if not known or argument.startswith("-"):
-            return
-        if argument not in known:
-            raise UnknownNameError(what, argument, known)
-        what, parser = f"action of {argument}", known[argument]
+def _parse(given: Sequence[str]) -> argparse.Namespace:
+    parser = build_parser(given[:1])
+    parsed = parser.parse_args(given)
+    if getattr(parsed, "config", None):
+        # The command line comes last, so that it wins.
+        parsed = parser.parse_args([given[0], *parsed.options_of(parsed.config), *given[1:]])
+    parsed.invocation = shlex.join(["oodd-eval", *given])
+    return parsed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Carry out a command line and return its exit code.
-
-    Parameters
-    ----------
-    arguments
-        Without the program's name; None means those of this process.
-    """
+    """Carry out a command line, by default this process's, and return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        parser = build_parser()
-        _check_command(parser, given)
-        parsed = parser.parse_args(given)
-        if getattr(parsed, "config", None):
-            options = _module("config").options_of(parsed.config)
-            parsed = build_parser().parse_args(["run", *options, *given[1:]])
-        module, _, function = parsed.handler.partition(":")
-        handler: Callable[[argparse.Namespace], int] = getattr(_module(module), function)
-        code = handler(parsed)
+        options = _parse(given)
+        code: int = options.handler(options)
         sys.stdout.flush()
     except SystemExit as error:  # argparse's --help and --version
         return error.code if isinstance(error.code, int) else 0
     except KeyboardInterrupt:
-        return _say("interrupted", 2)
+        return say("interrupted", 2)
     except BrokenPipeError:
-        # Whoever read the output has seen enough; nothing more can be written, not even at exit.
+        # Nothing more can be written to the closed pipe, not even when Python exits.
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 2
     except OoddError as error:
         if "-v" in given:
             traceback.print_exc()
-        return _say(str(error), 4)
+        return say(str(error), 4)
     except Exception:  # noqa: BLE001  the outermost: everything unforeseen ends here
         traceback.print_exc()
-        return _say("internal error, please report it with the lines above", 3)
-    return code
-
-
-def _module(name: str) -> ModuleType:
-    room = "leaderboard.build" if name == "leaderboard_build" else f"cli.{name}"
-    return import_module(f"oodd_eval.{room}")
-
-
-def _say(message: str, code: int) -> int:
-    print(f"oodd-eval: {message}", file=sys.stderr)  # noqa: T201  the program's voice
+        return say("internal error, please report it with the lines above", 3)
     return code

@@ -5,51 +5,46 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from oodd_training.train import train_policy
+
+from oodd_eval.cli import Parser, at_least
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.data.simulate.policies import load_policy
+from oodd_eval.data.simulate.record import evaluate_policy
+
+
+def define(parser: Parser) -> None:
+    """Add the actions and their options."""
+    # fmt: off
+    action = parser.nested("action")
+    add = action("train", "train a policy (needs the extra train)").options(train)
+    add("environment", metavar="ENV")
+    add("--output", default="policies", metavar="DIR", help="checkpoint and best policy")
+    add("--steps", type=int, metavar="N", help="environment steps in all")
+    add("--seed", type=int, default=1, metavar="N")
+    add = action("evaluate", "mean return of a policy").options(evaluate)
+    add("environment", metavar="ENV")
+    add("--policy", metavar="FILE", help="policy file (default: the frozen one)")
+    add("--episodes", type=at_least(1), default=100, metavar="N",
+        help="fresh episodes (default: 100)")
+    # fmt: on
 
 
 def train(options: argparse.Namespace) -> int:
     """Carry out ``policies train``, going on from a checkpoint if there is one."""
-    _check(options.environment)
-    console = make_console()
-
-    def progress(line: str) -> None:
-        if options.verbosity >= 0:
-            console.print(line)
-
-    from oodd_eval.data.simulate.train import train_policy  # noqa: PLC0415  an extra
-
-    best = train_policy(
-        options.environment,
-        out=Path(options.output),
-        steps=options.steps,
-        seed=options.seed,
-        progress=progress,
-    )
-    console.print(f"best policy in {best}")
+    tell = make_console(quiet=options.verbosity < 0).print
+    best = train_policy(options.environment, out=Path(options.output), steps=options.steps,
+                        seed=options.seed, progress=tell)  # fmt: skip
+    make_console().print(f"best policy in {best}")
     return 0
 
 
 def evaluate(options: argparse.Namespace) -> int:
     """Carry out ``policies evaluate``: mean return over fresh nominal episodes."""
-    _check(options.environment)
-    if options.episodes < 1:
-        raise UsageError(f"--episodes is {options.episodes}, expected at least 1")
-    from oodd_eval.data.simulate.policies import load_policy  # noqa: PLC0415  an extra
-    from oodd_eval.data.simulate.train import evaluate_policy  # noqa: PLC0415  an extra
-
-    policy = load_policy(options.environment, options.policy)
-    found = evaluate_policy(options.environment, policy, episodes=options.episodes)
-    paper = ENVIRONMENTS[options.environment].paper_return
-    make_console().print(
-        f"{options.environment}: return {found.mean:.1f} ± {found.std:.1f} over "
-        f"{options.episodes} episodes (paper: {paper})"
-    )
+    name = options.environment
+    policy = load_policy(name, options.policy)
+    found = evaluate_policy(name, policy, episodes=options.episodes)
+    mean, paper = f"{found.mean():.1f} ± {found.std():.1f}", ENVIRONMENTS[name].paper_return
+    make_console().print(f"{name}: return {mean} over {options.episodes} episodes (paper: {paper})")
     return 0
-
-
-def _check(environment: str) -> None:
-    if environment not in ENVIRONMENTS:
-        raise UnknownNameError("environment", environment, ENVIRONMENTS)

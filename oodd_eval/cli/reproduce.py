@@ -5,109 +5,110 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.console import Console
-
-from oodd_eval.cli import data
-from oodd_eval.cli.discovery import discovered, report_broken
-from oodd_eval.cli.run import DEVICES
-from oodd_eval.cli.terminal import TerminalReporter, make_console
+from oodd_eval.cli import Parser, add_resources, value
+from oodd_eval.cli.data import record_split
+from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UnknownNameError, UsageError
-from oodd_eval.names import memory_bytes, seconds, select
-from oodd_eval.paper import header as headers
-from oodd_eval.paper import returns
-from oodd_eval.paper.carry import Outcome, Watch, carry_out
-from oodd_eval.paper.costs import duration, scored_rows
-from oodd_eval.paper.experiments import EXPERIMENTS, IDS, TIERS, Tier, setups_of
-from oodd_eval.paper.gathering import gather
-from oodd_eval.paper.header import Header
-from oodd_eval.paper.publish import publish, put
-from oodd_eval.paper.schedule import (
-    STAGES,
-    Work,
-    finished_keys,
-    is_done,
-    lay_out,
-    own_records,
-    remaining_seconds,
-)
-from oodd_eval.plugins.discovery import Plugins
+from oodd_eval.names import seconds, select
+from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, TIERS
+from oodd_eval.paper.inputs import Reproduction, keep_inputs, load_records, load_returns
+from oodd_eval.paper.page import publish
+from oodd_eval.paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.tables import Table
-from oodd_eval.scoring.runner import Settings, available_cores
+from oodd_eval.scoring.executors import RunSettings, available_cores
+from oodd_eval.scoring.plan import Plan
+from oodd_eval.scoring.runner import RunOutcome
+from oodd_eval.scoring.runner import run as carry_out
+
+
+def define(parser: Parser) -> None:
+    """Add the command and its options."""
+    # fmt: off
+    add = parser.options(run, plugins=True)
+    add("--tier", default="full", metavar="full|reduced|mini",
+        help="how much: split standard; its first trajectories and fewer seeds; split mini "
+             "(default: full)")
+    add("--split", metavar="NAME", help="name or path of a split (default: the tier's)")
+    add("--output", default="reproduction", metavar="DIR",
+        help="directory of the reproduction (default: reproduction)")
+    add("--only", default="all", metavar="NAMES",
+        help="run what these need, such as table-5,figure-horizon (default: all)")
+    add("--plan", action="store_true", help="show what remains and how long it takes; do nothing")
+    add("--budget", metavar="TIME", type=value(seconds),
+        help="start nothing after this time, such as 2h; exit code 2")
+    add_resources(add, timeout="3h")
+    add("--fresh", action="store_true", help="run again what the directory has already")
+    add("--build", action="store_true", help="build the split if it is not on this machine")
+    add("--render-only", action="store_true",
+        help="run nothing; make tables and figures again from the directory's records")
+    add("--records", nargs="+", metavar="DIR",
+        help="with --render-only: read all results below these directories instead")
+    add("--no-figures", dest="figures", action="store_false", help="write tables only")
+    # fmt: on
 
 
 def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval reproduce``.
-
-    Returns
-    -------
-    0 when everything asked for is there, 1 when units failed, 2 when units are left because the
-    run was interrupted or its budget is used up.
-    """
-    tier, directory = _tier(options), Path(options.output)
-    console = make_console()
+    """Carry out the command; 1 when units failed, 2 when units are left."""
+    if options.tier not in TIERS:
+        raise UnknownNameError("tier", options.tier, TIERS)
     if options.render_only:
-        header = headers.load(directory)
-        places = [Path(place) for place in options.records or [directory]]
-        return _render(options, directory, header, gather(header, places), console)
+        header = Reproduction.load(Path(options.output))
+        places = [Path(place) for place in options.records or [options.output]]
+        return _render(options, header, load_records(header, places))
     if options.records:
         raise UsageError("--records is what --render-only reads; a run reads its own directory")
-    results = ResultsDirectory(directory)
-    jobs, limits = _jobs(options), Limits(seconds(options.timeout), memory_bytes(options.memory))
-    budget = None if options.budget is None else seconds(options.budget)
-    chosen = select("table or figure", options.only, IDS)
-    plugins = discovered(options.plugins)
-    report_broken(plugins)
-    split = _split(options, tier)
-    device = _device(options)
-    wanted = lay_out([e for e in EXPERIMENTS if e.id in chosen], tier, split, plugins, device)
-    header = _header(tier, split, plugins)
-    headers.check_same_data(directory, header)
-    finished = {} if options.fresh else finished_keys(_records(results))
-    left = [work for work in wanted if not is_done(work, finished)]
-    fitted = set() if options.fresh else _fitted(results)
+    return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run what remains, as far as the budget goes, and write tables and figures."""
+    console, results = make_console(), ResultsDirectory(options.output)
+    directory, jobs = results.path, options.jobs or available_cores()
+    names = select("table or figure", options.only, [TABLE_2, *(e.id for e in EXPERIMENTS)])
+    experiments = [e for e in EXPERIMENTS if e.id in names]
+    plugins = discovered(options)
+    split = _split(options)
+    tier, definition = TIERS[options.tier], split.manifest["definition"]
+    sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
+    units = len(lay_out(EXPERIMENTS, tier, split, plugins))
+    header = Reproduction(tier, split.name, split.digest, PROTOCOL, **sizes, units=units)
+    wanted = lay_out(experiments, tier, split, plugins, options.device)
+    header.check_same_data(directory)
+    here = results.records() if (directory / RECORDS).exists() and not options.fresh else []
+    left = unfinished(wanted, here)
+    fitted = {u.fit_key for u in left if results.fits.has(u.fit_key, fresh=options.fresh)}
+    rows = scored_rows(split)
     if options.verbosity >= 0 or options.plan:
-        _say_plan(console, header, wanted, left, fitted, jobs)
+        data = f"split {header.split}, digest {header.split_digest[:12]}"
+        console.print(f"reproduction, tier {header.tier.name}: {data}")
+        TerminalReporter(console).table(stages(wanted, left, rows, fitted, jobs))
     if options.plan:
         return 0
     results.prepare()
-    put(directory / headers.FILE, header.dump())
-    _keep_returns(directory, split)
-    rows = {e: scored_rows(split, e) for e in split.environments}
-    tell = console.print if options.verbosity >= 0 else None
-    watch = Watch(left, rows, jobs, tell, fitted)
-    settings = Settings(jobs=jobs, limits=limits, fresh=options.fresh)
-    outcome = carry_out(watch, split, plugins, settings, results, budget=budget)
-    code = _render(options, directory, header, _records(results), console)
-    return _say_end(console, outcome, watch) or code
+    keep_inputs(directory, header, split)
+    outcome = RunOutcome([])
+    progress = Progress(left, rows, jobs, console.print if options.verbosity >= 0 else None, fitted)
+    if left:
+        limits = Limits(options.timeout, options.memory)
+        settings = RunSettings(jobs=jobs, limits=limits, fresh=options.fresh,
+                               deadline=options.budget, command=options.invocation)  # fmt: skip
+        plan = Plan(split.name, split.digest, tuple(left))
+        outcome = carry_out(plan, split, plugins, settings, results, observers=[progress])
+    code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
+    if outcome.left:
+        why = "interrupted" if outcome.interrupted else "the budget is used up"
+        left_over = f"{outcome.left} units left, about {duration(progress.remaining())}"
+        console.print(f"{why}: {left_over}; the same command goes on")
+    return 2 if outcome.left else code
 
 
-def _tier(options: argparse.Namespace) -> Tier:
-    if options.tier not in TIERS:
-        raise UnknownNameError("tier", options.tier, TIERS)
-    return TIERS[options.tier]
-
-
-def _jobs(options: argparse.Namespace) -> int:
-    if options.jobs is not None and options.jobs < 1:
-        raise UsageError(f"--jobs is {options.jobs}, expected at least 1")
-    return options.jobs or available_cores()
-
-
-def _device(options: argparse.Namespace) -> str | None:
-    device: str | None = options.device
-    if device not in (None, *DEVICES):
-        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
-    return device
-
-
-def _split(options: argparse.Namespace, tier: Tier) -> Split:
+def _split(options: argparse.Namespace) -> Split:
     """Open the split, building it first where that was asked for."""
-    name = options.split or tier.split
+    name = options.split or TIERS[options.tier].split
     try:
         return load_split(name)
     except SplitNotFoundError as error:
@@ -115,97 +116,19 @@ def _split(options: argparse.Namespace, tier: Tier) -> Split:
             raise
         if not options.build:
             raise SplitNotFoundError(f"{error}, or let reproduce do so with --build") from None
-    data.build(
-        argparse.Namespace(
-            name=name, env="all", jobs=options.jobs, output=None, verbosity=options.verbosity,
-            train=None, calibration=None, test=None, cap=None, seed_base=None,
-        )
-    )  # fmt: skip
+    record_split(SPLITS[name], options)
     return load_split(name)
 
 
-def _header(tier: Tier, split: Split, plugins: Plugins) -> Header:
-    definition = split.manifest["definition"]
-    sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
-    units = len(lay_out(EXPERIMENTS, tier, split, plugins))
-    return Header(tier, split.name, split.digest, PROTOCOL, **sizes, units=units)
-
-
-def _records(results: ResultsDirectory) -> list[Record]:
-    return results.records() if (results.path / RECORDS).exists() else []
-
-
-def _fitted(results: ResultsDirectory) -> set[str]:
-    """Return the keys of the fits that are kept; a damaged one is fitted again, unforeseen."""
-    place = results.path / "fitted"
-    return {path.name for path in place.iterdir()} if place.is_dir() else set()
-
-
-def _keep_returns(directory: Path, split: Split) -> None:
-    """Read the returns for Table 2 once; they are in the split and not in records."""
-    path = directory / returns.FILE
-    if returns.load(path, split.digest) is None:
-        put(path, returns.dump(returns.collect(split), split.digest))
-
-
-def _render(
-    options: argparse.Namespace,
-    directory: Path,
-    header: Header,
-    records: list[Record],
-    console: Console,
-) -> int:
+def _render(options: argparse.Namespace, header: Reproduction, records: list[Record]) -> int:
     """Write tables and figures; 1 when units failed, as far as there are records."""
-    found = returns.load(directory / returns.FILE, header.split_digest)
+    console, directory = make_console(), Path(options.output)
+    returns = load_returns(directory, header.split_digest)
     try:
-        publish(directory, header, records, found, pictures=options.figures)
+        publish(directory, header, records, returns, figures=options.figures)
     except MissingExtraError as error:
         console.print(f"without figures: {error}")
-        publish(directory, header, records, found, pictures=False)
+        publish(directory, header, records, returns, figures=False)
     if options.verbosity >= 0:
         console.print(f"tables, figures and claims in {directory / 'README.md'}")
-    own = own_records(records, header.split_digest, header.tier, setups_of(EXPERIMENTS))
-    return int(not all(r.ok for r in own))
-
-
-def _say_plan(
-    console: Console,
-    header: Header,
-    wanted: list[Work],
-    left: list[Work],
-    fitted: set[str],
-    jobs: int,
-) -> None:
-    """Print what remains, stage by stage, and how long it takes."""
-    console.print(
-        f"reproduction, tier {header.tier.name}: split {header.split}, digest "
-        f"{header.split_digest[:12]}"
-    )
-    rows = []
-    seen = set(fitted)
-    for stage, title in enumerate(STAGES):
-        units = [w for w in wanted if w.stage == stage]
-        open_ = [w for w in left if w.stage == stage]
-        time = remaining_seconds(open_, seen) / jobs
-        seen |= {w.fit for w in open_}
-        if units:
-            rows.append([title, str(len(units)), str(len(units) - len(open_)),
-                         str(len(open_)), duration(time) if open_ else ""])  # fmt: skip
-    total = duration(remaining_seconds(left, fitted) / jobs) if left else ""
-    rows.append(["all", str(len(wanted)), str(len(wanted) - len(left)), str(len(left)), total])
-    on = f"time on {jobs} core{'s' if jobs > 1 else ''}"
-    TerminalReporter(console).table(
-        Table("What remains", ["", "units", "done", "to do", on], rows)
-    )  # fmt: skip
-
-
-def _say_end(console: Console, outcome: Outcome, watch: Watch) -> int:
-    """Say what is left; return 2 when something is, 0 otherwise."""
-    if not outcome.left:
-        return 0
-    why = "interrupted" if outcome.interrupted else "the budget is used up"
-    console.print(
-        f"{why}: {outcome.left} units left, about {duration(watch.remaining())}; "
-        "the same command goes on"
-    )
-    return 2
+    return int(not all(r.ok for r in header.own(records)))

@@ -1,129 +1,118 @@
-"""``oodd-eval run``: plan, run, report."""
+"""``oodd-eval run``: fit and score every selected cell, print tables and write them."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Final
+import tomllib
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-from oodd_eval.cli.discovery import discovered, report_broken
-from oodd_eval.cli.terminal import TerminalReporter, make_console
+from oodd_eval import cli
+from oodd_eval.cli import Parser
+from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.facts import ANOMALIES
-from oodd_eval.data.split import Split, load_split
+from oodd_eval.data.split import load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import expression, memory_bytes, seconds, select, whole_numbers
-from oodd_eval.plugins.discovery import Plugins
+from oodd_eval.names import expression, select, whole_numbers
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.tables import markdown
-from oodd_eval.scoring.plan import Plan, Unit, make_plan
-from oodd_eval.scoring.runner import Run, Settings
+from oodd_eval.results.tables import rendering
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.planning import make_plan
 from oodd_eval.scoring.runner import run as carry_out
 
-DEVICES: Final = ("auto", "cpu", "cuda")
+
+def define(parser: Parser) -> None:
+    """Add the options."""
+    # fmt: off
+    add = parser.options(run, plugins=True)
+    parser.set_defaults(options_of=options_of)
+    add("--detector", metavar="NAMES", help=f"{cli.NAMES} (required)")
+    add("--env", metavar="NAMES", help=f"{cli.NAMES} (required)")
+    add("--anomaly", default="all", metavar="NAMES", help=f"{cli.NAMES} (default: all)")
+    add("--split", default="mini", help="name or path of a split (default: mini)")
+    cli.add_detector(add)
+    add("--seed", default="0", metavar="N,...", type=cli.value(partial(whole_numbers, least=0)),
+        help="seeds of the detectors (default: 0)")
+    add("-k", dest="expression", metavar="EXPR", help=cli.EXPRESSION)
+    add("--collect-only", action="store_true", help="print the selected cells and do nothing")
+    add("-x", dest="stop", action="store_true", help="stop at the first failure")
+    add("--limit", type=cli.at_least(1), metavar="N",
+        help="use the first N trajectories of each part")
+    cli.add_resources(add, timeout="30m")
+    add("--executor", default="local", metavar="local|dask://HOST:PORT",
+        help="where fits are carried out: here, or on a Dask cluster (default: local)")
+    add("--fresh", action="store_true", help="fit again what the results directory has already")
+    add("--intervals", action="store_true", help="print 95 %% intervals in the tables")
+    add("--config", metavar="FILE", help="TOML file with these options by their long names")
+    add("--output", default="oodd-results", metavar="DIR",
+        help="results directory (default: oodd-results)")
+    # fmt: on
 
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval run`` and return its exit code."""
-    settings = _settings(options)
-    plugins = discovered(options.plugins)
-    report_broken(plugins)
+    for name in ("detector", "env"):
+        if getattr(options, name) is None:
+            raise UsageError(f"--{name} is missing, on the command line and in --config")
+    plugins = discovered(options)
     split = load_split(options.split)
-    plan = _plan(options, plugins, split)
+    plan = make_plan(
+        plugins, split=split.name, split_digest=split.digest,
+        detectors=plugins.select(options.detector),
+        environments=select("environment", options.env, split.environments),
+        anomalies=select("anomaly", options.anomaly, ANOMALIES),
+        horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
+        device=options.device, limit=options.limit,
+    )  # fmt: skip
+    if options.expression:
+        plan = plan.matching(expression(options.expression))
     if not plan.cells:
-        print(f"oodd-eval: no cell matches -k {options.expression!r}", file=sys.stderr)  # noqa: T201
-        return 5
+        return cli.say(f"no cell matches -k {options.expression!r}", 5)
     console = make_console()
     if options.collect_only:
         if options.verbosity >= 0:
-            console.print("\n".join(plan.cells))
+            console.print("\n".join(map(str, plan.cells)))
         console.print(f"{len(plan.cells)} cells in {len(plan.units)} fits")
         return 0
+    limits = Limits(options.timeout, options.memory)
+    settings = RunSettings(jobs=options.jobs, limits=limits, fresh=options.fresh,
+                           stop_on_failure=options.stop, executor=options.executor,
+                           command=options.invocation)  # fmt: skip
     results = ResultsDirectory(options.output)
-    reporter = TerminalReporter(console, verbosity=options.verbosity, intervals=options.intervals)
-    plugins.observe(reporter, "terminal")
-    done = carry_out(plan, split, plugins, settings, results)
+    reporter = TerminalReporter(
+        console, verbosity=options.verbosity, intervals=options.intervals, log=results.log_path
+    )
+    done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
     if done.records:
-        report = markdown.render(results.records(), intervals=options.intervals)
+        report = rendering.report(results.records(), intervals=options.intervals)
         path = results.write_report(report)
         if options.verbosity >= 0:
             console.print(f"results in {results.path}, tables in {path}")
-    return _exit_code(done, plugins)
-
-
-def _exit_code(done: Run, plugins: Plugins) -> int:
     if done.interrupted:
         return 2
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
 
 
-def _settings(options: argparse.Namespace) -> Settings:
-    for name in ("detector", "env"):
-        if getattr(options, name) is None:
-            raise UsageError(f"--{name} is missing, on the command line and in --config")
-    for name in ("jobs", "limit"):
-        if getattr(options, name) is not None and getattr(options, name) < 1:
-            raise UsageError(f"--{name} is {getattr(options, name)}, expected at least 1")
-    return Settings(
-        jobs=options.jobs,
-        limits=Limits(seconds(options.timeout), memory_bytes(options.memory)),
-        fresh=options.fresh,
-        stop_on_failure=options.stop,
-        executor=options.executor,
-    )
+def options_of(file: str) -> list[str]:
+    """Return a TOML file's content, long names of options with their values, as options."""
+    try:
+        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"configuration file {file!r} cannot be read: {error}") from None
+    return [option for key, given in content.items() for option in _options(file, key, given)]
 
 
-def _plan(options: argparse.Namespace, plugins: Plugins, split: Split) -> Plan:
-    plan = make_plan(
-        plugins,
-        split=split.name,
-        split_digest=split.digest,
-        detectors=plugins.select(options.detector),
-        environments=select("environment", options.env, split.environments),
-        anomalies=select("anomaly", options.anomaly, ANOMALIES),
-        horizons=whole_numbers("--horizon", options.horizon, least=1),
-        seeds=whole_numbers("--seed", options.seed, least=0),
-        parameters=_parameters(options.param),
-        limit=options.limit,
-    )
-    if options.device is not None:
-        plan = _on_device(plan, options.device, plugins)
-    return plan.matching(expression(options.expression)) if options.expression else plan
-
-
-def _on_device(plan: Plan, device: str, plugins: Plugins) -> Plan:
-    """Set the parameter ``device`` of those detectors that have it."""
-    if device not in DEVICES:
-        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
-    units = [_placed(unit, device, plugins) for unit in plan.units]
-    if units and not any("device" in unit.parameters for unit in units):
-        names = ", ".join(dict.fromkeys(unit.detector for unit in units))
-        raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
-    return replace(plan, units=tuple(units))
-
-
-def _placed(unit: Unit, device: str, plugins: Plugins) -> Unit:
-    defaults = plugins.offer(unit.detector).spec.parameters
-    if "device" not in defaults:
-        return unit
-    others = {name: value for name, value in unit.overrides.items() if name != "device"}
-    changed = {} if device == defaults["device"] else {"device": device}
-    return replace(
-        unit, parameters={**unit.parameters, "device": device}, overrides={**others, **changed}
-    )
-
-
-def _parameters(given: Sequence[str]) -> dict[str, Any]:
-    parameters = {}
-    for text in given:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise UsageError(f"--param {text!r}, expected NAME=VALUE")
-        try:
-            parameters[name] = json.loads(value)
-        except json.JSONDecodeError:
-            parameters[name] = value
-    return parameters
+def _options(file: str, name: str, given: Any) -> list[str]:
+    match given:
+        case dict() if name == "param":
+            return [f"--param={key}={json.dumps(v)}" for key, v in given.items()]
+        case bool():
+            return [f"--{name}"] if given else []
+        case list() if all(isinstance(v, str | int) for v in given):
+            return [f"--{name}={','.join(map(str, given))}"]
+        case str() | int():
+            return [f"--{name}={given}"]
+    raise UsageError(f"configuration file {file!r}: {name} is {given!r}, which no option takes")

@@ -3,73 +3,76 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
+from oodd_eval.cli import Parser, say
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UnknownNameError
+from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
-from oodd_eval.results.regression.tolerance import KNOWN
-from oodd_eval.results.tables import markdown, tables
+from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import boards
+from oodd_eval.results.tables.rendering import report
+
+
+def define(parser: Parser) -> None:
+    """Add the options."""
+    # fmt: off
+    add = parser.options(run)
+    add("directory", metavar="DIR", help="results directory")
+    add("--split", metavar="NAME", help="where the split is, if not at its usual place")
+    add("--stored", action="store_true", help="print stored metrics without recomputing them")
+    add("--intervals", action="store_true", help="print 95 %% intervals")
+    add("--detector", metavar="NAME", help="print the table by anomaly of one detector")
+    add("--metric", default="auc_matched",
+        help="metric of that table (default: auc_matched; see oodd-eval list metrics)")
+    add("--wide", action="store_true",
+        help="print all metrics, pooled AUC, average precision and FPR95 among them")
+    add("--markdown", action="store_true", help="print Markdown, everything in it")
+    # fmt: on
 
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval show``; 1 when one of the cells failed."""
-    if options.metric not in KNOWN:
-        raise UnknownNameError("metric", options.metric, KNOWN)
+    if options.metric not in NAMES:
+        raise UnknownNameError("metric", options.metric, NAMES)
     results = ResultsDirectory(options.directory)
     records = results.records()
     if not options.stored:
         records = _recomputed(records, results, options.split)
     if not records:
-        print(f"oodd-eval: no records in {options.directory}", file=sys.stderr)  # noqa: T201
-        return 5
+        return say(f"no records in {options.directory}", 5)
+    code = int(not all(r.ok for r in records))
     if options.markdown:
-        print(markdown.render(records, intervals=options.intervals), end="")  # noqa: T201
-        return int(not all(r.ok for r in records))
+        print(report(records, intervals=options.intervals), end="")
+        return code
     reporter = TerminalReporter(make_console(), intervals=options.intervals)
-    if options.detector:
-        _by_anomaly(options, records, reporter)
-    else:
+    name, intervals = options.detector, options.intervals
+    if name and name not in (known := {r.detector for r in records}):
+        raise UnknownNameError("detector of these results", name, known)
+    for board in boards(records) if name else ():
+        for entry in (e for e in board.entries if e.detector == name):
+            reporter.table(layout.by_anomaly(board, entry, options.metric, intervals=intervals))
+    if not name:
         reporter.tables(records)
-        if options.wide:
-            _wide(options, records, reporter)
+        for board in boards(records) if options.wide else ():
+            reporter.table(layout.all_metrics(board, intervals=intervals))
+            more = layout.calibrated(board, intervals=intervals), layout.pooled(board)
+            for table in filter(None, more):
+                reporter.table(table)
         reporter.failures(records)
     reporter.console.print(summary(records))
-    return int(not all(r.ok for r in records))
+    return code
 
 
-def _recomputed(records: list[Record], results: ResultsDirectory, place: str) -> list[Record]:
+def _recomputed(records: list[Record], results: ResultsDirectory, at: str | None) -> list[Record]:
     """Rescore each split's records, and keep the order of all."""
-    fresh: dict[tuple[str, ...], Record] = {}
+    fresh: dict[object, Record] = {}
     for name, digest in dict.fromkeys((r.split, r.split_digest) for r in records):
         # A split that is not the published one carries its digest behind its name.
-        split = load_split(place or name.partition("@")[0])
+        split = load_split(at or name.partition("@")[0])
         own = [r for r in records if r.split_digest == digest]
         fresh |= {r.identity: r for r in rescore(own, results, split)}
     return [fresh[r.identity] for r in records]
-
-
-def _wide(options: argparse.Namespace, records: list[Record], reporter: TerminalReporter) -> None:
-    for board in boards(records):
-        reporter.table(tables.all_metrics(board, intervals=options.intervals))
-        if alarms := tables.calibrated(board, intervals=options.intervals):
-            reporter.table(alarms)
-        reporter.table(tables.pooled(board))
-
-
-def _by_anomaly(
-    options: argparse.Namespace, records: list[Record], reporter: TerminalReporter
-) -> None:
-    known = {r.detector for r in records}
-    if options.detector not in known:
-        raise UnknownNameError("detector of these results", options.detector, known)
-    for board in boards(records):
-        for entry in board.entries:
-            if entry.detector == options.detector:
-                reporter.table(
-                    tables.by_anomaly(board, entry, options.metric, intervals=options.intervals)
-                )

@@ -1,11 +1,15 @@
-"""The terminal reporter: a plug-in that prints what the runner does, and the tables at its end."""
+"""The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -13,12 +17,15 @@ from rich.text import Text
 from tabulate import tabulate
 
 from oodd_eval._version import __version__
+from oodd_eval.cli import say
 from oodd_eval.data.facts import GROUPS, PROTOCOL
-from oodd_eval.plugins.hooks import hookimpl
+from oodd_eval.metrics.catalogue import METRICS
+from oodd_eval.plugins import hookimpl
+from oodd_eval.plugins.discovery import Plugins, discover, printable
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.tables import tables
-from oodd_eval.results.tables.board import Board, boards
-from oodd_eval.results.tables.tables import Table
+from oodd_eval.results.tables import layout
+from oodd_eval.results.tables.board import boards
+from oodd_eval.results.tables.layout import Table
 from oodd_eval.scoring.plan import Plan
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
@@ -26,30 +33,36 @@ _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Let the program see the error; rich would end the process with a failure's code."""
+        """Raise the error; rich would end the process with the exit code of a failure."""
         raise BrokenPipeError
 
 
-def make_console() -> Console:
+def make_console(*, quiet: bool = False) -> Console:
     """Return a console on standard output: coloured on a terminal, plain text in a pipe."""
-    return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True)
+    return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
+
+
+def discovered(options: argparse.Namespace) -> Plugins:
+    """Discover plug-ins without those of ``-p``; broken ones are reported on standard error."""
+    plugins = discover(options.disabled)
+    plugins.report_broken_to(
+        lambda b: say(f"plug-in {b.plugin!r} of {b.distribution} is broken: {b.reason}")
+    )
+    return plugins
 
 
 class TerminalReporter:
     """Print a header, a line per fit, tables, failures and a summary.
 
-    Parameters
-    ----------
-    console
-        Where to; see `make_console`.
-    verbosity
-        -1: the summary only. 0: a line per fit. 1: a line per cell, with intervals in the tables.
-    intervals
-        Whether the tables have 95 % intervals.
+    `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
     """
 
-    def __init__(self, console: Console, *, verbosity: int = 0, intervals: bool = False) -> None:
+    def __init__(
+        self, console: Console, *, verbosity: int = 0, intervals: bool = False,
+        log: Callable[[str], Path] | None = None,
+    ) -> None:  # fmt: skip
         self.console, self.verbosity, self.intervals = console, verbosity, intervals
+        self._log = log
         self._start = time.perf_counter()
         self._open: dict[tuple[str, str], list[Record]] = {}
         self._sizes: dict[tuple[str, str], int] = {}
@@ -70,14 +83,8 @@ class TerminalReporter:
         self._print(f"detectors: {', '.join(names)}")
         self._print(f"{len(plan.units)} fits, {len(plan.cells)} cells\n")
         if self.console.is_terminal:
-            self._progress = Progress(
-                TextColumn("cells"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                console=self.console,
-                transient=True,
-            )
+            columns = TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+            self._progress = Progress(*columns, console=self.console, transient=True)
             self._progress.add_task("cells", total=len(plan.cells))
             self._progress.start()
 
@@ -87,15 +94,12 @@ class TerminalReporter:
         self._resumed += resumed
         if self._progress:
             self._progress.advance(self._progress.task_ids[0])
-        if self.verbosity < 0:
-            return
-        if self.verbosity > 0:
-            self._line(record, str(record.cell), [record], resumed=resumed)
-            return
         unit = record.environment, record.label
         finished = self._open.setdefault(unit, [])
         finished.append(record)
-        if len(finished) == self._sizes[unit]:
+        if self.verbosity > 0:
+            self._line(record, str(record.cell), [record], resumed=resumed)
+        elif self.verbosity == 0 and len(finished) == self._sizes[unit]:
             self._line(record, "/".join(unit), finished, resumed=resumed)
 
     @hookimpl
@@ -115,46 +119,46 @@ class TerminalReporter:
     def tables(self, records: Sequence[Record]) -> None:
         """Print the tables of every board among some records."""
         for board in boards(records):
-            self._board(board)
+            self.table(layout.by_environment(board, intervals=self.intervals))
+            groups = [group for group in GROUPS if board.in_group(group)]
+            for h, group in product(board.horizons, groups):
+                self.table(layout.anomaly_groups(board, h, [group], intervals=self.intervals))
+            for sentence in layout.findings(board):
+                self._prose(sentence, "yellow")
+            for line in layout.notes(board):
+                self._prose(line, "dim")
+            self._print("")
 
     def failures(self, records: Sequence[Record]) -> None:
         """Print why fits failed."""
-        for board in boards(records):
-            for record in board.failures():
-                name = f"{record.environment}/{record.label}"
-                self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
+        for record in (record for board in boards(records) for record in board.failures()):
+            name = f"{record.environment}/{record.label}"
+            self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
+            if self.verbosity <= 0 or not self._log or not record.scores:
+                continue
+            if (path := self._log(record.scores)).is_file():
+                self._print(f"  {path}:")
+                for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+                    self._print(f"    {printable(line)}")
 
     def table(self, table: Table) -> None:
         """Print one table within the console's width: as it is, turned, or in parts."""
         self._print(table.title, "bold")
         for part in _fitting(table, self.console.width):
             self._print(_set(part) + "\n")
-
-    def _board(self, board: Board) -> None:
-        self.table(tables.ranking(board, intervals=self.intervals))
-        for horizon in board.horizons:
-            for group in GROUPS:
-                if board.in_group(group):
-                    self.table(
-                        tables.anomaly_groups(board, horizon, [group], intervals=self.intervals)
-                    )
-        for sentence in tables.findings(board):
-            self._prose(sentence, "yellow")
-        for line in tables.notes(board):
-            self._prose(line, "dim")
-        self._print("")
+        if table.note:
+            self._prose(table.note + "\n", "dim")
 
     def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
         parts = [f"{last.status:<12} {name}"]
         if last.ok:
-            values = [r.value("auc_matched") for r in cells]
-            defined = [v for v in values if v == v]  # noqa: PLR0124  NaN is unequal to itself
-            mean = sum(defined) / len(defined) if defined else float("nan")
-            parts.append(f"matched AUC {tables.number(mean, 'auc_matched')}")
+            defined = [v for r in cells if not math.isnan(v := r.value("auc_matched"))]
+            mean = sum(defined) / len(defined) if defined else math.nan
+            parts.append(f"matched AUC {METRICS['auc_matched'].text(mean)}")
             spent = last.seconds_fit + last.seconds_score
             if resumed:
                 parts.append("from an earlier run")
-            elif spent == spent:  # noqa: PLR0124
+            elif not math.isnan(spent):
                 parts.append(f"{spent:.1f} s")
         self._print("  ".join(parts), _COLOURS.get(last.status, "red"))
 
@@ -173,14 +177,8 @@ def summary(records: Sequence[Record]) -> str:
 
 
 def _set(table: Table) -> str:
-    text: str = tabulate(
-        table.rows,
-        headers=table.header,
-        tablefmt="simple",
-        colalign=table.alignment if table.rows else None,
-        disable_numparse=True,
-    )
-    return text
+    alignment = table.alignment if table.rows else None
+    return str(tabulate(table.rows, table.header, colalign=alignment, disable_numparse=True))
 
 
 def _fitting(table: Table, width: int) -> list[Table]:
@@ -189,13 +187,14 @@ def _fitting(table: Table, width: int) -> list[Table]:
         if _width(whole) <= width:
             return [whole]
     labels = list(range(table.labels))
-    parts: list[list[int]] = []
+    parts = [labels]
     for column in range(table.labels, len(table.header)):
-        if parts and _width(table.columns([*labels, *parts[-1], column])) <= width:
-            parts[-1].append(column)
+        wider = [*parts[-1], column]
+        if parts[-1] == labels or _width(table.columns(wider)) <= width:
+            parts[-1] = wider
         else:
-            parts.append([column])
-    return [table.columns([*labels, *part]) for part in parts]
+            parts.append([*labels, column])
+    return [table.columns(part) for part in parts]
 
 
 def _width(table: Table) -> int:
