@@ -1,12 +1,16 @@
 """Fixtures that more than one test module uses."""
 
 import contextlib
+import os
 import signal
 import sys
 import warnings
 from pathlib import Path
 
 import pytest
+
+# Two workers on two cores: numerical libraries get one thread each.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # The import mode of this suite leaves the tests' directory off the path.
 sys.path.insert(0, str(Path(__file__).parent))
@@ -32,6 +36,7 @@ def tiny_split(tmp_path_factory):
 @pytest.fixture(scope="session")
 def submissions(tmp_path_factory):
     """Valid entries of the leaderboard with their results and split; see `Submissions`."""
-    from helpers_submission import make_submissions
+    from helpers_submission import make_submissions, remembered_metrics
 
-    return make_submissions(tmp_path_factory.mktemp("submissions"))
+    with remembered_metrics():
+        yield make_submissions(tmp_path_factory.mktemp("submissions"))

@@ -1,71 +1,94 @@
-"""The doors between the rooms: who may import what, checked by reading the source."""
+"""The house: who imports what, how large a module may be, one public class a name."""
 
 import ast
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-MODULES = sorted((ROOT / "oodd_eval").rglob("*.py"))
-DETECTORS = sorted((ROOT / "detectors").glob("*/*/*.py"))
+CORE = sorted((ROOT / "oodd_eval").rglob("*.py"))
+OTHERS = sorted([*(ROOT / "detectors").glob("*/*/*.py"), *(ROOT / "training").glob("*/*.py")])
+TREES = {path: ast.parse(path.read_text()) for path in (*CORE, *OTHERS)}
+
+NEVER = {"pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+HEAVY = {"torch", "sklearn", "scipy", "pandas"}
+SIMULATORS = {"gymnasium", "pybullet", "pybullet_envs_gymnasium", "Box2D"}
 
 
-def imports(path):
-    for node in ast.walk(ast.parse(path.read_text())):
+def imported(path):
+    """Top-level names that a module imports anywhere in it."""
+    for node in ast.walk(TREES[path]):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            yield from (alias.name.split(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
+            yield node.module.split(".")[0]
 
 
-def top_level(path):
-    return {name.split(".")[0] for name in imports(path)}
+def wrong(paths, allowed):
+    """Modules that do what they may not, with it."""
+    found = {str(path.relative_to(ROOT)): sorted(allowed(path)) for path in paths}
+    return {path: names for path, names in found.items() if names}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_core_imports_no_heavy_library(path):
-    forbidden = {"torch", "sklearn", "scipy", "pandas", "matplotlib", "pickle"}
-    if path.name == "plots.py":
-        # Figures of a reproduction; imported when one is drawn (the next test).
-        forbidden -= {"matplotlib"}
-    if "simulate" in path.parts:
-        # Training needs torch, recording the simulators: both live behind this one door.
-        forbidden -= {"torch"} if "train" in path.parts else set()
-    else:
-        forbidden |= {"gymnasium", "pybullet", "pybullet_envs_gymnasium", "Box2D"}
-    assert not top_level(path) & forbidden
+def test_the_core_imports_no_heavy_library_and_no_detector():
+    own = {path.parent.name for path in OTHERS} - {"oodd_training"}
+    assert len(own) > 5
+
+    def forbidden(path):
+        simulators = set() if "simulate" in path.parts else SIMULATORS
+        return {*imported(path)} & (HEAVY | own | simulators)
+
+    assert not wrong(CORE, forbidden)
 
 
-@pytest.mark.parametrize("path", MODULES + DETECTORS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_no_module_holds_more_than_400_lines(path):
-    assert len(path.read_text().splitlines()) <= 400
+def test_nothing_unpickles():
+    def unsafe(path):
+        source = path.read_text()
+        flags = {f for f in ("allow_pickle=True", "weights_only=False") if f in source}
+        return flags | ({*imported(path)} & NEVER)
+
+    assert not wrong(TREES, unsafe)
 
 
-@pytest.mark.parametrize("path", MODULES + DETECTORS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_nothing_unpickles(path):
-    source = path.read_text()
-    assert "allow_pickle=True" not in source
-    assert "weights_only=False" not in source
-    assert not top_level(path) & {"pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+def test_modules_are_few_and_short():
+    lines = {path: len(path.read_text().splitlines()) for path in TREES}
+    assert not {str(path): n for path, n in lines.items() if n > 400}
+    assert len(CORE) <= 110
+    assert sum(lines[path] for path in CORE) <= 17_000
+    root = ROOT / "oodd_eval"
+    assert len([path for path in CORE if path.parent == root]) <= 9
+    assert len([place for place in root.iterdir() if (place / "__init__.py").exists()]) <= 9
 
 
-def test_core_never_imports_a_detector():
-    own = {p.parent.name for p in DETECTORS}
-    assert own
-    assert not {name for path in MODULES for name in top_level(path)} & own
+def test_no_two_public_classes_have_one_name():
+    names = Counter(
+        node.name
+        for tree in TREES.values()
+        for node in tree.body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert not {name: n for name, n in names.items() if n > 1}
 
 
-def test_listing_detectors_imports_nothing_heavy():
+@pytest.mark.parametrize(
+    ("arguments", "heavy"),
+    [
+        (["--help"], {"numpy", "h5py", "rich", "pydantic", "pluggy"}),
+        (["list", "detectors"], {"numpy", "h5py", "rich", "pydantic", *HEAVY, *SIMULATORS}),
+        (["list", "metrics"], {"h5py", "rich", "pydantic", *HEAVY, *SIMULATORS}),
+    ],
+)
+def test_quick_commands_import_nothing_heavy(arguments, heavy):
     code = (
         "import sys\n"
         "from oodd_eval.cli.main import main\n"
-        "try: main(['list', 'detectors'])\n"
-        "except SystemExit: pass\n"
-        "bad = {'torch', 'sklearn', 'h5py', 'gymnasium', 'pybullet'} & set(sys.modules)\n"
-        "sys.exit(f'imported {sorted(bad)}' if bad else 0)\n"
+        f"assert main({arguments!r}) == 0\n"
+        f"found = sorted({heavy!r} & set(sys.modules))\n"
+        "sys.exit(f'imported {found}' if found else 0)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "riqn" in done.stdout
+    assert done.stdout

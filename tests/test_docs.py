@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from helpers_docs import ROOT
 
+pytestmark = pytest.mark.docs
+
 DOCS = ROOT / "docs"
 FIGURES = DOCS / "figures"
 
@@ -69,7 +71,8 @@ def pages(site):
 
 def test_every_document_is_a_page(site):
     sources = [p.relative_to(DOCS) for p in sorted(DOCS.rglob("*.md"))]
-    outside = [p.relative_to(ROOT) for p in sorted((ROOT / "detectors").rglob("*.md"))]
+    beside = [p for d in ("detectors", "training") for p in sorted((ROOT / d).rglob("*.md"))]
+    outside = [p.relative_to(ROOT) for p in beside]
     built = [p.with_name("index.md") if p.name == "README.md" else p for p in (*sources, *outside)]
     missing = [p for p in built if not (site / p.with_suffix(".html")).is_file()]
     assert not missing
@@ -139,24 +142,25 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(pages, site):
 
 def test_reference_has_every_public_name(site):
     import oodd_eval
-    import oodd_eval.plugins.conformance
+    import oodd_eval.testing
 
     text = "".join(p.read_text() for p in (site / "reference").glob("*.html"))
     names = {*oodd_eval.__all__} - {"__version__", "hookimpl"}
-    assert all(re.search(rf'id="oodd_eval\.\w*\.?{name}"', text) for name in names)
-    for hook in ("detectors", "detector_from_spec", "run_started", "cell_finished", "run_finished"):
-        assert f'id="oodd_eval.plugins.hooks.oodd_{hook}"' in text
+    assert all(re.search(rf'id="oodd_eval\.[\w.]*{name}"', text) for name in names)
+    for hook in ("detectors", "detector_from_spec"):
+        assert f'id="oodd_eval.plugins.oodd_{hook}"' in text
+    for hook in ("run_started", "cell_finished", "run_finished"):
+        assert f'id="oodd_eval.scoring.observers.oodd_{hook}"' in text
 
 
 def test_reference_shows_the_help_of_every_command(pages, site):
     from oodd_eval.cli.main import build_parser
-    from oodd_eval.cli.options import choices
 
     text = "".join(pages[site / "reference" / "commands.html"].text)
     assert "help of every command -->" not in text
-    for command, parser in choices(build_parser()).items():
+    for command, parser in build_parser().choices.items():
         assert f"usage: oodd-eval {command} " in text
-        assert all(f"usage: oodd-eval {command} {action} " in text for action in choices(parser))
+        assert all(f"usage: oodd-eval {command} {action} " in text for action in parser.choices)
 
 
 def test_formulas_need_no_script(site):
@@ -245,7 +249,8 @@ def test_site_works_from_disk_in_a_browser(site, tmp_path):
             assert shown, page
         browser.run(
             "const input = document.querySelector('.md-search__input');"
-            "input.focus(); input.value = 'matched AUC';"
+            "document.querySelector('[data-md-toggle=search]').click();"
+            "input.value = 'matched AUC';"
             "input.dispatchEvent(new KeyboardEvent('keyup', { bubbles: true }));"
         )
         browser.wait_for("document.querySelectorAll('.md-search-result__item').length > 3", 30)

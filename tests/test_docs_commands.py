@@ -19,6 +19,8 @@ from helpers_docs import (
     quick,
 )
 
+pytestmark = pytest.mark.docs
+
 FORECASTER = """
 import numpy as np
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.packaging
+
 ROOT = Path(__file__).parents[1]
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
 
@@ -59,12 +61,14 @@ def test_wheel_ships_data_policies_and_types(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {
         "oodd_eval/py.typed",
+        "oodd_common/py.typed",
         "oodd_riqn/py.typed",
-        "oodd_eval/data/mini/manifest.json",
-        "oodd_eval/scaffold/templates/pyproject.toml.in",
-        "oodd_eval/scaffold/templates/gitignore.in",
+        "oodd_training/train.py",
+        "oodd_eval/data/shipped/mini/manifest.json",
+        "oodd_eval/plugins/template/templates/pyproject.toml.in",
+        "oodd_eval/plugins/template/templates/gitignore.in",
     } <= names
-    assert "oodd_eval/simulate/frozen/ant.npz" in names
+    assert "oodd_eval/data/simulate/frozen/ant.npz" in names
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):
