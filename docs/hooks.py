@@ -1,4 +1,4 @@
-"""What the site shows beyond the files of docs/, and links that work on both sides of it.
+"""Pages of the site from files outside of docs/, and links that work on both sides.
 
 MkDocs calls these functions while it builds (``hooks`` in mkdocs.yml). Pages that live beside what
 they describe, such as the detectors' READMEs, become pages of the site. A link to a file that has
@@ -15,18 +15,20 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
-from oodd_eval.cli.options import choices
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
 
-ELSEWHERE = ("CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
-             "leaderboard/README.md", "leaderboard/site/index.html")  # fmt: skip
+ELSEWHERE = (
+    "CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
+    "leaderboard/README.md", "leaderboard/site/index.html", "training/README.md",
+)  # fmt: skip
 """Files outside docs/ that are part of the site, under the same paths."""
 
 RESULTS = ("leaderboard/README.md", "leaderboard/site/index.html")
-"""What `leaderboard build` makes of entries: not there before the first entry is."""
+"""Files that `leaderboard build` writes; absent before the first entry."""
 
 FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
@@ -107,9 +109,9 @@ def _commands() -> str:
     os.environ["COLUMNS"] = "80"
     sections: list[str] = []
 
-    def add(name: str, parser: object, help_text: Callable[[], str], level: int) -> None:
+    def add(name: str, parser: Parser, help_text: Callable[[], str], level: int) -> None:
         sections.append(f"{'#' * level} {name}\n\n```text\n{help_text().rstrip()}\n```")
-        for action, inner in choices(parser).items():
+        for action, inner in parser.choices.items():
             add(f"{name} {action}", inner, inner.format_help, level)
 
     parser = build_parser()

@@ -26,12 +26,12 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.discovery import discover
 
 HEAVIER = {"masspole": 0.4, "length": 1.0}
-"""What changes at the onset; nominally 0.1 kg and 0.5 m (half of the pole)."""
+"""Values after the onset; nominally 0.1 kg and 0.5 m (half of the pole)."""
 
 
 @dataclass
 class Episode:
-    """What was seen: a value per observation, times of alarms, seconds per score."""
+    """Results of one episode: a value per observation, times of alarms, seconds per score."""
 
     scores: list[float] = field(default_factory=list)
     statistic: list[float] = field(default_factory=list)
