@@ -8,6 +8,7 @@ import textwrap
 import time
 from types import SimpleNamespace
 
+import h5py
 import pytest
 from helpers_plugins import install
 
@@ -295,6 +296,16 @@ def test_a_damaged_score_file_is_computed_again(tiny_split, tmp_path, counting, 
     file.write_bytes(content[: len(content) // 2] if damage is None else damage)
     after = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
     assert len(counting[1]()) == 2
+    assert stable(before) == stable(after)
+
+
+def test_a_foreign_attribute_of_a_score_file_is_not_taken_over(tiny_split, tmp_path, counting):
+    before = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
+    (file,) = (tmp_path / "out" / "scores").glob("*.h5")
+    with h5py.File(file, "a") as stored:
+        stored.attrs["status"] = 3.0
+    after = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
+    assert len(counting[1]()) == 1
     assert stable(before) == stable(after)
 
 

@@ -23,7 +23,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan
-from oodd_eval.scoring.unit import Scored, UnitJob
+from oodd_eval.scoring.unit import COSTS, Scored, UnitJob
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +171,10 @@ def _in_dependence(
 
 def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Record]:
     """Return the records of a unit's cells, in the order of its anomalies."""
-    plan, unit, cost = job.plan, job.unit, dict(scored.file.cost)
+    plan, unit, cost = job.plan, job.unit, scored.file.cost
     counts = {"train": job.data.train, "calibration": job.data.calibration, "test": job.data.twins}
     # A whole number, also when it was read back from a file of floats.
-    steps = int(cost.pop("steps_scored")) if "steps_scored" in cost else None
+    steps = int(cost["steps_scored"]) if "steps_scored" in cost else None
     device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
     records = [
         plan.blank(
@@ -185,7 +185,7 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
             counts={part: limited(len(known), plan.limit) for part, known in counts.items()},
             steps_scored=steps,
             provenance={**origin, **device},
-            **cost,
+            **{name: cost[name] for name in COSTS if name in cost},
         )
         for anomaly in unit.anomalies
     ]
