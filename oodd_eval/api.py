@@ -21,17 +21,11 @@ from oodd_eval.scoring.runner import run
 
 
 def evaluate(
-    detector: str | DetectorSpec | Callable[..., Detector],
-    split: str | Path | Split = "mini",
-    *,
-    environments: str = "all",
-    anomalies: str = "all",
-    horizon: int = 1,
-    seed: int = 0,
-    parameters: Mapping[str, Any] | None = None,
-    limit: int | None = None,
+    detector: str | DetectorSpec | Callable[..., Detector], split: str | Path | Split = "mini", *,
+    environments: str = "all", anomalies: str = "all", horizon: int = 1, seed: int = 0,
+    parameters: Mapping[str, Any] | None = None, limit: int | None = None,
     output: str | Path | None = None,
-) -> list[Record]:
+) -> list[Record]:  # fmt: skip
     """Evaluate one detector and return a record per cell.
 
     Parameters

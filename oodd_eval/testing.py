@@ -81,7 +81,17 @@ def run_checks(
 def check_detector(
     factory: Factory, *, expected_failures: Mapping[str, str] | None = None, **arguments: Any
 ) -> Report:
-    """Do what `run_checks` does, print it, and raise `NonConformingError` unless all is right.
+    """Do what `run_checks` does, and print it.
+
+    Parameters
+    ----------
+    factory, expected_failures, arguments
+        As in `run_checks`.
+
+    Raises
+    ------
+    NonConformingError
+        When a check fails, or one passes that is expected to fail.
 
     Examples
     --------

@@ -2,15 +2,18 @@
 
 import html.parser
 import importlib.metadata
+import inspect
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from pkgutil import resolve_name
 
 import helpers_browser
 import numpy as np
 import pytest
+import yaml
 from helpers_docs import ROOT
 
 pytestmark = pytest.mark.docs
@@ -235,6 +238,49 @@ def test_numbers_of_the_protocol_are_those_of_its_episode():
     assert off[1].transitions - int(off.onsets[1]) + 1 == 10
     assert "the robot falls ten steps later" in text
     assert np.array_equal(episode.observations[:onset], twin.observations[:onset])
+
+
+def shown_functions(page):
+    """Functions and methods that a page of the reference shows, by name."""
+    for name, options in re.findall(r"^::: (\S+)\n((?: {4}.*\n)*)", page + "\n", re.MULTILINE):
+        members = (yaml.safe_load(options) or {}).get("options", {}).get("members")
+        found = resolve_name(name)
+        if inspect.isfunction(found):
+            yield name, found
+            continue
+        home = found.__module__ if inspect.isclass(found) else name
+        for one, item in list(vars(found).items()):
+            wanted = one in members if members is not None else not one.startswith("_")
+            member = getattr(item, "__func__", item)
+            if not wanted or getattr(member, "__module__", "") != home:
+                continue
+            if inspect.isclass(member):
+                own = {k: getattr(v, "__func__", v) for k, v in vars(member).items()}
+                yield from ((f"{one}.{k}", v) for k, v in own.items()
+                            if inspect.isfunction(v) and not k.startswith("_"))  # fmt: skip
+            elif inspect.isfunction(member):
+                yield f"{name}.{one}", member
+
+
+def test_every_function_of_the_reference_names_its_parameters():
+    pages = [path.read_text() for path in sorted(DOCS.glob("reference/*.md"))]
+    functions = [pair for page in pages for pair in shown_functions(page)]
+    assert len(functions) > 20
+    wrong = {}
+    for name, function in functions:
+        section = re.search(
+            r"^Parameters\n-+\n(.*?)(?:\n\n\w+\n---|\Z)",
+            inspect.getdoc(function) or "",
+            re.DOTALL | re.MULTILINE,
+        )
+        named = re.findall(
+            r"^(\w+(?:, \w+)*)(?: :.*)?$", section[1] if section else "", re.MULTILINE
+        )
+        documented = {one for names in named for one in names.split(", ")}
+        expected = {*inspect.signature(function).parameters} - {"self", "cls"}
+        if documented != expected:
+            wrong[name] = sorted(documented ^ expected)
+    assert not wrong
 
 
 @pytest.mark.skipif(helpers_browser.programs() is None, reason="no Chromium and chromedriver")

@@ -86,21 +86,16 @@ def _write(
         if info.discrete:
             action = {"type": "Discrete", "dtype": "int64", "start": 0, "n": info.action_dim}
         metadata = {
-            "dataset_id": identity,
-            "minari_version": "0.5.0",
-            "data_format": "hdf5",
-            "total_episodes": len(trajectories),
-            "total_steps": int(trajectories.lengths.sum()),
+            "dataset_id": identity, "minari_version": "0.5.0", "data_format": "hdf5",
+            "total_episodes": len(trajectories), "total_steps": int(trajectories.lengths.sum()),
             "dataset_size": round(file.stat().st_size / 1e6, 1),
             "observation_space": json.dumps(_box(info.observation_dim, -infinity, infinity)),
-            "action_space": json.dumps(action),
-            "algorithm_name": info.policy,
+            "action_space": json.dumps(action), "algorithm_name": info.policy,
             "author": ["The oodd-eval developers"],
             "description": f"{info.title}, {what}: trajectories of a frozen {info.policy} policy, "
             f"from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
-            "oodd_eval_version": __version__,
-            "split_digest": split.digest,
-        }
+            "oodd_eval_version": __version__, "split_digest": split.digest,
+        }  # fmt: skip
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
         made.chmod(0o755)  # temporary directories are their maker's alone
         made.rename(place)

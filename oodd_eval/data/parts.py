@@ -137,10 +137,17 @@ class EnvironmentData:
         return TrajectorySet(self._file, TWINS)
 
     def anomalous(self, anomaly: str) -> AnomalousSet:
-        """Return the test trajectories with one of `anomalies`, in the order of their twins.
+        """Return the test trajectories with one anomaly, in the order of their twins.
 
-        Raises `UnknownNameError` when the benchmark has no such anomaly, `SplitError` when this
-        split has no such part.
+        Parameters
+        ----------
+        anomaly
+            One of `anomalies`.
+
+        Raises
+        ------
+        UnknownNameError, SplitError
+            When the benchmark has no such anomaly, or this split has no such part.
         """
         if anomaly not in ANOMALIES:
             raise UnknownNameError("anomaly", anomaly, ANOMALIES)

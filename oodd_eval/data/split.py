@@ -104,9 +104,22 @@ class Split:
     def environment(self, name: str) -> EnvironmentData:
         """Open one environment after verifying every group's digest.
 
-        Its file is open until `EnvironmentData.close` is called. Raises `UnknownNameError` when the
-        split has no such environment, `SplitNotFoundError`, `SplitError` or `DigestError` when the
-        file is missing, damaged, or not what the manifest names.
+        Parameters
+        ----------
+        name
+            One of `environments`.
+
+        Returns
+        -------
+        EnvironmentData
+            Its file is open until it is closed.
+
+        Raises
+        ------
+        UnknownNameError
+            When the split has no such environment.
+        SplitNotFoundError, SplitError, DigestError
+            When the file is missing, damaged, or not what the manifest names.
         """
         if name not in self.environments:
             raise UnknownNameError(f"environment of split {self.name}", name, self.environments)

@@ -130,12 +130,7 @@ def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
 def pad(arrays: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Stack arrays of shape (n_b, D) into (B, max n_b, D), zeros behind their ends; return lengths.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> batch, lengths = pad([np.ones((2, 1), "f4"), np.ones((3, 1), "f4")])
-    >>> batch[..., 0].tolist(), lengths.tolist()
-    ([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], [2, 3])
+    Raises `TrajectoryError` without an array, or for arrays of different widths.
     """
     if not arrays:
         raise TrajectoryError("no sequences to stack: expected at least one")

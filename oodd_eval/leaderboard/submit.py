@@ -67,17 +67,10 @@ class Submission:
 
 
 def submit(
-    results: Path | str,
-    root: Path | str,
-    statement: Statement,
-    *,
-    detectors: str = "all",
-    cells: str = "",
-    complete: bool = False,
-    scores: bool = False,
-    curves: Extent = "rows",
+    results: Path | str, root: Path | str, statement: Statement, *, detectors: str = "all",
+    cells: str = "", complete: bool = False, scores: bool = False, curves: Extent = "rows",
     split: str | Path | None = None,
-) -> Submission:
+) -> Submission:  # fmt: skip
     """Write an entry from a results directory, verify it, and move it to its place in `root`."""
     source, root = ResultsDirectory(results), Path(root)
     records, left_out = selected(source.records(), detectors, cells, complete=complete)

@@ -87,11 +87,16 @@ def calibrate(scores: Sequence[Floats], rule: AlarmRule, target: float) -> float
     Parameters
     ----------
     scores : sequence of float64 arrays
-        Scores of the calibration trajectories; without a defined one, the threshold is NaN.
+        Scores of the calibration trajectories.
     rule
         Standardization and drift; its threshold is not used.
     target
         False-alarm rate per step, in (0, 1).
+
+    Returns
+    -------
+    float
+        In the unit of standardized scores; NaN without a defined score.
 
     Notes
     -----

@@ -57,8 +57,17 @@ def mean_of(values: Sequence[float] | Floats) -> Contribution:
 def auc(positives: Floats, negatives: Floats) -> float:
     """Area under the ROC curve: P(positive > negative) + P(tie) / 2 over all pairs.
 
-    The Mann-Whitney U statistic over the number of pairs, counted exactly. NaN (undefined) scores
-    are left out; the area is NaN when either class is empty.
+    The Mann-Whitney U statistic over the number of pairs, counted exactly.
+
+    Parameters
+    ----------
+    positives, negatives
+        Scores of the two classes, float64 arrays of one dimension; NaN (undefined) is left out.
+
+    Returns
+    -------
+    float
+        In [0, 1]; NaN when either class is empty.
 
     Examples
     --------

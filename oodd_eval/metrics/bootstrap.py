@@ -35,11 +35,6 @@ def bootstrap_weights(
     """Return counts of each of n trajectories in each resample: shape (resamples, n).
 
     The same seed and key, such as an environment, give the same weights, and so the same intervals.
-
-    Examples
-    --------
-    >>> bootstrap_weights(5, resamples=3).sum(axis=1).tolist()
-    [5.0, 5.0, 5.0]
     """
     rng = np.random.default_rng([seed, zlib.crc32(key.encode()), n])
     return rng.multinomial(n, np.full(n, 1 / n), size=resamples).astype(np.float64)
@@ -124,12 +119,6 @@ def samples(cells: Sequence[CellPart]) -> Samples:
     Test trajectories are resampled, the same ones in all cells of an environment, and detector
     seeds where there are several. Differences, sums and `mean_samples` of what this returns for
     several detectors or anomalies are paired.
-
-    Examples
-    --------
-    >>> half = Contribution(np.array([1.0, 1.0]), np.array([2.0, 2.0]))
-    >>> percentiles(samples([("hopper", 0, half), ("hopper", 1, half)]))
-    (0.5, 0.5)
     """
     by_seed: dict[int, list[Samples]] = {}
     for environment, seed, contribution in cells:

@@ -35,9 +35,6 @@ def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
 
     Where the curve is vertical, it is its upper end; NaN when either class has no defined score.
     The area under the curve is `oodd_eval.metrics.auc.auc`.
-
-    >>> roc(np.array([2.0, 3.0]), np.array([1.0, 2.0]), np.array([0.0, 0.25, 0.5, 1.0])).tolist()
-    [0.5, 0.75, 1.0, 1.0]
     """
     positives = np.sort(positives[~np.isnan(positives)])
     negatives = np.sort(negatives[~np.isnan(negatives)])

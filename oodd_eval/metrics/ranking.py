@@ -94,10 +94,14 @@ def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
     Parameters
     ----------
     rows
-        By name. ResultsError: rows differ in cells or in the number of test trajectories, or a cell
-        has no value.
+        By name.
     resamples
         Number of bootstrap resamples R; by default at least 10 000 and 50 per ordered pair.
+
+    Raises
+    ------
+    ResultsError
+        When rows differ in cells or in the number of test trajectories, or a cell has no value.
 
     Notes
     -----

@@ -29,8 +29,12 @@ def oodd_detectors() -> list[DetectorSpec] | None:
     """Offer detectors.
 
     Called once, when the plug-in is loaded: when one of its detectors may have been named, or all
-    detectors are listed. It has to be quick: import heavy libraries inside the factories. Return
-    the specs; None means none.
+    detectors are listed. It has to be quick: import heavy libraries inside the factories.
+
+    Returns
+    -------
+    list of DetectorSpec
+        None means none.
     """
 
 
@@ -39,10 +43,23 @@ def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
     """Make a detector from a name with a colon, such as ``pyod:IForest``.
 
     Called when a user names such a detector, and again in the worker that runs it, until a plug-in
-    answers; those of oodd-eval itself are asked first. Return None for names that this plug-in does
-    not handle. For a name that it handles and that leads nowhere, raise
-    `oodd_eval.errors.UsageError` or `UnknownNameError`. The name of the spec has a colon too, may
-    be tidier than `spec`, and makes the same detector. The first line of the implementation's
+    answers; those of oodd-eval itself are asked first. The first line of the implementation's
     docstring says which names it knows: ``oodd-eval list detectors`` prints it. Names in results
     are never resolved.
+
+    Parameters
+    ----------
+    spec
+        The name that the user gave.
+
+    Returns
+    -------
+    DetectorSpec
+        Its name has a colon too, may be tidier than `spec`, and makes the same detector. None for
+        names that this plug-in does not handle.
+
+    Raises
+    ------
+    UsageError, UnknownNameError
+        For a name that this plug-in handles and that leads nowhere.
     """

@@ -67,10 +67,27 @@ class Detector(Protocol):
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
-        """Learn from nominal trajectories, forgetting any earlier fit. The result is ignored."""
+        """Learn from nominal trajectories, forgetting any earlier fit. The result is ignored.
+
+        Parameters
+        ----------
+        nominal
+            Training trajectories, all with the same numbers of sensors and actions.
+        """
 
     def score(self, trajectory: Trajectory) -> Scores:
-        """Return float64 scores of shape (T + 1,), higher meaning more anomalous."""
+        """Return one score per observation row, higher meaning more anomalous.
+
+        Parameters
+        ----------
+        trajectory
+            One episode with T transitions.
+
+        Returns
+        -------
+        float64 array of shape (T + 1,)
+            NaN in the leading undefined rows only.
+        """
 
 
 @runtime_checkable
@@ -83,11 +100,20 @@ class StreamingDetector(Detector, Protocol):
     def update(
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> float:
-        """Return the score of the next observation, NaN where it is undefined.
+        """Return the score of the next observation: that of `score`, to a relative 1e-5.
 
-        The scores of an episode are those of `score` on the whole of it, to a relative 1e-5. The
-        action is ``a_{t-1}``, commanded since the previous observation; None at the first one, and
-        for detectors that do not look at actions.
+        Parameters
+        ----------
+        observation : float32 array of shape (D,)
+            The sensors now.
+        action : float32 array of shape (A,), optional
+            ``a_{t-1}``, commanded since the previous observation; None at the first one, and for
+            detectors that do not look at actions.
+
+        Returns
+        -------
+        float
+            NaN where the score is undefined.
         """
 
 
@@ -96,13 +122,27 @@ class StorableDetector(Detector, Protocol):
     """A detector whose fit can be kept in plain files: never pickle, as they may be anybody's."""
 
     def save(self, directory: Path) -> None:
-        """Write the fitted state as files into an empty directory."""
+        """Write the fitted state as files.
+
+        Parameters
+        ----------
+        directory
+            An empty directory.
+        """
 
     def load(self, directory: Path) -> None:
         """Take over what `save` wrote, instead of `fit`: scores are the same, bit for bit.
 
-        The new detector was made with the same parameters except those that do not decide the fit
-        (`oodd_eval.plugins.parameters.parameter`). Raises `FittedStateError` for other files.
+        Parameters
+        ----------
+        directory
+            Written by a detector with the same parameters, except those that do not decide the fit
+            (`oodd_eval.plugins.parameters.parameter`).
+
+        Raises
+        ------
+        FittedStateError
+            For other files.
         """
 
 

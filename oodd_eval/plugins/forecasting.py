@@ -92,8 +92,20 @@ def anomaly_scores(
 ) -> NDArray[np.float64]:
     """Return scores of one trajectory from the mean absolute errors of its forecasts.
 
-    `errors`, of shape (T + 1 - horizon,), are means over samples, members and sensors of
-    ``|o_t - f_t|`` for ``t >= horizon``.
+    Parameters
+    ----------
+    observations
+        Of shape (T + 1, D).
+    errors
+        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, of shape
+        (T + 1 - horizon,).
+    horizon
+        Prediction horizon in steps.
+
+    Returns
+    -------
+    float64 array of shape (T + 1,)
+        NaN for ``t < horizon``.
     """
     scores = np.full(len(observations), np.nan)
     scores[horizon:] = errors

@@ -230,7 +230,12 @@ class RecordWriter:
 
 
 def read_records(file: Path) -> list[Record]:
-    """Read a file of records, compressed or not.
+    """Read a file of records.
+
+    Parameters
+    ----------
+    file
+        Lines of JSON, compressed or not.
 
     Raises
     ------

@@ -54,13 +54,9 @@ class Rules:
 
 
 def cell_metrics(
-    anomalous: Sequence[Scores],
-    twins: Sequence[Scores],
-    onsets: Sequence[int],
-    rules: Rules,
-    *,
+    anomalous: Sequence[Scores], twins: Sequence[Scores], onsets: Sequence[int], rules: Rules, *,
     environment: str,
-) -> tuple[dict[str, Metric], dict[str, Contribution]]:
+) -> tuple[dict[str, Metric], dict[str, Contribution]]:  # fmt: skip
     """Compute all metrics of one cell with their intervals."""
     found = cell_contributions(anomalous, twins, onsets, rules.standard)
     for suffix, rule in rules.calibrated.items():

@@ -21,27 +21,40 @@ from oodd_eval.scoring.plan import Plan
 
 @hookspec
 def oodd_run_started(plan: Plan) -> None:
-    """Observe that a run is about to start.
+    """Observe that a run is about to start. Called once, before any detector is fitted.
 
-    Called once, before any detector is fitted, with everything the run is going to do.
+    Parameters
+    ----------
+    plan
+        Everything that the run is going to do.
     """
 
 
 @hookspec
 def oodd_cell_finished(record: Record, resumed: bool) -> None:
-    """Observe a finished cell, whatever its status.
+    """Observe a finished cell, in the harness's process and in the order in which cells finish.
 
-    Called in the harness's process, in the order in which cells finish. `resumed` tells that the
-    scores are of an earlier run with the same key; nothing was fitted.
+    Parameters
+    ----------
+    record
+        The result, whatever its status.
+    resumed
+        Whether the scores are of an earlier run with the same key, so that nothing was fitted.
     """
 
 
 @hookspec
 def oodd_run_finished(plan: Plan, records: list[Record], interrupted: bool) -> None:
-    """Observe the end of a run.
+    """Observe the end of a run. Called once, after the records are written.
 
-    Called once, after the records are written, with the records in the order of the plan; when the
-    run was interrupted, with those that were finished.
+    Parameters
+    ----------
+    plan
+        What the run was going to do.
+    records
+        Those of all finished cells, in the order of the plan.
+    interrupted
+        Whether the run was interrupted.
     """
 
 

@@ -88,22 +88,10 @@ class Plan:
     def blank(self, unit: Unit, anomaly: str, **outcome: Any) -> Record:
         """Return the record of a cell with its identity filled in, and no metrics."""
         return Record(
-            detector=unit.detector,
-            detector_version=unit.version,
-            plugin=f"{unit.distribution}:{unit.plugin}",
-            plugin_source=unit.source,
-            parameters=dict(unit.shown),
-            overrides=unit.setting.overrides,
-            inputs=unit.inputs,
-            environment=unit.environment,
-            anomaly=anomaly,
-            group=ANOMALIES[anomaly].group,
-            horizon=unit.horizon,
-            seed=unit.seed,
-            split=self.split,
-            split_digest=self.split_digest,
-            limit=self.limit,
-            scores=unit.scores_key,
-            protocol=PROTOCOL,
-            **outcome,
-        )
+            detector=unit.detector, detector_version=unit.version,
+            plugin=f"{unit.distribution}:{unit.plugin}", plugin_source=unit.source,
+            parameters=dict(unit.shown), overrides=unit.setting.overrides, inputs=unit.inputs,
+            environment=unit.environment, anomaly=anomaly, group=ANOMALIES[anomaly].group,
+            horizon=unit.horizon, seed=unit.seed, split=self.split, split_digest=self.split_digest,
+            limit=self.limit, scores=unit.scores_key, protocol=PROTOCOL, **outcome,
+        )  # fmt: skip

@@ -17,19 +17,12 @@ DEVICES: Final = ("auto", "cpu", "cuda")
 
 
 def make_plan(
-    plugins: Plugins,
-    *,
-    split: str,
-    split_digest: str,
-    detectors: Sequence[str],
-    environments: Sequence[str],
-    anomalies: Sequence[str] = tuple(ANOMALIES),
-    horizons: Sequence[int] = (1,),
-    seeds: Sequence[int] = (0,),
-    parameters: Mapping[str, Any] | None = None,
-    limit: int | None = None,
+    plugins: Plugins, *, split: str, split_digest: str, detectors: Sequence[str],
+    environments: Sequence[str], anomalies: Sequence[str] = tuple(ANOMALIES),
+    horizons: Sequence[int] = (1,), seeds: Sequence[int] = (0,),
+    parameters: Mapping[str, Any] | None = None, limit: int | None = None,
     device: str | None = None,
-) -> Plan:
+) -> Plan:  # fmt: skip
     """Lay out every unit, environments outermost; the cells are the product of all names.
 
     `device` is the value of the parameter ``device`` for those detectors that have it.
@@ -52,15 +45,9 @@ def make_plan(
 
 
 def make_unit(
-    offer: Offer,
-    given: Mapping[str, Any],
-    environment: str,
-    anomalies: Sequence[str],
-    horizon: int,
-    seed: int,
-    split_digest: str,
-    limit: int | None,
-) -> Unit:
+    offer: Offer, given: Mapping[str, Any], environment: str, anomalies: Sequence[str],
+    horizon: int, seed: int, split_digest: str, limit: int | None,
+) -> Unit:  # fmt: skip
     """Resolve one unit: its parameters, its setting and its keys."""
     spec = offer.spec
     declared = parameters_of(spec.parameters)
@@ -87,20 +74,11 @@ def make_unit(
             same["horizon"] = None
         fit = fit_key(identity | same)
     return Unit(
-        environment=environment,
-        setting=Setting.of(spec.name, horizon, overrides),
-        seed=seed,
-        anomalies=tuple(anomalies),
-        parameters=resolved,
-        shown=shown,
-        plugin=offer.plugin,
-        distribution=offer.distribution,
-        version=offer.version,
-        source=source,
-        inputs=spec.inputs,
-        scores_key=scores,
-        fit_key=fit,
-    )
+        environment=environment, setting=Setting.of(spec.name, horizon, overrides), seed=seed,
+        anomalies=tuple(anomalies), parameters=resolved, shown=shown, plugin=offer.plugin,
+        distribution=offer.distribution, version=offer.version, source=source, inputs=spec.inputs,
+        scores_key=scores, fit_key=fit,
+    )  # fmt: skip
 
 
 def _placed(offer: Offer, device: str | None) -> dict[str, str]:

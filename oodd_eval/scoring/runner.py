@@ -39,13 +39,9 @@ class RunOutcome:
 
 
 def run(
-    plan: Plan,
-    split: Split,
-    plugins: Plugins,
-    settings: RunSettings,
-    results: ResultsDirectory | None = None,
-    observers: Sequence[object] = (),
-) -> RunOutcome:
+    plan: Plan, split: Split, plugins: Plugins, settings: RunSettings,
+    results: ResultsDirectory | None = None, observers: Sequence[object] = (),
+) -> RunOutcome:  # fmt: skip
     """Fit and score every unit of a plan, which was made for the split.
 
     Scores and records are kept in `results`, from which a later run resumes; None keeps nothing.

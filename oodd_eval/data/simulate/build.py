@@ -72,14 +72,10 @@ class Chunk:
 
 
 def build_split(
-    definition: SplitDefinition,
-    directory: Path,
-    *,
-    environments: Iterable[str] | None = None,
-    policies: Mapping[str, Path] | None = None,
-    jobs: int | None = None,
+    definition: SplitDefinition, directory: Path, *, environments: Iterable[str] | None = None,
+    policies: Mapping[str, Path] | None = None, jobs: int | None = None,
     progress: Progress = lambda _done, _total, _what: None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Build a split into a directory and return the directory; resume an earlier build.
 
     Complete environments there are kept. By default there are all seven, the frozen policies act,

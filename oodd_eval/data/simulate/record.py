@@ -21,6 +21,8 @@ from oodd_eval.data.simulate.policies import Policy
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError, UnknownNameError
 
+_Rows = NDArray[np.float32]
+
 GENERATOR_VERSION: Final = 1
 """Raised by every change that gives other bytes for the same seed."""
 
@@ -57,13 +59,9 @@ class Episode:
 
 
 def record_seed(
-    environment: str,
-    seed: int,
-    anomalies: Iterable[str],
-    *,
-    policy: Policy,
+    environment: str, seed: int, anomalies: Iterable[str], *, policy: Policy,
     episode_cap: int | None = None,
-) -> dict[str | None, Episode]:
+) -> dict[str | None, Episode]:  # fmt: skip
     """Record the nominal twin of a seed (key None) and one episode per anomaly.
 
     Raises `TwinTooShortError` when an onset would not fit, `SimulationError` after 100 redraws.
@@ -130,13 +128,9 @@ def _record_anomalous(
 
 
 def _run(
-    environment: str,
-    seed: int,
-    policy: Policy,
-    episode_cap: int | None,
-    replayed: Sequence[Any] = (),
-    anomaly: tuple[str, np.random.Generator] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool, dict[str, Any]]:
+    environment: str, seed: int, policy: Policy, episode_cap: int | None,
+    replayed: Sequence[Any] = (), anomaly: tuple[str, np.random.Generator] | None = None,
+) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:  # fmt: skip
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
     simulator, drawn, info = make(environment), None, ENVIRONMENTS[environment]
     cap = info.episode_cap if episode_cap is None else min(info.episode_cap, episode_cap)

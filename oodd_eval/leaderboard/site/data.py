@@ -57,14 +57,11 @@ def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]
     shown = [_board(section, units, curves) for section in sections]
     names = dict.fromkeys(name for board in shown for name in board["metrics"])
     data = {
-        "threshold": THRESHOLD,
-        "drift": DRIFT,
-        "metrics": {name: _metric(name) for name in names},
+        "threshold": THRESHOLD, "drift": DRIFT, "metrics": {name: _metric(name) for name in names},
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in ANOMALIES.values()},
-        "paper": paper_tables()["table5_groups_delta1"],
-        "boards": shown,
-    }
+        "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
+    }  # fmt: skip
     return data, curves
 
 
@@ -105,27 +102,18 @@ def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Jso
 
 
 def _row(
-    section: LeaderboardSection,
-    standing: Standing,
-    names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]],
-    units: Units,
-    curves: list[Json],
-) -> Json:
+    section: LeaderboardSection, standing: Standing, names: Sequence[str],
+    chosen: Mapping[str, Sequence[SelectedCell]], units: Units, curves: list[Json],
+) -> Json:  # fmt: skip
     row, records = standing.entry, standing.records
     sources = [source.meta for source in section.sources[row]]
     own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
     if own:
         curves.append(own)
     return {
-        "id": f"{section.name}/{row!s}",
-        "label": str(row),
-        "detector": row.detector,
-        "version": records[0].detector_version,
-        "plugin": records[0].plugin,
-        "horizon": row.horizon,
-        "parameters": records[0].parameters,
-        "overrides": row.overrides,
+        "id": f"{section.name}/{row!s}", "label": str(row), "detector": row.detector,
+        "version": records[0].detector_version, "plugin": records[0].plugin, "horizon": row.horizon,
+        "parameters": records[0].parameters, "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
         **_fields(standing, "trivial", "inputs", "rank", "ties", "state"),
         "wins": _short(standing.wins),
@@ -133,9 +121,8 @@ def _row(
         "trust": section.trust[row],
         "entries": [_entry(meta, records[0].plugin) for meta in sources],
         "cells": [_cell(r, names) for r in sorted(records, key=_place)],
-        "intervals": _intervals(records, names, chosen),
-        "curves": len(curves) - 1 if own else None,
-    }
+        "intervals": _intervals(records, names, chosen), "curves": len(curves) - 1 if own else None,
+    }  # fmt: skip
 
 
 def _entry(meta: EntryInfo, plugin: str) -> Json:

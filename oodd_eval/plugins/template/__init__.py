@@ -32,14 +32,7 @@ _RESERVED: Final = ("all", "eval")  # every detector, and this distribution
 
 @dataclass(frozen=True, slots=True)
 class Project:
-    """The names of a plug-in project, which follow from the name of its detector.
-
-    Examples
-    --------
-    >>> project = Project("slow-drift")
-    >>> project.distribution, project.module
-    ('oodd-slow-drift', 'oodd_slow_drift')
-    """
+    """The names of a plug-in project, which follow from the name of its detector."""
 
     name: str
 

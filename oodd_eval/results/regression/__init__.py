@@ -164,13 +164,9 @@ class Comparison:
 
 
 def compare(
-    now: RecordSet,
-    reference: RecordSet,
-    tolerances: Sequence[Tolerance] = (),
-    *,
-    by: By = "cell",
+    now: RecordSet, reference: RecordSet, tolerances: Sequence[Tolerance] = (), *, by: By = "cell",
     two_sided: bool = False,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare records with a reference, cells under equal conditions only.
 
     Means are over the reference's cells: of a group of anomalies in one environment, or all of a

@@ -100,11 +100,6 @@ def _referenced(record: Record) -> Record:
     return replace(
         record,
         metrics={name: Metric(metric.value, n=metric.n) for name, metric in record.metrics.items()},
-        per_trajectory={},
-        scores="",
-        seconds_fit=NAN,
-        seconds_score=NAN,
-        steps_scored=None,
-        peak_rss_mb=NAN,
-        provenance={k: v for k, v in record.provenance.items() if k in known},
-    )
+        per_trajectory={}, scores="", seconds_fit=NAN, seconds_score=NAN, steps_scored=None,
+        peak_rss_mb=NAN, provenance={k: v for k, v in record.provenance.items() if k in known},
+    )  # fmt: skip

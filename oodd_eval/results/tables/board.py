@@ -68,14 +68,9 @@ class Board:
         return self._plugins[entry].endswith(":trivial")
 
     def mean(
-        self,
-        entry: Setting,
-        environments: Sequence[str],
-        anomalies: Sequence[str],
-        metric: str,
-        *,
+        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str, *,
         intervals: bool = False,
-    ) -> Value:
+    ) -> Value:  # fmt: skip
         """Return an entry's mean of a metric over cells, seeds included.
 
         The interval resamples test trajectories, the same ones for all cells of an environment,
