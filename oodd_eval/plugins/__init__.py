@@ -34,7 +34,7 @@ def oodd_detectors() -> list[DetectorSpec] | None:
     Returns
     -------
     list of DetectorSpec
-        None means none.
+        None stands for an empty list.
     """
 
 
@@ -55,11 +55,11 @@ def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
     Returns
     -------
     DetectorSpec
-        Its name has a colon too, may be tidier than `spec`, and makes the same detector. None for
-        names that this plug-in does not handle.
+        Its name has a colon, too, and makes the same detector; it may be a simpler spelling of
+        `spec`. None for names that this plug-in does not handle.
 
     Raises
     ------
     UsageError, UnknownNameError
-        For a name that this plug-in handles and that leads nowhere.
+        When this plug-in handles such names, but can make no detector of this one.
     """

@@ -105,7 +105,7 @@ class StreamingDetector(Detector, Protocol):
         Parameters
         ----------
         observation : float32 array of shape (D,)
-            The sensors now.
+            The newest sensor readings.
         action : float32 array of shape (A,), optional
             ``a_{t-1}``, commanded since the previous observation; None at the first one, and for
             detectors that do not look at actions.

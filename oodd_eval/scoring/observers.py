@@ -32,7 +32,7 @@ def oodd_run_started(plan: Plan) -> None:
 
 @hookspec
 def oodd_cell_finished(record: Record, resumed: bool) -> None:
-    """Observe a finished cell. Called in the harness's process, in the order of finishing.
+    """Observe a finished cell. Called in the harness's process, once for every cell.
 
     Parameters
     ----------
