@@ -22,7 +22,8 @@ record, freeze, iqn, td3, train = (
 )
 
 QUICK = {
-    "td3": {"layers": [8, 6], "batch": 4, "warm_up": 20, "evaluate_every": 40, "replay": 50},
+    "td3": {"layers": [8, 6], "batch": 4, "warm_up": 20, "evaluate_every": 40, "replay": 50,
+            "refill": 50},
     "iqn": {"width": 8, "cosines": 4, "batch": 4, "quantiles_loss": 2, "quantiles_acting": 4,
             "warm_up": 20, "evaluate_every": 40, "replay": 50, "environments": 2},
 }  # fmt: skip
@@ -92,7 +93,7 @@ def test_the_last_steps_are_evaluated_too(tmp_path, environment):
     assert [c[0] for c in checkpoint(tmp_path, environment)["curve"]] == [40, 50]
 
 
-def test_the_best_actor_has_the_largest_mean_less_one_deviation(tmp_path, monkeypatch):
+def test_the_best_actor_has_the_largest_worst_return(tmp_path, monkeypatch):
     returns = iter([[10.0, 10.0], [0.0, 40.0], [11.0, 11.0], [10.9, 10.9]])
     found = []
 
