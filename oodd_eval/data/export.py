@@ -7,6 +7,7 @@ https://minari.farama.org/content/dataset_standards. Minari itself is not needed
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import re
 import tempfile
@@ -19,7 +20,14 @@ import numpy as np
 
 from oodd_eval._version import __version__
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.parts import PARTS, TRAIN, AnomalousSet, TrajectorySet, parts_of
+from oodd_eval.data.parts import (
+    PARTS,
+    TRAIN,
+    AnomalousSet,
+    EnvironmentData,
+    TrajectorySet,
+    parts_of,
+)
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OutputError
@@ -50,7 +58,7 @@ def export(
                 parts = {TRAIN: data.train, **parts_of(data, data.anomalies)}
                 for part, trajectories in parts.items():
                     identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(part)}"
-                    _write(directory, identity, environment, trajectories, split)
+                    _write(directory, identity, data, trajectories, split)
                     written.append(identity)
                     progress(identity)
     except OSError as error:
@@ -63,11 +71,11 @@ def _dataset(part: str) -> str:
 
 
 def _write(
-    directory: Path, identity: str, environment: str, trajectories: TrajectorySet, split: Split
+    directory: Path, identity: str, data: EnvironmentData, trajectories: TrajectorySet, split: Split
 ) -> None:
     """Write one dataset, all or nothing."""
     place = directory / identity
-    info = ENVIRONMENTS[environment]
+    info = ENVIRONMENTS[data.id]
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=place.parent) as temporary:
         made = Path(temporary)
@@ -81,7 +89,7 @@ def _write(
         what, further = f"nominal, {trajectories.group}", ""
         if isinstance(trajectories, AnomalousSet):
             what = f"{trajectories.group.removeprefix('test/')} anomalies from an onset on"
-            further = ", anomaly, onset, redraws, parameters as JSON"
+            further = ", anomaly, onset, effect, redraws, parameters as JSON"
         infinity, action = float("inf"), _box(info.action_dim, -1.0, 1.0)
         if info.discrete:
             action = {"type": "Discrete", "dtype": "int64", "start": 0, "n": info.action_dim}
@@ -95,6 +103,8 @@ def _write(
             "description": f"{info.title}, {what}: trajectories of a frozen {info.policy} policy, "
             f"from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
             "oodd_eval_version": __version__, "split_digest": split.digest,
+            "sensors": [dataclasses.asdict(quantity) for quantity in data.sensors],
+            "actions": [dataclasses.asdict(quantity) for quantity in data.actions],
         }  # fmt: skip
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
         made.chmod(0o755)  # temporary directories are their maker's alone
@@ -119,5 +129,6 @@ def _episode(
     group.attrs.update({"id": i, "seed": int(data.seeds[i]), "total_steps": steps})
     if isinstance(data, AnomalousSet):
         group.attrs["anomaly"] = data.group.removeprefix("test/")
-        group.attrs.update({"onset": int(data.onsets[i]), "redraws": int(data.redraws[i])})
+        drawn = {"onset": data.onsets, "effect": data.effects, "redraws": data.redraws}
+        group.attrs.update({name: int(values[i]) for name, values in drawn.items()})
         group.attrs["parameters"] = json.dumps(data.parameters[i], sort_keys=True)

@@ -13,10 +13,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, TypeVar
 
-PROTOCOL: Final = 1
+PROTOCOL: Final = 2
 """Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
 
 Group = Literal["sensor", "dynamics"]
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A sensor or an action: its name, and the unit of its numbers.
+
+    `unit` is what the number 1 means: ``"rad"``, or ``"10 rad/s"`` where the simulator divides
+    angular speeds by ten, or ``"1"`` for a plain number.
+    """
+
+    name: str
+    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +55,16 @@ class EnvironmentInfo:
     def discrete(self) -> bool:
         """True when actions are discrete."""
         return self.family == "classic"
+
+    @property
+    def sensors(self) -> tuple[Quantity, ...]:
+        """Names and units of the sensors, in the order of the columns of an observation."""
+        return _quantities()[self.id]["sensors"]
+
+    @property
+    def actions(self) -> tuple[Quantity, ...]:
+        """Names and units of the columns of an action row."""
+        return _quantities()[self.id]["actions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,16 +131,33 @@ ANOMALIES: Final = _by_id(
 GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
 
 SPLITS: Final = _by_id(
-    SplitDefinition("mini", 40, 20, 10, 300, 1),
-    SplitDefinition("standard", 500, 100, 50, None, 2),
+    # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
+    SplitDefinition("mini", 40, 40, 10, 300, 4),
+    SplitDefinition("standard", 500, 200, 50, None, 5),
     # The first trajectories of standard: its seed base, the same episodes.
-    SplitDefinition("reduced", 500, 50, 20, None, 2),
-    SplitDefinition("paper", 10_000, 1_000, 1_000, None, 3),
+    SplitDefinition("reduced", 500, 50, 20, None, 5),
+    SplitDefinition("paper", 10_000, 1_000, 1_000, None, 6),
 )
 """The published splits by name."""
 
+OWN_SEED_BASES: Final = range(10, 900)
+"""Seed bases for splits of one's own: published splits have those below, policies those above."""
+
+BRIEF_TAIL: Final = 20
+"""A part whose episodes last fewer transitions beyond their onsets, in the median, is *brief*."""
+
 PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
 """Seed offset of each part within the million seeds of a split's base."""
+
+
+@functools.cache
+def _quantities() -> Mapping[str, Mapping[str, tuple[Quantity, ...]]]:
+    file = Path(__file__).with_name("quantities.json")
+    stored = json.loads(file.read_text(encoding="utf-8"))
+    return {
+        environment: {kind: tuple(Quantity(*row) for row in rows) for kind, rows in kinds.items()}
+        for environment, kinds in stored.items()
+    }
 
 
 @functools.cache

@@ -1,9 +1,11 @@
-"""A description of a split: sizes, lengths, onsets and returns, and the paper's Table 2."""
+"""A description of a split: sizes, sensors, lengths, onsets, returns, and the paper's Table 2."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,8 @@ from oodd_eval.data.parts import AnomalousSet, EnvironmentData
 from oodd_eval.data.split import Split
 
 _KINDS = ("nominal", *ANOMALIES)
+HEADER: Final = ("group", "trajectories", "transitions", "length", "onset", "effect", "tail",
+                 "redraws", "return")  # fmt: skip
 Rows = list[list[str]]
 Returns = Mapping[str, NDArray[np.float64]]
 """Of the test part by kind: ``nominal`` and the anomalies."""
@@ -30,14 +34,13 @@ def describe(split: Split) -> str:
         f"generator {manifest['generator']}\nin {split.path}"
     )
     lines = [recipe]
-    header = ["group", "trajectories", "transitions", "length", "onset", "redraws", "return"]
     returns: dict[str, Returns] = {}
     for name in split.environments:
         entry = manifest["environments"][name]
         size = (split.path / entry["file"]).stat().st_size / 1e6
         title = f"{ENVIRONMENTS[name].title}: {size:.2f} MB, policy {entry['policy'][:12]}"
         with closing(split.environment(name)) as data:
-            lines += ["", _table(title, header, group_rows(data))]
+            lines += ["", _table(title, HEADER, group_rows(data)), "", *column_lines(data)]
             returns[name] = collect_returns(data)
     title = "Table 2: mean return of the policies, nominal and under each anomaly"
     return "\n".join(
@@ -46,17 +49,35 @@ def describe(split: Split) -> str:
 
 
 def group_rows(data: EnvironmentData) -> Rows:
-    """Return per part: trajectories, transitions, lengths, onsets, redraws and returns."""
+    """Return the rows of a table with the columns of `HEADER`.
+
+    The effect is counted from the onset, the tail is the median of the transitions beyond it.
+    """
     rows = []
     anomalous = map(data.anomalous, data.anomalies)
     for part in (data.train, data.calibration, data.twins, *anomalous):
-        drawn = ["", ""]
+        drawn = ["", "", "", ""]
         if isinstance(part, AnomalousSet):
-            drawn = [_span(part.onsets), str(part.redraws.sum())]
+            tail = f"{np.median(part.tails):g}{' brief' if part.brief else ''}"
+            after = f"+{_span(part.effects - part.onsets)}"
+            drawn = [_span(part.onsets), after, tail, str(part.redraws.sum())]
         sizes = [str(len(part)), str(part.lengths.sum()), _span(part.lengths)]
         mean = f"{part.returns.mean():.1f} ± {part.returns.std():.1f}"
         rows.append([part.group, *sizes, *drawn, mean])
     return rows
+
+
+def column_lines(data: EnvironmentData) -> list[str]:
+    """Return numbers, names and units of sensors and actions as lines of text."""
+    lines = []
+    for kind, quantities in (("sensors", data.sensors), ("actions", data.actions)):
+        units = [f" [{quantity.unit}]" if quantity.unit != "1" else "" for quantity in quantities]
+        named = [f"{i} {q.name}{u}" for i, (q, u) in enumerate(zip(quantities, units, strict=True))]
+        # Lines break between quantities, not within one.
+        text = ", ".join(name.replace(" ", "\u00a0") for name in named)
+        wrapper = textwrap.TextWrapper(100, subsequent_indent="  ", break_on_hyphens=False)
+        lines += [line.replace("\u00a0", " ") for line in wrapper.wrap(f"{kind}: {text}")]
+    return lines
 
 
 def collect_returns(data: EnvironmentData) -> Returns:

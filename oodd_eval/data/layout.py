@@ -1,8 +1,9 @@
 """Layout of a split on disk: one HDF5 file per environment, a manifest, content digests.
 
-A file holds one group per part. A group stores its trajectories as flat rows and offsets, counted
-in transitions: trajectory i owns transitions ``offsets[i]:offsets[i+1]`` and observation rows
-``offsets[i]+i : offsets[i+1]+i+1``. No dataset holds objects: parameters are JSON in UTF-8 bytes.
+A file holds one group per part, and the names and units of its columns in the group ``names``. A
+part stores its trajectories as flat rows and offsets, counted in transitions: trajectory i owns
+transitions ``offsets[i]:offsets[i+1]`` and observation rows ``offsets[i]+i : offsets[i+1]+i+1``. No
+dataset holds objects: parameters, and names with units, are JSON in UTF-8 bytes.
 The digest of a group covers names, dtypes, shapes and little-endian bytes of its datasets, and
 nothing of chunks or compression.
 """
@@ -13,7 +14,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,12 +22,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.facts import Quantity, SplitDefinition
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.data.parts import CALIBRATION, NAMES, PARTS, TRAIN, TWINS
 from oodd_eval.errors import SplitError
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
 
 NOMINAL_DTYPES: Final = {
@@ -34,7 +35,10 @@ NOMINAL_DTYPES: Final = {
     **dict.fromkeys(("offsets", "seeds"), "<i8"),
     "terminated": "|u1",
 }
-ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {"onsets": "<i8", "redraws": "<i8", "parameters": "|S"}
+ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {
+    **dict.fromkeys(("onsets", "effects", "redraws"), "<i8"),
+    "parameters": "|S",
+}
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
 _BLOCK: Final = 1 << 21
@@ -106,6 +110,34 @@ def check_layout(file: str, name: str, group: h5py.Group) -> None:
                 f"{where}, {dataset} has {len(group[dataset])} rows, expected {expected} "
                 f"for {n} trajectories with {total} transitions"
             )
+    if "effects" in lengths:
+        onsets, effects = group["onsets"][:], group["effects"][:]
+        wrong = (onsets < 0) | (effects < onsets) | (effects > np.diff(offsets))
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise SplitError(
+                f"{where}: trajectory {i} has its onset at row {onsets[i]} and its effect at row "
+                f"{effects[i]}, expected 0 <= onset <= effect <= {offsets[i + 1] - offsets[i]}, "
+                "the last row"
+            )
+
+
+def check_names(file: str, stored: h5py.File) -> None:
+    """Raise `SplitError` unless a file names each column of its observations and actions."""
+    for kind, columns in (("sensors", "observations"), ("actions", "actions")):
+        if f"{NAMES}/{kind}" not in stored:
+            raise SplitError(f"{file} lacks the names of its {kind}: build or fetch it again")
+        names = stored[f"{NAMES}/{kind}"]
+        if names.dtype.kind != "S":
+            raise SplitError(f"{file}, {NAMES}/{kind} has dtype {names.dtype.str}, expected |S")
+        for part in PARTS:
+            if f"{part}/{columns}" in stored:
+                shape = stored[f"{part}/{columns}"].shape
+                if (*shape[1:], len(shape)) != (len(names), 2):
+                    raise SplitError(
+                        f"{file}, group {part}: {columns} have shape {shape}, expected "
+                        f"{len(names)} columns, since {NAMES} has as many {kind}"
+                    )
 
 
 def content_digest(group: Mapping[str, Any]) -> str:
@@ -130,14 +162,20 @@ def _blocks(data: Any) -> Iterator[NDArray[Any]]:
         yield np.asarray(data[start : start + step])
 
 
-def environment_digest(groups: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the digest of an environment from what the manifest says of its groups."""
-    return _canonical_digest({name: entry["sha256"] for name, entry in groups.items()})
+def environment_digest(entry: Mapping[str, Any]) -> str:
+    """Return the digest of an environment from its manifest entry: that of all its groups."""
+    digests = {name: group["sha256"] for name, group in entry["groups"].items()}
+    return _canonical_digest(digests | {NAMES: names_digest(entry)})
+
+
+def names_digest(entry: Mapping[str, Any]) -> str:
+    """Return the digest of an environment's group of names from its manifest entry."""
+    return content_digest({kind: pack_parameters(entry[kind]) for kind in ("sensors", "actions")})
 
 
 def split_digest(environments: Mapping[str, Any], definition: Mapping[str, Any]) -> str:
     """Return the digest of a split from its manifest's environments and recipe."""
-    digests = {name: environment_digest(entry["groups"]) for name, entry in environments.items()}
+    digests = {name: environment_digest(entry) for name, entry in environments.items()}
     return _canonical_digest({"environments": digests, "definition": dict(definition)})
 
 
@@ -146,19 +184,24 @@ def _canonical_digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def pack_parameters(parameters: list[dict[str, Any]]) -> NDArray[np.bytes_]:
+def pack_parameters(parameters: Sequence[Mapping[str, Any]]) -> NDArray[np.bytes_]:
     """Return parameters as fixed-width JSON texts, keys sorted."""
     texts = [json.dumps(p, sort_keys=True, separators=(",", ":")).encode() for p in parameters]
     return np.array(texts, dtype=f"S{max(map(len, texts), default=1)}")
 
 
 def write_environment(
-    path: Path, groups: Iterable[tuple[str, Arrays]], policy: str
-) -> dict[str, Any]:
+    path: Path, groups: Iterable[tuple[str, Arrays]], policy: str, *,
+    sensors: Sequence[Quantity], actions: Sequence[Quantity],
+) -> dict[str, Any]:  # fmt: skip
     """Write an environment's groups, one at a time, in one step; return its manifest entry."""
+    names = {"sensors": [dataclasses.asdict(q) for q in sensors],
+             "actions": [dataclasses.asdict(q) for q in actions]}  # fmt: skip
     entries: dict[str, dict[str, Any]] = {}
     with replacing(path) as partial, h5py.File(partial, "w", libver="v110") as file:
         file.attrs["schema"] = SCHEMA
+        for kind, quantities in names.items():
+            _write(file.require_group(NAMES), kind, pack_parameters(quantities), "|S")
         for name, arrays in groups:
             group = file.create_group(name)
             for dataset, dtype in dtypes_of(name).items():
@@ -167,14 +210,15 @@ def write_environment(
             n, total = len(group["seeds"]), int(group["offsets"][-1])
             digest = content_digest(group)
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
-    digest = environment_digest(entries)
-    return {"file": path.name, "policy": policy, "digest": digest, "groups": entries}
+        check_names(path.name, file)
+    entry = {"groups": entries, **names}
+    return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
 
 
 def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: str) -> None:
     if not isinstance(content, Blocks):
         array = np.asarray(content)
-        dtype = array.dtype.str if name == "parameters" else dtype  # texts keep their width
+        dtype = array.dtype.str if dtype == "|S" else dtype  # texts keep their width
         content = Blocks(array.shape, lambda: [array])
     row = int(np.prod(content.shape[1:], dtype=np.int64)) * np.dtype(dtype).itemsize
     gzip = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
@@ -200,7 +244,9 @@ def _manifest_schema() -> Any:
     # Others trust these numbers with memory and disk.
     count = core_schema.int_schema(gt=0, le=10**10)
     group = record(sha256=text, trajectories=count, transitions=count)
-    environment = record(file=text, policy=text, digest=text, groups=by_name(text, group))
+    names = core_schema.list_schema(record(name=text, unit=text), min_length=1)
+    environment = record(file=text, policy=text, digest=text, groups=by_name(text, group),
+                         sensors=names, actions=names)  # fmt: skip
     environments, schema = by_name(text, environment), core_schema.literal_schema([SCHEMA])
     named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
@@ -231,10 +277,17 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     try:
         manifest: dict[str, Any] = _manifest_schema().validate_json(file.read_bytes())
     except ValidationError as error:
+        problems = error.errors(include_url=False)
+        other = next((p["input"] for p in problems if p["loc"] == ("schema",)), None)
+        if isinstance(other, int):
+            raise SplitError(
+                f"{file} is of a split with layout schema {other}, expected {SCHEMA}: it was "
+                "written by another version of oodd-eval; remove it, then build or fetch it again"
+            ) from None
         found = "; ".join(
             f"{'.'.join(map(str, p['loc'])) or 'content'}: {p['msg']}"
             + (f", got {p['input']!r}"[:100] if p["type"] != "missing" else "")
-            for p in error.errors(include_url=False)
+            for p in problems
         )
         raise SplitError(f"{file} is not a split's manifest: {found}") from None
     except OSError as error:

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import SplitError, UnknownNameError
 
@@ -25,6 +25,9 @@ TWINS: Final = "test/nominal"
 
 PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
 """All parts in the benchmark's order. Each is a group of the environment's file."""
+
+NAMES: Final = "names"
+"""The group of an environment's file that names the columns of observations and actions."""
 
 _ROWS: Final = 1 << 14
 """Transitions that are read at once from a large part, unless a single trajectory has more."""
@@ -101,18 +104,30 @@ class AnomalousSet(TrajectorySet):
     """Anomalous trajectories and what is known of them; number i is the twin of test seed i.
 
     `onsets` (int64, of shape (n,)) are the first observations that may differ from the twins',
-    `redraws` the numbers of draws that were rejected.
+    `effects` those that do differ first, never before the onsets, and `redraws` the numbers of
+    draws that were rejected.
     """
 
     def __init__(self, file: h5py.File, group: str) -> None:
         super().__init__(file, group)
         self.onsets: NDArray[np.int64] = self._data["onsets"][:]
+        self.effects: NDArray[np.int64] = self._data["effects"][:]
         self.redraws: NDArray[np.int64] = self._data["redraws"][:]
 
     @functools.cached_property
     def parameters(self) -> list[dict[str, Any]]:
         """Values that the anomaly drew for each trajectory."""
         return [json.loads(text) for text in self._data["parameters"][:]]
+
+    @property
+    def tails(self) -> NDArray[np.int64]:
+        """Transitions of each trajectory beyond its onset."""
+        return self.lengths - self.onsets
+
+    @property
+    def brief(self) -> bool:
+        """True when the median tail is under 20: the anomaly ends most episodes at once."""
+        return bool(np.median(self.tails) < BRIEF_TAIL)
 
 
 class EnvironmentData:
@@ -154,6 +169,20 @@ class EnvironmentData:
         if f"test/{anomaly}" not in self._file:
             raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
         return AnomalousSet(self._file, f"test/{anomaly}")
+
+    @functools.cached_property
+    def sensors(self) -> tuple[Quantity, ...]:
+        """Names and units of the columns of observations."""
+        return self._named("sensors")
+
+    @functools.cached_property
+    def actions(self) -> tuple[Quantity, ...]:
+        """Names and units of the columns of actions."""
+        return self._named("actions")
+
+    def _named(self, kind: str) -> tuple[Quantity, ...]:
+        rows = map(json.loads, self._file[f"{NAMES}/{kind}"][:])
+        return tuple(Quantity(row["name"], row["unit"]) for row in rows)
 
     @property
     def anomalies(self) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import h5py
 from oodd_eval.data import layout
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.parts import NAMES, PARTS, EnvironmentData
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
 
 SHIPPED = Path(__file__).with_name("shipped")
@@ -133,8 +133,8 @@ class Split:
                     "fetch it again"
                 )
             stack.pop_all()
-        groups = self.manifest["environments"][name]["groups"]
-        return EnvironmentData(name, file, layout.environment_digest(groups))
+        digest = layout.environment_digest(self.manifest["environments"][name])
+        return EnvironmentData(name, file, digest)
 
     def verify(self) -> Iterator[GroupCheck]:
         """Compare every group with the manifest; `SplitError` when a file cannot be read."""
@@ -158,17 +158,25 @@ class Split:
 
     def _checks(self, name: str, file: h5py.File) -> Iterator[GroupCheck]:
         short = Path(file.filename).name
-        for group, entry in self.manifest["environments"][name]["groups"].items():
+        entry = self.manifest["environments"][name]
+        expected = {group: str(found["sha256"]) for group, found in entry["groups"].items()}
+        held = [part for part in PARTS if part in file]
+        if {*held, *expected} != {*expected} & {*PARTS}:
+            raise SplitError(f"{short} holds the groups {held}, expected {[*expected]}")
+        for group, digest in (expected | {NAMES: layout.names_digest(entry)}).items():
             if group not in file:
                 raise SplitError(f"{short} lacks the group {group}: build or fetch it again")
             try:
-                layout.check_layout(short, group, file[group])
+                if group == NAMES:
+                    layout.check_names(short, file)
+                else:
+                    layout.check_layout(short, group, file[group])
                 found = layout.content_digest(file[group])
-            except (OSError, KeyError, RuntimeError) as error:
+            except (OSError, KeyError, RuntimeError, AttributeError, TypeError) as error:
                 raise SplitError(
                     f"{short}, group {group} cannot be read ({error}): build or fetch it again"
                 ) from error
-            yield GroupCheck(short, group, str(entry["sha256"]), found)
+            yield GroupCheck(short, group, digest, found)
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,4 +1,4 @@
-"""One episode as a detector sees it, and ragged batches of episodes.
+"""One episode as a detector sees it, and sequences of episodes.
 
 Time runs as in the protocol: observations ``o_0 .. o_T`` (T + 1 rows) and the commanded actions
 ``a_0 .. a_{T-1}`` between them; ``a_t`` was chosen after ``o_t`` was seen.
@@ -25,8 +25,9 @@ class Trajectory:
     ----------
     observations : array of shape (T + 1, D)
         Rows ``o_0 .. o_T`` in the simulator's units; stored as read-only float32, as are actions.
-    actions : array of shape (T, A)
-        Rows ``a_0 .. a_{T-1}``, commanded by the policy; a discrete action is a one-hot row.
+    actions : array of shape (T, A), optional
+        Rows ``a_0 .. a_{T-1}``, commanded by the policy; a discrete action is a one-hot row. None
+        for an episode without known actions: rows of width A = 0.
 
     Raises
     ------
@@ -40,14 +41,16 @@ class Trajectory:
     (3, 2, 2, 1)
     >>> len(episode[:2])
     2
+    >>> episode.without_actions()
+    Trajectory(T=2, D=2, A=0)
     """
 
     observations: NDArray[np.float32]
     actions: NDArray[np.float32]
 
-    def __init__(self, observations: ArrayLike, actions: ArrayLike) -> None:
+    def __init__(self, observations: ArrayLike, actions: ArrayLike | None = None) -> None:
         o = _matrix("observations", observations)
-        a = _matrix("actions", actions)
+        a = _matrix("actions", np.empty((len(o) - 1, 0)) if actions is None else actions)
         if len(o) != len(a) + 1:
             raise TrajectoryError(
                 f"a trajectory has one observation more than actions: got {len(o)} observations "
@@ -74,6 +77,10 @@ class Trajectory:
             )
         return Trajectory(self.observations[:n], self.actions[: n - 1])
 
+    def without_actions(self) -> Trajectory:
+        """Return the same observations with actions of width 0."""
+        return Trajectory(self.observations) if self.action_dim else self
+
     @property
     def transitions(self) -> int:
         """Number of transitions, T."""
@@ -86,7 +93,7 @@ class Trajectory:
 
     @property
     def action_dim(self) -> int:
-        """Width of an action row, A."""
+        """Width of an action row, A; 0 where actions are not known."""
         return int(self.actions.shape[1])
 
 
@@ -111,10 +118,10 @@ def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
         array = np.array(values, dtype=np.float32, order="C", ndmin=1)
     except (TypeError, ValueError) as error:
         raise TrajectoryError(f"{what} cannot be read as a float32 matrix: {error}") from None
-    if array.ndim != 2 or array.shape[1] == 0 or (what == "observations" and len(array) == 0):
+    if array.ndim != 2 or (what == "observations" and 0 in array.shape):
         raise TrajectoryError(
-            f"{what} have shape {array.shape}, expected (rows, columns) with at least one column"
-            + (" and one row" if what == "observations" else "")
+            f"{what} have shape {array.shape}, expected (rows, columns)"
+            + (" with at least one row and one column" if what == "observations" else "")
         )
     bad = ~np.isfinite(array)
     if bad.any():
@@ -125,20 +132,3 @@ def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
         )
     array.flags.writeable = False
     return array
-
-
-def pad(arrays: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Stack arrays of shape (n_b, D) into (B, max n_b, D), zeros behind their ends; return lengths.
-
-    Raises `TrajectoryError` without an array, or for arrays of different widths.
-    """
-    if not arrays:
-        raise TrajectoryError("no sequences to stack: expected at least one")
-    widths = {a.shape[1] for a in arrays}
-    if len(widths) > 1:
-        raise TrajectoryError(f"sequences of different widths cannot be stacked: {sorted(widths)}")
-    lengths = np.array([len(a) for a in arrays], dtype=np.int64)
-    batch = np.zeros((len(arrays), int(lengths.max()), widths.pop()), dtype=np.float32)
-    for row, array in zip(batch, arrays, strict=True):
-        row[: len(array)] = array
-    return batch, lengths

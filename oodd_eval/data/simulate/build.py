@@ -21,6 +21,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,10 @@ def build_split(
         files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
         groups = ((part, _joined(part, files[part.split("/")[0]])) for part in PARTS)
         target = directory / f"{environment}.h5"
-        entries[environment] = layout.write_environment(target, groups, digests[environment])
+        info = ENVIRONMENTS[environment]
+        entries[environment] = layout.write_environment(
+            target, groups, digests[environment], sensors=info.sensors, actions=info.actions
+        )
     ordered = {e: entries[e] for e in ENVIRONMENTS if e in entries}
     versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
     layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
@@ -183,7 +187,10 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
     if not chunks:
         return
     context = multiprocessing.get_context("spawn")
-    with _single_threaded_children(), ProcessPoolExecutor(jobs, context, _watch_parent) as pool:
+    # Sums depend on the number of threads of matrix libraries, which these read when they load,
+    # before any code of ours runs in a child.
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with patch.dict(os.environ, single), ProcessPoolExecutor(jobs, context, _watch_parent) as pool:
         running = {pool.submit(record_chunk, chunk, work): chunk for chunk in chunks}
         try:
             for future in as_completed(running):
@@ -191,23 +198,6 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
                 yield running[future]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Let child processes start with one thread per matrix library: sums depend on their number.
-
-    The libraries look at the environment when they load, before any code of ours runs in a child.
-    """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ[name] for name in names if name in os.environ}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name in names:
-            del os.environ[name]
-        os.environ.update(before)
 
 
 def _watch_parent() -> None:
@@ -253,6 +243,7 @@ def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     }
     if episodes[0].onset is not None:
         found["onsets"] = np.array([e.onset for e in episodes], dtype=np.int64)
+        found["effects"] = np.array([e.effect for e in episodes], dtype=np.int64)
         found["redraws"] = np.array([e.redraws for e in episodes], dtype=np.int64)
         found["parameters"] = layout.pack_parameters([e.parameters for e in episodes])
     return found

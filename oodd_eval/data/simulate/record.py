@@ -1,14 +1,15 @@
 """Recording: a trajectory is a pure function of environment, anomaly, seed, cap and policy.
 
 The anomalous episode of a seed replays its nominal twin's actions up to the onset, which the policy
-would choose anyway, since the observations are the same.
+would choose anyway, since the observations are the same. An episode that equals its twin, or ends
+soon after its onset, is drawn again: onset and parameters.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,14 +24,14 @@ from oodd_eval.errors import SimulationError, UnknownNameError
 
 _Rows = NDArray[np.float32]
 
-GENERATOR_VERSION: Final = 1
+GENERATOR_VERSION: Final = 2
 """Raised by every change that gives other bytes for the same seed."""
 
 FIRST_ONSET: Final = 30
 LAST_ONSET_SHARE: Final = 0.6
 SHORTEST_TWIN: Final = 50
-SHORTEST_TAIL: Final = 5
-"""An anomalous episode has more than this many transitions beyond the onset."""
+SHORTEST_TAIL: Final = 20
+"""An anomalous episode has more than this many transitions beyond the onset, if any draw does."""
 
 MAX_REDRAWS: Final = 100
 EVALUATION_SEED: Final = 900_000_000
@@ -45,8 +46,9 @@ class TwinTooShortError(SimulationError):
 class Episode:
     """One recorded episode; `terminated` is True when the simulator, not the cap, ended it.
 
-    `onset` is the index of the first observation that may differ from the twin's, None when
-    nominal; `parameters` are what the anomaly drew, `redraws` counts rejected draws.
+    `onset` is the index of the first observation that may differ from the twin's, `effect` of the
+    first that does, both None when nominal; `parameters` are what the anomaly drew, `redraws`
+    counts rejected draws.
     """
 
     trajectory: Trajectory
@@ -54,6 +56,7 @@ class Episode:
     terminated: bool
     seed: int
     onset: int | None = None
+    effect: int | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
     redraws: int = 0
 
@@ -64,7 +67,8 @@ def record_seed(
 ) -> dict[str | None, Episode]:  # fmt: skip
     """Record the nominal twin of a seed (key None) and one episode per anomaly.
 
-    Raises `TwinTooShortError` when an onset would not fit, `SimulationError` after 100 redraws.
+    Raises `TwinTooShortError` when an onset would not fit, `SimulationError` when an anomaly
+    changes nothing in 100 redraws.
     """
     names = list(anomalies)
     if unknown := [name for name in names if name not in ANOMALIES]:
@@ -111,20 +115,38 @@ def _record_anomalous(
     if ENVIRONMENTS[environment].discrete:
         commands = [int(row.argmax()) for row in commands]
     last = int(LAST_ONSET_SHARE * len(commands))
+    longest: Episode | None = None
+    tail = -1
     for attempt in range(MAX_REDRAWS + 1):
         rng = generator(environment, anomaly, twin.seed, attempt)
         onset = int(rng.integers(FIRST_ONSET, last + 1))
         given = (commands[: onset - 1], (anomaly, rng))
-        found = _run(environment, twin.seed, policy, episode_cap, *given)
-        rows, actions, rewards, over, parameters = found
-        same = np.array_equal(rows, twin.trajectory.observations)
-        if not same and len(rewards) > onset + SHORTEST_TAIL:
-            trajectory = Trajectory(rows, actions)
-            return Episode(trajectory, rewards, over, twin.seed, onset, parameters, attempt)
-    raise SimulationError(
-        f"no acceptable {anomaly} episode of {environment} with seed {twin.seed} in {MAX_REDRAWS} "
-        f"redraws: each equalled its twin or ended within {SHORTEST_TAIL} steps of its onset"
-    )
+        rows, actions, rewards, over, parameters = _run(
+            environment, twin.seed, policy, episode_cap, *given
+        )
+        effect = first_difference(rows, twin.trajectory.observations)
+        if effect is None or len(rewards) - onset <= tail:
+            continue
+        tail, drawn = len(rewards) - onset, (onset, effect, parameters, attempt)
+        longest = Episode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
+        if tail > SHORTEST_TAIL:
+            return longest
+    if longest is None:
+        raise SimulationError(
+            f"no {anomaly} episode of {environment} with seed {twin.seed} differs from its twin in "
+            f"{MAX_REDRAWS} redraws, expected one: the policy or the simulator ignores the anomaly"
+        )
+    return replace(longest, redraws=MAX_REDRAWS)
+
+
+def first_difference(rows: _Rows, twin: _Rows) -> int | None:
+    """Return the index of the first row that differs from the twin's, None if no common row does.
+
+    Rows of shape (n, D) and (m, D) have min(n, m) in common.
+    """
+    common = min(len(rows), len(twin))
+    differs = (rows[:common] != twin[:common]).any(axis=1)
+    return int(differs.argmax()) if differs.any() else None
 
 
 def _run(

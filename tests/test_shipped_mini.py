@@ -1,0 +1,195 @@
+"""The shipped split keeps the protocol's promises, and stock simulators give its bytes again."""
+
+import zlib
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium")
+from gymnasium.envs.box2d import lunar_lander
+from gymnasium.envs.classic_control.acrobot import AcrobotEnv
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+from pybullet_envs_gymnasium import gym_locomotion_envs
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
+from oodd_eval.data.simulate.anomalies import VALUES
+from oodd_eval.data.simulate.policies import load_policy
+from oodd_eval.data.split import SHIPPED, load_split
+
+SENSOR = [a for a, info in ANOMALIES.items() if info.group == "sensor"]
+
+
+@pytest.fixture(scope="module", params=ENVIRONMENTS)
+def data(request):
+    opened = load_split("mini").environment(request.param)
+    yield opened
+    opened.close()
+
+
+def test_it_is_the_published_one_and_at_most_25_mb():
+    split = load_split("mini")
+    assert split.name == "mini"
+    definition = SPLITS["mini"]
+    assert (definition.train, definition.calibration, definition.test) == (40, 40, 10)
+    assert split.manifest["definition"]["seed_base"] == definition.seed_base
+    assert sum(f.stat().st_size for f in (SHIPPED / "mini").iterdir()) <= 25e6
+
+
+def test_policies_of_the_shipped_split_are_the_shipped_policies():
+    entries = load_split("mini").manifest["environments"]
+    assert {e: entry["policy"] for e, entry in entries.items()} == {
+        e: load_policy(e).digest for e in ENVIRONMENTS
+    }
+
+
+def test_columns_are_named_as_in_the_facts(data):
+    info = ENVIRONMENTS[data.id]
+    assert (data.sensors, data.actions) == (info.sensors, info.actions)
+
+
+def test_episodes_are_their_twins_bit_for_bit_before_the_effect_and_differ_at_it(data):
+    for anomaly in ANOMALIES:
+        part = data.anomalous(anomaly)
+        assert part.seeds.tolist() == data.twins.seeds.tolist()
+        for i, (x, twin) in enumerate(zip(part, data.twins, strict=True)):
+            onset, effect = part.onsets[i], part.effects[i]
+            assert 30 <= onset <= int(0.6 * twin.transitions)
+            assert onset <= effect < min(len(x), len(twin)), (anomaly, i)
+            same = x.observations[:effect].tobytes() == twin.observations[:effect].tobytes()
+            assert same, (anomaly, i)
+            assert (x.observations[effect] != twin.observations[effect]).any(), (anomaly, i)
+            assert x.actions[:effect].tobytes() == twin.actions[:effect].tobytes(), (anomaly, i)
+
+
+def test_tails_have_more_than_20_transitions_unless_100_redraws_failed(data):
+    for anomaly in ANOMALIES:
+        part = data.anomalous(anomaly)
+        tails = part.lengths - part.onsets
+        assert ((tails > 20) | (part.redraws == 100)).all(), anomaly
+        assert part.brief == (np.median(tails) < 20), anomaly
+
+
+def test_a_fifth_of_the_sensors_is_corrupted_and_never_a_discrete_one(data):
+    rows = np.concatenate([x.observations for x in data.train])
+    distinct = [len(np.unique(column)) for column in rows.T]
+    for anomaly in SENSOR:
+        for parameters in data.anomalous(anomaly).parameters:
+            chosen = parameters["sensors"]
+            assert len(set(chosen)) == len(chosen) == max(1, len(data.sensors) // 5)
+            assert not [data.sensors[s].name for s in chosen if "contact" in data.sensors[s].name]
+            assert min(distinct[s] for s in chosen) > 8
+
+
+# Stock simulators, driven by nothing but what the split stores
+
+CASES = [
+    ("acrobot", "iid"), ("acrobot", "wind-l2r"), ("acrobot", "components"),
+    ("cartpole", "calibration"), ("cartpole", "wind-r2l"), ("cartpole", "gravity"),
+    ("lunarlander", "drift"), ("lunarlander", "wind-l2r"), ("lunarlander", "components"),
+    ("ant", "shutdown"), ("ant", "wind-r2l"), ("ant", "gravity"),
+    ("halfcheetah", "iid"), ("halfcheetah", "wind-l2r"), ("halfcheetah", "components"),
+    ("hopper", "calibration"), ("hopper", "wind-l2r"), ("hopper", "gravity"),
+    ("walker2d", "drift"), ("walker2d", "wind-r2l"), ("walker2d", "components"),
+]  # fmt: skip
+
+
+class Stock:
+    """A simulator as its authors ship it, with the changes of an anomaly made by hand."""
+
+    def __init__(self, environment, monkeypatch):
+        classic = {"acrobot": AcrobotEnv, "cartpole": CartPoleEnv,
+                   "lunarlander": lunar_lander.LunarLander}  # fmt: skip
+        robot = f"{ENVIRONMENTS[environment].title}BulletEnv"
+        self.kind, self.patch = environment, monkeypatch
+        self.env = (classic.get(environment) or getattr(gym_locomotion_envs, robot))()
+
+    def change(self, name, value):
+        env, kind = self.env, self.kind
+        if kind == "acrobot":
+            what, number = name.split("_")[1:]
+            setattr(env, f"LINK_{what.upper()}_{number}", value)
+            if what == "length":
+                setattr(env, f"LINK_COM_POS_{number}", value / 2)
+        elif kind == "cartpole":
+            stock = {"gravity": "gravity", "pole_length": "length", "pole_mass": "masspole"}
+            setattr(env, stock[name], value)
+            env.total_mass = env.masspole + env.masscart
+            env.polemass_length = env.masspole * env.length
+        elif kind == "lunarlander" and name == "gravity":
+            env.world.gravity = (0, -value)
+        elif kind == "lunarlander":
+            self.patch.setattr(lunar_lander, name.upper(), value)
+        elif name == "gravity":
+            env._p.setGravity(0, 0, -value)
+        else:
+            env.robot.power = value
+
+    def step(self, action, wind):
+        """Step with wind blowing (-1, 0, 1)."""
+        env, kind = self.env, self.kind
+        if kind == "acrobot":
+            push = action - 1
+            torque = push if not wind else 2 * push if push == wind else 0
+            env.AVAIL_TORQUE = [torque] * 3
+        elif kind == "cartpole":
+            pushes = 1 if action == 1 else -1
+            env.force_mag = {pushes: 20.0, -pushes: 0.0}.get(wind, 10.0)
+        elif kind == "lunarlander":
+            pushes = {1: -1, 3: 1}.get(action, 0)
+            power = 1.2 if wind and pushes == wind else 0.6
+            if wind:
+                action = 0 if pushes == -wind else action
+                self.patch.setattr(lunar_lander, "SIDE_ENGINE_POWER", power)
+        elif wind:
+            action = np.clip(action + np.float32(wind * 0.33), -1, 1)
+        row = np.asarray(env.step(action)[0], np.float32)
+        if kind == "lunarlander" and wind:
+            self.patch.setattr(lunar_lander, "SIDE_ENGINE_POWER", 0.6)
+        return row
+
+
+def corrupted(anomaly, row, t, parameters, rng):
+    chosen, row = parameters["sensors"], row.copy()
+    true = row[chosen].astype(float)
+    row[chosen] = {
+        "iid": lambda: true + rng.normal(parameters["mean"], parameters["std"], len(chosen)),
+        "shutdown": lambda: 0 * true,
+        "calibration": lambda: true * parameters["factor"],
+        "drift": lambda: true + parameters["slope"] * t,
+    }[anomaly]()
+    return row
+
+
+@pytest.mark.parametrize(("environment", "anomaly"), CASES)
+def test_stock_simulators_give_the_same_bits_again(environment, anomaly, monkeypatch):
+    data, info = load_split("mini").environment(environment), ENVIRONMENTS[environment]
+    part, policy = data.anomalous(anomaly), load_policy(environment)
+    i = int(part.redraws.argmin())
+    onset, parameters, seed = int(part.onsets[i]), part.parameters[i], int(part.seeds[i])
+    # The anomaly's own stream of random numbers: first the onset, then what it draws.
+    names = [zlib.crc32(name.encode()) for name in (environment, anomaly)]
+    rng = np.random.default_rng([2, *names, seed, int(part.redraws[i])])
+    assert rng.integers(30, int(0.6 * data.twins.lengths[i]) + 1) == onset
+    if anomaly in SENSOR:
+        listed, count = VALUES["sensors"][environment], len(parameters["sensors"])
+        assert sorted(rng.choice(listed, count, replace=False)) == parameters["sensors"]
+    stock, x = Stock(environment, monkeypatch), part[i]
+    rows = [np.asarray(stock.env.reset(seed=seed)[0], np.float32)]
+    for t, stored in enumerate(x.actions, start=1):
+        action = policy.act(x.observations[t - 1])
+        assert (np.eye(info.action_dim)[action] if info.discrete else action).tolist() == (
+            stored.tolist()
+        ), f"the policy acts on what is stored, row {t - 1}"
+        wind = parameters.get("direction", 0) if t >= onset else 0
+        if wind and info.discrete and rng.random() >= parameters["probability"]:
+            wind = 0
+        if t == onset and anomaly in {"gravity", "components"}:
+            for name, value in parameters.items():
+                stock.change(name, value)
+        row = stock.step(action, wind)
+        if t >= onset and anomaly in SENSOR:
+            row = corrupted(anomaly, row, t, parameters, rng)
+        rows.append(row)
+    stock.env.close()
+    data.close()
+    assert np.array_equal(np.array(rows), x.observations)
