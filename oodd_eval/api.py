@@ -33,7 +33,7 @@ def evaluate(
     detector
         Name of an installed detector, which runs in worker processes, as on the command line. Or a
         `DetectorSpec`, or a factory called as ``factory(seed=..., horizon=..., **parameters)``,
-        which run in this process.
+        which run in this process. A factory's detector is shown actions, a spec's if it says so.
     split
         Name or path of a split, or an opened one.
     environments, anomalies
@@ -74,7 +74,9 @@ def evaluate(
         plugins = discover(only=())
         if not isinstance(detector, DetectorSpec):
             shown = getattr(detector, "__name__", type(detector).__name__).lower()
-            detector = DetectorSpec(shown, detector, "", parameters=declared_by(given))
+            detector = DetectorSpec(
+                shown, detector, "", inputs="observations+actions", parameters=declared_by(given)
+            )
         name = detector.name
         plugins.add(Offer(detector, "", "", "local", ""))
     plan = make_plan(

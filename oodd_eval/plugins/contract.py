@@ -11,7 +11,6 @@ uses nothing after t (randomness has to be keyed by seed and time, not by call o
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from oodd_eval.data.trajectory import Trajectory
 
-CONTRACT: Final = 1
+CONTRACT: Final = 2
 """Version of how the harness fits and scores, part of every key of scores and fits.
 
 Raise it by hand when a change of the harness changes scores.
@@ -42,7 +41,7 @@ MIN_ROWS: Final = 8
 """Observations of the shortest episode that is cut."""
 
 TOLERANCE: Final = 1e-5
-"""Relative difference that stands for the same score where matrices differ in shape.
+"""Difference that stands for the same score where matrices differ in shape: see `difference`.
 
 Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
 """
@@ -100,15 +99,17 @@ class StreamingDetector(Detector, Protocol):
     def update(
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> float:
-        """Return the score of the next observation: that of `score`, to a relative 1e-5.
+        """Return the score of the next observation: that of `score`.
+
+        They may differ by 1e-5 of the spread of scores (`difference`).
 
         Parameters
         ----------
         observation : float32 array of shape (D,)
             The newest sensor readings.
         action : float32 array of shape (A,), optional
-            ``a_{t-1}``, commanded since the previous observation; None at the first one, and for
-            detectors that do not look at actions.
+            ``a_{t-1}``, commanded since the previous observation; None at the first one. Detectors
+            that do not look at actions are given None or an action of width 0.
 
         Returns
         -------
@@ -162,7 +163,13 @@ class DetectorSpec:
     reference
         Where the method is from.
     inputs
-        What the scores depend on: observations alone, or commanded actions too.
+        What the scores depend on: observations alone, or commanded actions too. A detector that
+        declares observations is handed trajectories whose actions have width 0.
+    deterministic
+        Whether the seed changes nothing: results of one seed are then those of all.
+    alarm
+        The statistic of the guaranteed alarms: the CUSUM of standardized scores, or the score
+        itself, for a detector that accumulates by itself.
     parameters
         A frozen dataclass whose fields are the parameters that ``--param`` may set, each declared
         with `oodd_eval.plugins.parameters.parameter`. None when there are none.
@@ -186,6 +193,8 @@ class DetectorSpec:
     summary: str
     reference: str = ""
     inputs: Literal["observations", "observations+actions"] = "observations"
+    deterministic: bool = False
+    alarm: Literal["cusum", "score"] = "cusum"
     parameters: type | None = None
     other_parameters: bool = False
     requires: tuple[str, ...] = ()
@@ -265,34 +274,37 @@ def check_scores(
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """The first `rows` observations of trajectory `index` of a part, scored on their own."""
+    """The first `rows` observations of trajectory `index` of a part, or all of them."""
 
     part: str
     index: int
     rows: int
 
 
-def probes(lengths: Mapping[str, Sequence[int]], key: str) -> list[Probe]:
-    """Draw prefixes of different episodes, between a quarter and three quarters of each.
+def probes(lengths: Mapping[str, Sequence[int]], seed: int) -> list[Probe]:
+    """Draw prefixes of different episodes, at least a quarter of each, and one with most of it.
 
-    `lengths` are the observations of each trajectory, by part. Equal keys give equal probes.
+    `lengths` are the observations of each trajectory, by part. No two are of one test seed, so that
+    they can be scored together. Equal seeds give equal probes. The first one is cut in the last
+    quarter of its episode.
     """
     import numpy as np  # noqa: PLC0415  see above
 
     every = ((part, i, n) for part, counts in lengths.items() for i, n in enumerate(counts))
     long = [(part, i, n) for part, i, n in every if n >= MIN_ROWS]
-    seed = int.from_bytes(hashlib.sha256(f"probes|{key}".encode()).digest())
-    rng = np.random.default_rng(seed)
-    chosen = (long[c] for c in rng.permutation(len(long))[:PROBES])
+    rng = np.random.default_rng([seed, PROBES])  # not the numbers that shuffle the groups
+    chosen: dict[tuple[bool, int], tuple[str, int, int]] = {}
+    for part, i, n in (long[c] for c in rng.permutation(len(long))):
+        chosen.setdefault((part.startswith("test/"), i), (part, i, n))
     return [
-        Probe(part, i, int(rng.integers(n // 4, 3 * n // 4, endpoint=True)))
-        for part, i, n in chosen
+        Probe(part, i, int(rng.integers(n // 4 if k else 3 * n // 4, n)))
+        for k, (part, i, n) in enumerate([*chosen.values()][:PROBES])
     ]
 
 
 def check_prefix(found: Scores, whole: Scores, *, detector: str, where: str) -> None:
     """Raise `ContractError` when the scores of a prefix differ from those of the whole episode."""
-    if wrong := difference(found, whole[: len(found)], PROBE_TOLERANCE):
+    if wrong := difference(found, whole, PROBE_TOLERANCE):
         raise ContractError(
             f"detector {detector!r} gives the first {len(found)} of {len(whole)} observations of "
             f"{where} other scores when they are all it gets: {wrong}; expected the same, as a "
@@ -301,22 +313,49 @@ def check_prefix(found: Scores, whole: Scores, *, detector: str, where: str) -> 
         )
 
 
-def difference(found: Scores, expected: Scores, tolerance: float = 0.0) -> str:
-    """Return where two score sequences of one length differ first; empty when they do not.
+def difference(found: Scores, whole: Scores, tolerance: float = 0.0) -> str:
+    """Return where scores differ first from those of a whole episode; empty when they do not.
 
-    The tolerance is relative to the larger of the score itself and the mean magnitude of all
-    expected scores: a score that passes through zero has no relative precision.
+    Parameters
+    ----------
+    found, whole
+        Scores of the first rows of an episode, or of all, and of the whole episode.
+    tolerance
+        Relative to how far scores vary around the score: to its distance from the k-th nearest
+        other score of the episode, k being a tenth of all. So neither a constant that is added to
+        scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
+        scores are equal, they have to be equal in `found`, too.
     """
     import numpy as np  # noqa: PLC0415  see above
 
-    usual = np.abs(expected[np.isfinite(expected)])
+    expected = whole[: len(found)]
     # Scores near the largest float overflow here; another check finds that they are too large.
     with np.errstate(invalid="ignore", over="ignore"):
-        scale = np.maximum(np.abs(expected), usual.mean() if usual.size else 0.0)
         same = (found == expected) | (np.isnan(found) & np.isnan(expected))
-        if tolerance:
-            same |= np.abs(found - expected) <= tolerance * scale
+        if tolerance and not same.all():
+            same |= np.abs(found - expected) <= tolerance * _spread(expected, whole)
     if same.all():
         return ""
     t = int(np.flatnonzero(~same)[0])
-    return f"at t = {t} it is {found[t]:.10g} instead of {expected[t]:.10g}"
+    digits = 10 if f"{found[t]:.10g}" != f"{expected[t]:.10g}" else 17
+    return f"at t = {t} it is {found[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
+
+
+def _spread(scores: Scores, whole: Scores) -> Scores:
+    """Return the distance of each score to the k-th nearest other one of the whole episode."""
+    import numpy as np  # noqa: PLC0415  see above
+
+    ordered = np.sort(whole[np.isfinite(whole)])
+    if not ordered.size:
+        return np.zeros(len(scores))
+    k, last = max(1, len(ordered) // 10), len(ordered) - 1
+    place, spread = np.searchsorted(ordered, scores), np.full(len(scores), np.inf)
+    # The k nearest ones and the score itself are neighbours among the ordered scores.
+    for first in range(-k, 1):
+        low, high = place + first, place + first + k
+        inside = (low >= 0) & (high <= last)
+        farther = np.maximum(
+            scores - ordered[low.clip(0, last)], ordered[high.clip(0, last)] - scores
+        )
+        spread = np.where(inside, np.minimum(spread, farther), spread)
+    return np.where(np.isfinite(spread), spread, 0.0)

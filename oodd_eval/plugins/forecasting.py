@@ -63,11 +63,15 @@ class FeatureScale:
 
         Raises `TrajectoryError` when the trajectory has another number of sensors.
         """
+        self.must_fit(trajectory)
+        return ((trajectory.observations - self.mean) / self.std).astype(np.float32)
+
+    def must_fit(self, trajectory: Trajectory) -> None:
+        """Raise `TrajectoryError` when the trajectory has another number of sensors."""
         if (found := trajectory.observation_dim) != len(self.mean):
             what = f"fitted on {len(self.mean)} sensors and asked to score a trajectory of {found}"
             advice = "score trajectories of the environment that the detector was fitted on"
             raise TrajectoryError(f"{what}: {advice}")
-        return ((trajectory.observations - self.mean) / self.std).astype(np.float32)
 
     def row(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Return one standardized observation, float32 of shape (D,); raises as `checked` does."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from oodd_eval.data.facts import ANOMALIES, PROTOCOL
 from oodd_eval.names import Predicate
@@ -32,6 +32,8 @@ class Unit:
     version: str
     source: str = ""
     inputs: str = ""
+    alarm: Literal["cusum", "score"] = "cusum"
+    deterministic: bool = False
     scores_key: str = ""
     fit_key: str = ""
 
@@ -91,7 +93,8 @@ class Plan:
             detector=unit.detector, detector_version=unit.version,
             plugin=f"{unit.distribution}:{unit.plugin}", plugin_source=unit.source,
             parameters=dict(unit.shown), overrides=unit.setting.overrides, inputs=unit.inputs,
-            environment=unit.environment, anomaly=anomaly, group=ANOMALIES[anomaly].group,
-            horizon=unit.horizon, seed=unit.seed, split=self.split, split_digest=self.split_digest,
-            limit=self.limit, scores=unit.scores_key, protocol=PROTOCOL, **outcome,
+            alarm=unit.alarm, deterministic=unit.deterministic, environment=unit.environment,
+            anomaly=anomaly, group=ANOMALIES[anomaly].group, horizon=unit.horizon, seed=unit.seed,
+            split=self.split, split_digest=self.split_digest, limit=self.limit,
+            scores=unit.scores_key, protocol=PROTOCOL, **outcome,
         )  # fmt: skip

@@ -77,7 +77,7 @@ def make_unit(
         environment=environment, setting=Setting.of(spec.name, horizon, overrides), seed=seed,
         anomalies=tuple(anomalies), parameters=resolved, shown=shown, plugin=offer.plugin,
         distribution=offer.distribution, version=offer.version, source=source, inputs=spec.inputs,
-        scores_key=scores, fit_key=fit,
+        alarm=spec.alarm, deterministic=spec.deterministic, scores_key=scores, fit_key=fit,
     )  # fmt: skip
 
 

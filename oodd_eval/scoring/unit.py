@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import copy
+import secrets
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
 from itertools import islice
 from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.parts import EnvironmentData, TrajectorySet, lengths_of, limited, parts_of
+from oodd_eval.data.parts import (
+    TWINS,
+    EnvironmentData,
+    TrajectorySet,
+    lengths_of,
+    limited,
+    parts_of,
+)
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins.contract import (
+    Probe,
     Scores,
     check_prefix,
     check_scores,
@@ -21,8 +32,8 @@ from oodd_eval.plugins.contract import (
     score_chunk,
 )
 from oodd_eval.plugins.discovery import Offer, printable
-from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Request, Stop, run_isolated
-from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Stop, run_isolated
+from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory, ScoreFile
 from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
@@ -74,7 +85,9 @@ class UnitJob:
             return work.isolated(limits, stop, load=load, save=save)
 
         if results is None:
-            return work.checked(isolated())
+            # It is this process that removes what was saved, however the worker ends.
+            with tempfile.TemporaryDirectory(prefix="oodd-eval-") as place:
+                return work.checked(isolated(save=place))
         fits = results.fits
         return work.checked(_with_kept_fit(isolated, fits, self.unit.fit_key, stop, fresh=fresh))
 
@@ -88,99 +101,96 @@ class UnitJob:
 
 
 class _Work:
-    """The trajectories of one unit, the order in which they are scored, and the checks of scores.
+    """The trajectories of one unit, the groups in which they are scored, and the checks of scores.
 
-    Scoring is in an order that tells nothing of parts. A worker knows its seed, but not the
-    split's digest: it cannot draw the same order.
+    A group holds no two trajectories of one seed: as many calibration trajectories as there are
+    test seeds, the twins, one anomaly, or prefixes of other trajectories. It is scored apart from
+    all others. The order of groups, and which prefixes there are, follow from a number drawn from
+    the system's randomness, which is stored with the scores. Within a group the order is that of
+    the split, so that scores are the same bit for bit.
     """
 
     def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
         self._job, self._sets = job, sets
         self._lengths = lengths_of(sets, job.plan.limit)
-        key = f"{job.plan.split_digest}|{job.unit.environment}|{job.unit.seed}"
-        counts = {part: len(lengths) for part, lengths in self._lengths.items()}
-        self._order, self._probes = shuffled(counts, key), probes(self._lengths, key)
+        self._order = secrets.randbits(ORDER_BITS)
+        self._probes = probes(self._lengths, self._order)
+        self._ordered = [*groups(self._lengths), self._probes]
+        self._drawn = np.random.default_rng(self._order).permutation(len(self._ordered))
+        self._groups = [self._ordered[k] for k in self._drawn]
 
     def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
-        """Fit (or load a fit) and score in a worker process."""
+        """Fit (or load a fit) and score in worker processes."""
         unit, data = self._job.unit, self._job.data
         train = 0 if load else limited(len(data.train), self._job.plan.limit)
-        request = Request(
-            unit.plugin, unit.detector, dict(unit.parameters), unit.seed, unit.horizon, train,
-            load, save,
-        )  # fmt: skip
-        whole = (self._sets[part][i] for part, i in self._order)
-        cut = (self._sets[p.part][p.index][: p.rows] for p in self._probes)
-        return run_isolated(
-            request, islice(data.train, train), whole, cut, limits=limits, stop=stop
-        )
+        request = {
+            "plugin": unit.plugin, "detector": unit.detector, "parameters": dict(unit.parameters),
+            "seed": unit.seed, "horizon": unit.horizon,
+            "train": train, "load": load, "save": save,
+        }  # fmt: skip
+        nominal = map(self._shown, islice(data.train, train))
+        parts = map(self._members, self._groups)
+        return run_isolated(request, nominal, parts, limits=limits, stop=stop)
 
     def checked(self, outcome: Outcome) -> Scored:
-        """Check every score sequence of a worker and put them back in order."""
+        """Check every score sequence of a worker and put them in their places."""
         if outcome.status != "ok":
             return Scored(outcome.status, outcome.reason, log=outcome.log)  # type: ignore[arg-type]
+        returned, sizes = iter(outcome.scores), [*map(len, self._groups)]
+        if (n := len(outcome.scores)) != sum(sizes):
+            wrong = f"{n} score arrays came back, expected {sum(sizes)}"
+            return Scored("invalid", wrong, log=outcome.log)
+        try:
+            parts = self._placed([[*islice(returned, n)] for n in sizes], outcome.warm_up)
+        except ContractError as error:
+            return Scored("invalid", str(error), log=outcome.log)
+        # Prefixes, a few percent more, are others in every run, and records shall be the same.
+        steps = sum(map(sum, self._lengths.values()))
+        cost = {name: getattr(outcome, name) for name in COSTS}
+        known = {name: value for name, value in cost.items() if value is not None}
+        return Scored(file=ScoreFile(parts, {**known, "steps_scored": steps}, self._order))
+
+    def in_process(self) -> Scored:
+        """Fit and score in this process, a copy each group; errors of the detector pass through."""
+        unit, limit = self._job.unit, self._job.plan.limit
+        detector = make_detector(
+            self._job.offer.spec.factory, seed=unit.seed, horizon=unit.horizon,
+            parameters=unit.parameters,
+        )  # fmt: skip
+        detector.fit([*map(self._shown, islice(self._job.data.train, limit))])
+        returned = [
+            score_chunk(copy.deepcopy(detector), [*self._members(group)]) for group in self._groups
+        ]
+        parts = self._placed(returned, getattr(detector, "warm_up", 0))
+        return Scored(file=ScoreFile(parts, {}, self._order))
+
+    def _members(self, group: Sequence[Probe]) -> Iterator[Trajectory]:
+        return (self._shown(self._sets[p.part][p.index][: p.rows]) for p in group)
+
+    def _shown(self, trajectory: Trajectory) -> Trajectory:
+        """Return what the detector may see: no actions, unless it declares that it uses them."""
+        withheld = self._job.unit.inputs == "observations"
+        return trajectory.without_actions() if withheld else trajectory
+
+    def _placed(self, returned: list[list[object]], warm_up: object) -> dict[str, list[Scores]]:
+        """Check the scores of all groups; raise `ContractError`, or return them by part."""
         parts: dict[str, list[Scores]] = {
             p: [np.empty(0)] * len(n) for p, n in self._lengths.items()
         }
-        returned, warm_up = outcome.scores, outcome.warm_up
-        whole, prefixes = returned[: len(self._order)], returned[len(self._order) :]
-        try:
-            for (part, i), scores in zip(self._order, whole, strict=True):
-                parts[part][i] = self._check(scores, warm_up, part, i)
-            self._check_prefixes(prefixes, warm_up, parts)
-        except ContractError as error:
-            return Scored("invalid", str(error), log=outcome.log)
-        steps = sum(map(sum, self._lengths.values())) + sum(p.rows for p in self._probes)
-        cost = {name: getattr(outcome, name) for name in COSTS}
-        known = {name: value for name, value in cost.items() if value is not None}
-        return Scored(file=ScoreFile(parts, {**known, "steps_scored": steps}))
-
-    def in_process(self) -> Scored:
-        """Fit and score in this process; errors of the detector pass through."""
-        unit, limit = self._job.unit, self._job.plan.limit
-        detector = make_detector(
-            self._job.offer.spec.factory,
-            seed=unit.seed,
-            horizon=unit.horizon,
-            parameters=unit.parameters,
-        )
-        detector.fit(list(islice(self._job.data.train, limit)))
-        warm_up = getattr(detector, "warm_up", 0)
-        parts = {
-            part: [
-                self._check(scores, warm_up, part, i)
-                for i, scores in enumerate(score_chunk(detector, trajectories[:limit]))
-            ]
-            for part, trajectories in self._sets.items()
-        }
-        cut = [self._sets[p.part][p.index][: p.rows] for p in self._probes]
-        self._check_prefixes(score_chunk(detector, cut) if cut else [], warm_up, parts)
-        return Scored(file=ScoreFile(parts, {}))
-
-    def _check(
-        self, scores: object, warm_up: object, part: str, i: int, rows: int | None = None
-    ) -> Scores:
-        return check_scores(
-            scores,
-            self._lengths[part][i] if rows is None else rows,
-            horizon=self._job.unit.horizon,
-            warm_up=warm_up,
-            detector=self._job.unit.detector,
-            where=self._place(part, i),
-        )
-
-    def _check_prefixes(
-        self, returned: list[object], warm_up: object, parts: Mapping[str, list[Scores]]
-    ) -> None:
-        for probe, scores in zip(self._probes, returned, strict=True):
-            part, i = probe.part, probe.index
-            found = self._check(scores, warm_up, part, i, probe.rows)
-            check_prefix(
-                found, parts[part][i], detector=self._job.unit.detector, where=self._place(part, i)
-            )
-
-    def _place(self, part: str, i: int) -> str:
-        return f"{self._job.unit.environment}/{part}[{i}]"
+        scores, unit = dict(zip(self._drawn, returned, strict=True)), self._job.unit
+        # In the order of the split: the first fault that is told is the same in every run.
+        for k, group in enumerate(self._ordered):
+            for (part, i, rows), one in zip(map(astuple, group), scores[k], strict=True):
+                where = f"{unit.environment}/{part}[{i}]"
+                found = check_scores(
+                    one, rows, horizon=unit.horizon, warm_up=warm_up, detector=unit.detector,
+                    where=where,
+                )  # fmt: skip
+                if group is self._probes:
+                    check_prefix(found, parts[part][i], detector=unit.detector, where=where)
+                else:
+                    parts[part][i] = found
+        return parts
 
 
 def _with_kept_fit(
@@ -204,11 +214,11 @@ def _with_kept_fit(
     return outcome
 
 
-def shuffled(counts: Mapping[str, int], key: str) -> list[tuple[str, int]]:
-    """Return all trajectories to score, as part and number, in an order that a key decides.
+def groups(lengths: Mapping[str, Sequence[int]]) -> list[list[Probe]]:
+    """Return whole trajectories in groups of one part, at most as many as there are twins.
 
-    Position tells nothing of the part, and the same key gives the same order anywhere.
+    All have that size but the last one of calibration, where the twins do not divide it.
     """
-    ordered = [(part, i) for part, n in counts.items() for i in range(n)]
-    seed = int.from_bytes(hashlib.sha256(key.encode()).digest())
-    return [ordered[i] for i in np.random.default_rng(seed).permutation(len(ordered))]
+    size = max(1, len(lengths.get(TWINS, ())))
+    every = [[Probe(part, i, n) for i, n in enumerate(own)] for part, own in lengths.items()]
+    return [part[i : i + size] for part in every for i in range(0, len(part), size)]

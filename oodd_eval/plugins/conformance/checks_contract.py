@@ -40,7 +40,22 @@ def check_unknown_parameter(trial: Trial) -> None:
 def check_fits(trial: Trial) -> None:
     """It can be fitted on nominal trajectories, and score one."""
     if isinstance(trial.first_fit, CheckFailedError):
+        if trial.needs_actions():
+            raise CheckSkipped("needs actions: see check 'inputs'")
         raise trial.first_fit
+
+
+def check_inputs(trial: Trial) -> None:
+    """It can do without actions where the spec declares observations alone."""
+    if trial.actions:
+        raise CheckSkipped("may look at actions")
+    if trial.needs_actions():
+        raise CheckFailedError(
+            f"without actions, {trial.first_fit}; with them it works: expected "
+            'inputs="observations+actions" in the spec, as a detector that declares observations '
+            "is handed actions of width 0"
+        )
+    trial.fitted()
 
 
 def check_declared_parameters(trial: Trial) -> None:

@@ -75,6 +75,9 @@ class Effects(Events):
     running: list[str] = field(default_factory=list)  # threads and child processes left
 
 
+DAEMON: Final = "daemon thread"
+"""How a thread that does not keep the process alive is called in `Effects.running`."""
+
 _install: Final = functools.cache(sys.addaudithook)
 _recording: Final[list[Events]] = []  # the audit hook writes to the last one
 
@@ -279,11 +282,11 @@ def _peak_memory(end: Event) -> int:
 
 
 def _running() -> set[tuple[int, str]]:
-    """Return the threads that keep a process alive, and the children of this one: id and name."""
+    """Return the further threads and the children of this process: id and name."""
     found = {
-        (thread.ident or 0, f"thread {thread.name}")
+        (thread.ident or 0, f"{DAEMON if thread.daemon else 'thread'} {thread.name}")
         for thread in threading.enumerate()
-        if not thread.daemon and thread is not threading.main_thread()
+        if thread is not threading.main_thread()
     }
     for child in psutil.Process().children():
         with contextlib.suppress(psutil.NoSuchProcess):

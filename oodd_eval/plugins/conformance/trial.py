@@ -45,14 +45,20 @@ class Trial:
     """All that the checks of one detector share.
 
     The factory is called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec`
-    tells its declared parameters too.
+    tells what the detector declares too. Episodes have actions where the spec declares them, and
+    for a factory, which declares nothing.
     """
 
     def __init__(
         self, factory: Factory, *, horizon: int = 1, seed: int = 0,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:  # fmt: skip
-        self.spec = factory if isinstance(factory, DetectorSpec) else DetectorSpec("", factory, "")
+        self.spec = (
+            factory
+            if isinstance(factory, DetectorSpec)
+            else DetectorSpec("", factory, "", inputs="observations+actions")
+        )
+        self.actions = self.spec.inputs == "observations+actions"
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
         self.arguments = {"seed": seed, "horizon": horizon, **self.parameters}
         self.rows = ROWS + horizon  # of an ordinary episode
@@ -105,6 +111,19 @@ class Trial:
             return error
         return detector
 
+    def needs_actions(self) -> bool:
+        """Tell whether a detector that declares observations works with actions only."""
+        if self.actions or not isinstance(self.first_fit, CheckFailedError):
+            return False
+        self.actions = True
+        try:
+            self.fit().score(self.nominal(1)[0])
+        except Exception:  # noqa: BLE001  whatever it is: actions do not help
+            return False
+        finally:
+            self.actions = False
+        return True
+
     def fitted(self) -> Detector:
         """Return the shared fitted detector, for checks about something else: only to score."""
         if isinstance(self.first_fit, CheckFailedError):
@@ -146,7 +165,8 @@ class Trial:
 
     def episode(self, key: int, rows: int | None = None, sensors: int = SENSORS) -> Trajectory:
         """Return the nominal episode of a key; another number of sensors is another system."""
-        return Trajectory(*_system(key, self.rows if rows is None else rows, sensors))
+        observations, actions = _system(key, self.rows if rows is None else rows, sensors)
+        return Trajectory(observations, actions if self.actions else None)
 
     def training(self, sensors: int = SENSORS, first: int = 1000) -> list[Trajectory]:
         """Return nominal episodes of equal length to fit on."""

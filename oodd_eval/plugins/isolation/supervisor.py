@@ -17,10 +17,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
-from itertools import chain, islice
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -43,24 +43,6 @@ CHUNK: Final = 64  # trajectories that a worker scores at once
 
 POLL_SECONDS: Final = 0.05  # between two looks at a worker that is silent
 _END_POLL_SECONDS: Final = 0.005
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """The first message to a worker; the trajectories follow, `train` of them to fit on.
-
-    `load` is the directory of a kept fit, which replaces fitting; `save` is an empty directory
-    where the detector may save its fit. Both are empty where there is none.
-    """
-
-    plugin: str
-    detector: str
-    parameters: dict[str, Any]
-    seed: int
-    horizon: int
-    train: int
-    load: str = ""
-    save: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +110,8 @@ class Child:
         for descriptor in descriptors:
             os.close(descriptor)
         self.channel = Channel(self._receiving, self.sending, self._wait)
-        self._limits, self._stop = limits, stop
-        self._seen = psutil.Process(self._process.pid)
+        self._limits, self._stop, self.forked = limits, stop, True
+        self._seen = self._scoring = psutil.Process(self._process.pid)
         self._printed = b""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -138,6 +120,12 @@ class Child:
     def start_clock(self) -> None:
         """Count the seconds of the limit from now on."""
         self._start = time.monotonic()
+
+    def watch(self, pid: int, *, forked: bool) -> None:
+        """Hold a process that it has started to the limit of memory, too."""
+        self.forked = forked
+        with contextlib.suppress(psutil.Error):
+            self._scoring = psutil.Process(pid)
 
     @property
     def exited(self) -> bool:
@@ -221,32 +209,43 @@ class Child:
             raise GivenUpError("oom", reason, f"held {held}, more than {most}")
 
     def _resident_bytes(self) -> int:
-        with contextlib.suppress(psutil.Error):
-            return int(self._seen.memory_info().rss)
-        return 0
+        held = []
+        for process in {self._seen, self._scoring}:
+            with contextlib.suppress(psutil.Error):
+                held.append(int(process.memory_info().rss))
+        return int(self.together(held))
+
+    def together(self, held: Sequence[float]) -> float:
+        """Return the memory of a worker and a process that scores, of what each of them holds.
+
+        What a fork shares counts in both: the larger of the two holds all of it.
+        """
+        return max(held, default=0) if self.forked else sum(held)
 
 
 def run_isolated(
-    request: Request, train: Iterable[Trajectory], score: Iterable[Trajectory],
-    again: Iterable[Trajectory] = (), *, limits: Limits, stop: Stop,
+    request: Mapping[str, Any], train: Iterable[Trajectory],
+    groups: Iterable[Iterable[Trajectory]], *, limits: Limits, stop: Stop,
 ) -> Outcome:  # fmt: skip
-    """Fit on `train`, score `score` and then `again` in a worker process.
+    """Fit on `train` and score groups of trajectories, each group in a process of its own.
 
+    The request names ``plugin`` and ``detector``, its ``parameters``, ``seed`` and ``horizon``, and
+    the number of trajectories to ``train`` on. ``load`` is the directory of a kept fit, which
+    replaces fitting; ``save`` is an empty directory where the detector may save its fit. One of the
+    two may be empty.
     Each iterable is read once, lazily and from another thread, the next one when the one before is
-    exhausted: what `score` gave may still serve for `again`. `again` never shares a chunk with
-    `score`, so that its company changes no digit there. When `stop` is set, the worker is killed
+    exhausted. Scores come back in the order of the groups. When `stop` is set, the worker is killed
     and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
     child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
     # From another thread, so that neither side can deadlock on a full pipe.
     with ThreadPoolExecutor(1) as pool:
-        chunks = chain(_chunks(score), _chunks(again))
-        sent = pool.submit(_send, child, request, train, chunks)
+        sent = pool.submit(_send, child, request, train, groups)
         try:
-            _converse(child.channel, outcome)
+            _converse(child, outcome)
         except GivenUpError as error:
             outcome.status, outcome.reason = error.status, error.reason
-        except (ChannelGarbledError, KeyError):
+        except (ChannelGarbledError, KeyError, TypeError, ValueError):
             outcome.status = "error"
             outcome.reason = "the detector wrote into the pipe between worker and harness"
         except ChannelClosedError:
@@ -266,17 +265,24 @@ def run_isolated(
     return outcome
 
 
-def _converse(channel: Channel, outcome: Outcome) -> None:
+def _converse(child: Child, outcome: Outcome) -> None:
     """Receive the worker's messages into `outcome` until the last one."""
+    channel, seconds, peak = child.channel, 0.0, 0.0
     while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
             raise GivenUpError(message["status"], message["reason"])
         if outcome.seconds_fit is None:
-            outcome.seconds_fit, outcome.warm_up = message["seconds_fit"], message["warm_up"]
-        elif "seconds_score" in message:
-            outcome.peak_rss_mb = message["peak_rss_mb"]
-            outcome.seconds_score = message["seconds_score"]
+            outcome.warm_up = message["warm_up"]
+            outcome.seconds_fit = float(message["seconds_fit"])
+        elif "pid" in message:
+            child.watch(message["pid"], forked=message["forked"])
+        elif "peak_rss_mb" in message:
+            held = float(message["peak_rss_mb"])
+            if "seconds_score" in message:
+                seconds, peak = seconds + float(message["seconds_score"]), max(peak, held)
+            else:
+                outcome.seconds_score, outcome.peak_rss_mb = seconds, child.together([peak, held])
         elif message["type"] == "array":
             outcome.scores.append(channel.receive_array())
         else:
@@ -285,18 +291,22 @@ def _converse(channel: Channel, outcome: Outcome) -> None:
 
 
 def _send(
-    child: Child, request: Request, train: Iterable[Trajectory], chunks: Iterable[list[Trajectory]]
-) -> None:
+    child: Child, request: Mapping[str, Any], train: Iterable[Trajectory],
+    groups: Iterable[Iterable[Trajectory]],
+) -> None:  # fmt: skip
     channel = child.channel
     try:
-        channel.send(asdict(request))
+        channel.send({**request})
         for trajectory in train:
             channel.send_trajectory(trajectory)
-        for chunk in chunks:
-            channel.send({"score": len(chunk)})
-            for trajectory in chunk:
-                channel.send_trajectory(trajectory)
-        channel.send({"score": 0})
+        for group in groups:
+            channel.send({"group": True})
+            for chunk in _chunks(group):
+                channel.send({"score": len(chunk)})
+                for trajectory in chunk:
+                    channel.send_trajectory(trajectory)
+            channel.send({"score": 0})
+        channel.send({"group": False})
     except BrokenPipeError:
         pass  # The worker ended; the receiving side finds out why.
     finally:

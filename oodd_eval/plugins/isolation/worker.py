@@ -1,34 +1,44 @@
 """The process that holds one detector: it receives trajectories without names and returns scores.
 
 It never holds onsets, anomalies, twins' pairing or the name of the environment. Training
-trajectories come first, in the order of the split; then, shuffled together and in chunks, the
-trajectories to score. Messages have descriptors of their own, so that nothing that a detector
-prints gets between them.
+trajectories come first, in the order of the split; then the trajectories to score, in groups.
+
+Each group is scored by a fork of the fitted process, which ends with it. So nothing that an honest
+detector remembers of a group reaches the next one, and two episodes with the same seed, which agree
+bit for bit before the onset, never meet. A process with further threads cannot be forked safely (a
+GPU starts some), and further processes would be shared by all groups: the fit is saved, and loaded
+by a fresh process for each group. Files and shared memory are not watched.
+
+Messages have descriptors of their own, so that nothing that a detector prints gets between them.
 """
 
 from __future__ import annotations
 
 import faulthandler
+import json
 import math
 import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, TrajectoryError
-from oodd_eval.plugins.contract import StorableDetector, make_detector, score_chunk
+from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
 from oodd_eval.plugins.discovery import describe, offer_of
 from oodd_eval.plugins.isolation import Channel
 
@@ -37,6 +47,13 @@ _STATUSES: Final[dict[type[BaseException], str]] = {
     ModuleNotFoundError: "unavailable",
 }  # fmt: skip
 """Status of a cell by what its detector raised."""
+
+
+SCORED: Final = 93
+"""Exit code of a process that has scored its group: no other one that ends itself has it."""
+
+PATIENCE: Final = 1.0
+"""Seconds that threads and processes of a fit have to end."""
 
 
 class TrajectoryFile(TrajectorySequence):
@@ -95,39 +112,140 @@ def peak_rss_mb() -> float:
         return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def serve(channel: Channel) -> None:
-    """Fit the requested detector and score what comes until a chunk of zero."""
+def serve(channel: Channel, descriptors: Sequence[str]) -> None:
+    """Fit the requested detector and have every group that comes scored by a process of its own."""
+    threads, own = psutil.Process().num_threads(), os.getpid()
     request = channel.receive()
     train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
-    spec = offer_of(request["plugin"], request["detector"]).spec
-
     start = time.perf_counter()
-    given = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    detector = make_detector(spec.factory, **given)
-    if not request["load"]:
-        detector.fit(train)
-    elif isinstance(detector, StorableDetector):
-        detector.load(Path(request["load"]))
+    detector = _made(request)
+    if request["load"]:
+        _load(detector, request["load"])
     else:
-        raise ContractError("a detector that had saved itself has no load(directory) any more")
+        detector.fit(train)
+    if os.getpid() != own:
+        os._exit(1)  # The fit has forked, and one process answers.
     seconds_fit = time.perf_counter() - start
-    if request["save"] and isinstance(detector, StorableDetector):
-        # A failure costs a later run the time of a fit, no more.
-        directory = Path(request["save"])
-        try:
-            detector.save(directory)
-        except Exception:  # noqa: BLE001  a detector may raise anything
-            traceback.print_exc()
-            shutil.rmtree(directory)
-            directory.mkdir()
+    saved = request["load"] or (request["save"] and _saved(detector, request["save"]))
+    process: Callable[[], int] = lambda: _fork(channel, detector)  # noqa: E731
+    if _runs_on(threads):
+        _end_children()
+        if not saved:
+            raise NotImplementedError(
+                "threads or processes run on after fit, which groups would share, so that the "
+                "process cannot be forked, and the fit cannot be saved: end them in fit, or give "
+                "the detector save and load"
+            )
+        order = json.dumps({**request, "load": saved, "train": 0})
+        process = lambda: _start(descriptors, order)  # noqa: E731
     channel.send({"seconds_fit": seconds_fit, "warm_up": getattr(detector, "warm_up", 0)})
+    while channel.receive()["group"]:
+        if (code := process()) != SCORED:
+            _end_like(code)
+    channel.send({"peak_rss_mb": peak_rss_mb()})
 
-    seconds_score = 0.0
+
+def _runs_on(threads: int) -> bool:
+    """Tell whether more threads run than there were, or a child, also after a while.
+
+    The system ends a thread a moment after it was joined.
+    """
+    here, end = psutil.Process(), time.monotonic() + PATIENCE
+    while here.num_threads() > threads or _children():
+        if time.monotonic() > end:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def _children() -> list[psutil.Process]:
+    """Return the processes that this one has started and that run, with theirs."""
+    # To list them takes 10 ms, in every group; to ask whether there are any takes none.
+    if hasattr(os, "waitid"):
+        try:
+            os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+        except ChildProcessError:
+            return []
+    found = []
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):
+            if child.status() != psutil.STATUS_ZOMBIE:
+                found.append(child)
+    return found
+
+
+def _end_children() -> None:
+    for child in _children():
+        with suppress(psutil.Error):
+            child.kill()
+
+
+def _made(request: dict[str, Any]) -> Detector:
+    spec = offer_of(request["plugin"], request["detector"]).spec
+    given = {name: request[name] for name in ("seed", "horizon", "parameters")}
+    return make_detector(spec.factory, **given)
+
+
+def _load(detector: Detector, directory: str) -> None:
+    if not isinstance(detector, StorableDetector):
+        raise ContractError("a detector that had saved itself has no load(directory) any more")
+    detector.load(Path(directory))
+
+
+def _saved(detector: Detector, place: str) -> str:
+    """Let a detector save itself; return the directory, or nothing where that fails."""
+    if not isinstance(detector, StorableDetector):
+        return ""
+    directory = Path(place)
+    try:
+        detector.save(directory)
+    except Exception:  # noqa: BLE001  a detector may raise anything; a later run fits again
+        traceback.print_exc()
+        shutil.rmtree(directory)
+        directory.mkdir()
+        return ""
+    return place
+
+
+def _fork(channel: Channel, detector: Detector) -> int:
+    """Score a group in a fork of this process; return its exit code, negative for a signal."""
+    _flush()  # What is printed but not written yet would be written by every fork.
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            code = _reported(channel, lambda: _score_group(channel, detector)) or SCORED
+        finally:
+            os._exit(code)  # Whatever happens, a fork never goes on with the loop over groups.
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def _start(descriptors: Sequence[str], order: str) -> int:
+    """Score a group in a fresh process that loads the fit; return its exit code."""
+    command = [sys.executable, "-P", "-m", "oodd_eval.plugins.isolation.worker", *descriptors]
+    return subprocess.run(  # noqa: S603  our own interpreter and module
+        [*command, order], pass_fds=[int(d) for d in descriptors], check=False
+    ).returncode
+
+
+def _end_like(code: int) -> NoReturn:
+    """End this process as a group's process ended, which has told the harness what it could."""
+    if code < 0:
+        if -code != signal.SIGKILL:
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code)
+
+
+def _score_group(channel: Channel, detector: Detector, *, forked: bool = True) -> None:
+    """Score what comes until a chunk of zero, and end the processes that this has started."""
+    channel.send({"pid": os.getpid(), "forked": forked})
+    seconds = 0.0
     while size := channel.receive()["score"]:
         chunk = [channel.receive_trajectory() for _ in range(size)]
         start = time.perf_counter()
         scores = score_chunk(detector, chunk)
-        seconds_score += time.perf_counter() - start
+        seconds += time.perf_counter() - start
         for one in scores:
             if not isinstance(one, np.ndarray):
                 channel.send({"type": type(one).__name__})
@@ -136,7 +254,8 @@ def serve(channel: Channel) -> None:
             else:
                 channel.send({"type": "array"})
                 channel.send_array(np.asarray(one))
-    channel.send({"seconds_score": seconds_score, "peak_rss_mb": peak_rss_mb()})
+    _end_children()
+    channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
 
 
 def connect(arguments: Sequence[str]) -> Channel:
@@ -158,21 +277,45 @@ def connect(arguments: Sequence[str]) -> Channel:
     return Channel(reading, writing)
 
 
-def main(arguments: Sequence[str]) -> NoReturn:
-    """Serve one request and end the process, whatever the detector has left running."""
-    channel = connect(arguments)
+def _reported(channel: Channel, work: Callable[[], None]) -> int:
+    """Do some work and return the exit code; an error is sent to the harness."""
     code = 0
     try:
-        serve(channel)
+        work()
     except BaseException as error:  # noqa: BLE001  a detector may raise anything; all is reported
-        traceback.print_exc()
+        with suppress(ValueError, OSError):  # The detector may have closed the stream.
+            traceback.print_exc()
         status = next((s for kind, s in _STATUSES.items() if isinstance(error, kind)), "error")
         channel.send({"status": status, "reason": reason_of(error)})
         code = 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    # Threads and exit handlers of the detector have no say any more: the scores are sent.
-    os._exit(code)
+    _flush()
+    return code
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        # The detector may have closed a stream, or put None in its place.
+        with suppress(ValueError, OSError, AttributeError):
+            stream.flush()
+
+
+def main(arguments: Sequence[str]) -> NoReturn:
+    """Serve one request, or load a fit and score one group; then end the process.
+
+    Threads and exit handlers of the detector have no say any more: the scores are sent.
+    """
+    descriptors, order = arguments[:3], arguments[3:]
+    channel = connect(descriptors)
+
+    def group() -> None:
+        request = json.loads(order[0])
+        detector = _made(request)
+        _load(detector, request["load"])
+        _score_group(channel, detector, forked=False)
+
+    if order:
+        os._exit(_reported(channel, group) or SCORED)
+    os._exit(_reported(channel, lambda: serve(channel, descriptors)))
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ class DaskExecutor:
             self._running.discard(future)
         if "refused" in outcome:
             raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
-        file = ScoreFile(outcome["parts"], outcome["cost"])
+        file = ScoreFile(outcome["parts"], outcome["cost"], outcome["order"])
         return Scored(outcome["status"], outcome["reason"], file, outcome["log"])
 
     def stop(self) -> None:
@@ -187,6 +187,7 @@ def _scored(order: Message, stop: Stop) -> Message:
         "log": scored.log,
         "parts": scored.file.parts,
         "cost": scored.file.cost,
+        "order": scored.file.order,
     }
 
 
