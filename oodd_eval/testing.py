@@ -95,7 +95,7 @@ def check_detector(
 
     Examples
     --------
-    >>> from oodd_eval.plugins.baselines import Clock
+    >>> from oodd_trivial import Clock
     >>> known = {"gross-anomaly": "knows only the time"}
     >>> check_detector(Clock, expected_failures=known).ok  # doctest: +ELLIPSIS
     passed   factory...

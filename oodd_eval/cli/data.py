@@ -5,21 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from oodd_eval.cli import Parser, at_least
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.data.export import export as export_split
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
 from oodd_eval.data.fetch import fetch as fetch_split
 from oodd_eval.data.info import describe
 from oodd_eval.data.simulate.build import build_split
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import select
-
-SEED_BASES: Final = range(4, 900)
-"""Free bases: published splits have those below, policies are trained and evaluated above."""
 
 
 def define(parser: Parser) -> None:
@@ -86,10 +82,10 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
         known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
         raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
     train, calibration, test, seed_base = sizes.values()
-    if seed_base not in SEED_BASES:
+    if seed_base not in OWN_SEED_BASES:
         raise UsageError(
-            f"--seed-base is {seed_base}, expected {SEED_BASES.start} to {SEED_BASES.stop - 1}: "
-            "other bases are those of published splits and policies"
+            f"--seed-base is {seed_base}, expected {OWN_SEED_BASES.start} to "
+            f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
     if not name.isprintable() or set(name) & set("/@: "):
         raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")

@@ -60,6 +60,9 @@ def define(parser: Parser) -> None:
     add("--submitter", default="", metavar="TEXT", help="who stands behind the results")
     add("--citation", default="", metavar="TEXT", help="how to cite the method")
     add("--url", default="", metavar="URL", help="page of the method or its code")
+    add("--primary", nargs="+", default=(), metavar="ROW",
+        help="rows that are ranked for their detectors, such as 'riqn[updates=9000]' (default: of "
+             "each detector the one with default parameters and the shortest horizon)")
     add("--caption", default="", metavar="TEXT",
         help="a note above the tables, such as a reduced setting")
     add("--scores", action="store_true",
@@ -99,7 +102,7 @@ def build(options: argparse.Namespace) -> int:
 def submit(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard submit``; 1 when what was written did not pass."""
     options.citation = " ".join(options.citation.split())
-    texts = ("id", "title", "submitter", "citation", "url", "caption", "trust")
+    texts = ("id", "title", "submitter", "citation", "url", "caption", "trust", "primary")
     statement = submission.Statement(**{name: getattr(options, name) for name in texts})
     chosen = ("detectors", "cells", "complete", "scores", "curves", "split")
     how = {name: getattr(options, name) for name in chosen}

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from oodd_eval.cli import Parser
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.metrics.catalogue import CALIBRATED, METRICS, TARGETS
+from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS
 from oodd_eval.plugins.discovery import Plugins, discover
 
 Rows = Iterable[tuple[str, ...]]
@@ -78,7 +78,7 @@ def _splits() -> Rows:
 
 def _metrics() -> Rows:
     yield from ((name, info.summary) for name, info in METRICS.items())
-    for suffix, target in TARGETS.items():
-        at = f"alarms at a calibrated false-alarm rate of {100 * target:g} %"
-        yield f"..._{suffix}", f"{', '.join(CALIBRATED)}: {at}"
-        yield f"threshold_{suffix}", "the CUSUM threshold of that rate"
+    for suffix, level in LEVELS.items():
+        at = f"guaranteed alarms, in at most {100 * level:g} % of nominal episodes"
+        yield f"..._{suffix}", f"{', '.join(GUARANTEED)}: {at}"
+        yield f"threshold_{suffix}", "the threshold of their statistic"

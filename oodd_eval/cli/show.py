@@ -29,7 +29,7 @@ def define(parser: Parser) -> None:
     add("--metric", default="auc_matched",
         help="metric of that table (default: auc_matched; see oodd-eval list metrics)")
     add("--wide", action="store_true",
-        help="print all metrics, pooled AUC, average precision and FPR95 among them")
+        help="print all metrics, nulls and guaranteed alarms at 10, 5 and 1 %% among them")
     add("--markdown", action="store_true", help="print Markdown, everything in it")
     # fmt: on
 
@@ -59,8 +59,7 @@ def run(options: argparse.Namespace) -> int:
         reporter.tables(records)
         for board in boards(records) if options.wide else ():
             reporter.table(layout.all_metrics(board, intervals=intervals))
-            more = layout.calibrated(board, intervals=intervals), layout.pooled(board)
-            for table in filter(None, more):
+            for table in layout.all_alarms(board, intervals=intervals):
                 reporter.table(table)
         reporter.failures(records)
     reporter.console.print(summary(records))

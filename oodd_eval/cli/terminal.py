@@ -119,7 +119,9 @@ class TerminalReporter:
     def tables(self, records: Sequence[Record]) -> None:
         """Print the tables of every board among some records."""
         for board in boards(records):
-            self.table(layout.by_environment(board, intervals=self.intervals))
+            self.table(layout.separability(board, intervals=self.intervals))
+            if alarms := layout.guaranteed(board, intervals=self.intervals):
+                self.table(alarms)
             groups = [group for group in GROUPS if board.in_group(group)]
             for h, group in product(board.horizons, groups):
                 self.table(layout.anomaly_groups(board, h, [group], intervals=self.intervals))

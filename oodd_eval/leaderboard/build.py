@@ -31,11 +31,11 @@ this. How to read it: [docs/leaderboard.md](../docs/leaderboard.md). How to take
 [docs/submitting.md](../docs/submitting.md).
 """
 
-_LEGEND = """Rank is 1 + the number of rows that are significantly better (paired bootstrap over
-test seeds, Holm's correction over all pairs of the table). Rows that share a letter under *ties*
-cannot be told apart. Trivial rows know nothing of the dynamics: what does not beat them has found
-nothing. AUC is the paper's, for which the trivial row *clock* has 100 by construction. Brackets
-hold 95 % intervals.
+_LEGEND = """Rank is 1 + the number of primary rows, one a detector, that are significantly better
+(paired bootstrap over test seeds, Holm's correction over all their pairs). Primary rows that share
+a letter under *ties* cannot be told apart. Trivial rows know nothing of the dynamics: what does not
+beat them has found nothing. AUC is the paper's, for which the trivial row *clock* has 100 by
+construction. Brackets hold 95 % intervals.
 """
 
 MANY: Final = 6
@@ -124,13 +124,12 @@ def _section(section: LeaderboardSection) -> str:
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
     rendered = [
-        layout.alarms(ranks),
+        layout.separability(board),
+        *layout.alarms(ranks),
         layout.cost(ranks),
         *_as_in_the_paper(board),
-        layout.by_environment(board),
         layout.all_metrics(board),
-        layout.calibrated(board),
-        layout.pooled(board, ranks.standings),
+        *layout.all_alarms(board),
         layout.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
         layout.failures(board),
     ]

@@ -46,9 +46,10 @@ class EntryInfo:
     Title, submitter, citation, url and caption (a note above the tables) are plain text for people;
     all but the title may be empty, like the command that made the records. Detectors, sorted, split
     and protocol are those of the records. `plugins` have ``distribution``, ``plugin``, ``version``
-    and ``source_digest``, the `environment` ``python``, ``platform`` and ``packages``; `rerun` has
-    ``by`` and ``how`` where the trust is ``"re-run"``. `files` has ``sha256`` and ``bytes`` of all
-    other files by relative name.
+    and ``source_digest``, the `environment` ``python``, ``platform`` and ``packages``; `primary`
+    are the rows that are ranked for their detectors, as `Setting` writes them; `rerun` has ``by``
+    and ``how`` where the trust is ``"re-run"``. `files` has ``sha256`` and ``bytes`` of all other
+    files by relative name.
     """
 
     id: str
@@ -68,6 +69,7 @@ class EntryInfo:
     caption: str
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
     rerun: dict[str, str] | None = None
+    primary: list[str] = field(default_factory=list)
     schema: int = SCHEMA
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}

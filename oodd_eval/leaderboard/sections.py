@@ -11,7 +11,7 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import TRUST, SubmittedEntry, Trust, place_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import RankedBoard, boards, ranked
+from oodd_eval.results.tables.board import RankedBoard, boards, primary_settings, ranked
 
 TABLES: Final = "tables"
 """Directory of the CSV files."""
@@ -85,8 +85,43 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
             rows.setdefault(record.setting, set()).add(ordered.index(owner[id(record)]))
         sources = {row: [ordered[i] for i in sorted(own)] for row, own in rows.items()}
         own = [ordered[i] for i in sorted(set().union(*rows.values()))]
-        found.append(LeaderboardSection(ranked(board.records), own, sources))
+        ranks = ranked(board.records, _primary(board.records, sources))
+        found.append(LeaderboardSection(ranks, own, sources))
     return sorted(found, key=lambda section: section.place)
+
+
+def _primary(
+    records: Sequence[Record], sources: Mapping[Setting, Sequence[SubmittedEntry]]
+) -> set[Setting]:
+    """Return the primary row of each detector: what its entry declares, else the usual one.
+
+    A declared row takes the place of another. So the entry has to be the only one with rows of the
+    detector, or it would push somebody else's row out of the ranking, and its row has to be whole.
+    """
+    found = {row.detector: row for row in primary_settings(records)}
+    cells: dict[Setting, set[tuple[str, str]]] = {}
+    for r in records:
+        cells.setdefault(r.setting, set()).add((r.environment, r.anomaly))
+    declared: dict[str, Setting] = {}
+    for row, entry in ((row, entry) for row, own in sources.items() for entry in own):
+        if str(row) not in entry.meta.primary:
+            continue
+        name = f"entry {entry.meta.id!r} declares {str(row)!r} as the primary row of {row.detector}"
+        for other in (e for r in sources if r.detector == row.detector for e in sources[r]):
+            if other is not entry:
+                raise ResultsError(
+                    f"{name}, but entry {other.meta.id!r} has rows of it, too: only an entry with "
+                    "all rows of a detector may choose, so leave the statement out"
+                )
+        if (before := declared.setdefault(row.detector, row)) != row:
+            raise ResultsError(f"{name}, and {str(before)!r}, too: expected one row a detector")
+        if lacking := cells[usual := found[row.detector]] - cells[row]:
+            raise ResultsError(
+                f"{name}, which lacks {len(lacking)} cells that {str(usual)!r} has: expected a row "
+                "with all of them, so run the rest or leave the statement out"
+            )
+        found[row.detector] = row
+    return set(found.values())
 
 
 def _refuse_mixtures(records: Sequence[Record], owner: Mapping[int, SubmittedEntry]) -> None:

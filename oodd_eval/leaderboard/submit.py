@@ -34,6 +34,7 @@ from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
+from oodd_eval.results.tables.board import primary_settings
 
 LARGE: Final = 10 * 10**6
 """Bytes beyond which an entry is said to be large: a repository keeps every version of it."""
@@ -52,6 +53,7 @@ class Statement:
     url: str = ""
     caption: str = ""
     trust: Trust = "reported"
+    primary: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,17 +163,14 @@ def _publishable(record: Record) -> Record:
 def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
     """Return the records that curves are made of.
 
-    With ``"detectors"`` these are, of each detector, those of the row with the fewest parameters
-    that are not defaults, and of such rows the one with the shortest horizon.
+    With ``"detectors"`` these are, of each detector, those of the row that is primary by default.
     """
     seeds = first_seeds(records)
     if extent == "none":
         return []
     if extent == "detectors":
-        simplest: dict[str, Setting] = {}
-        for row in sorted(seeds, key=lambda s: (len(s.parameters), s.horizon, s.overrides_json)):
-            simplest.setdefault(row.detector, row)
-        seeds = {row: seeds[row] for row in simplest.values()}
+        rows = primary_settings(r for r in records if r.ok)
+        seeds = {row: seeds[row] for row in rows}
     return [r for r in records if r.ok and seeds.get(r.setting) == r.seed]
 
 
@@ -224,6 +223,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     stated = asdict(statement) | {
         "id": name,
         "title": statement.title or f"{shown} on {first.split}",
+        "primary": [str(Setting.parse(row)) for row in statement.primary],
     }
     return EntryInfo(
         **stated,

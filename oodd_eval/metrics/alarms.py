@@ -1,37 +1,216 @@
-"""Alarms with a false-alarm rate chosen in advance, and alarms as they come.
+"""Alarms with a guarantee: at most a chosen share of nominal episodes raises one.
 
-A threshold is found on the calibration trajectories, nominal and apart from training and test, so
-that delay and misses are compared at the same target; the rate that was achieved on the test's
-nominal twins is reported beside it.
+The threshold is a rank among the calibration episodes' largest statistics (split conformal
+prediction). A new nominal episode is exchangeable with them, so that its largest statistic exceeds
+the k-th smallest of n with probability at most ``1 - k / (n + 1)``, whatever the distribution of
+scores and however they depend on one another within an episode.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.auc import AlarmRule
-from oodd_eval.metrics.cusum import cusum
+from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, LEVELS
+from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
 Floats = NDArray[np.float64]
 
-MIN_STEPS: Final = {"at_1pct": 1_000, "at_01pct": 20_000}
-"""Defined calibration steps below which a target is not offered: 10 and 20 alarms at the target."""
+AlarmKind = Literal["cusum", "score"]
+"""Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself."""
+
+_ROUNDING: Final = 1e-9
+"""Share of one episode that a level may be off by rounding: (n + 1) x 0.05 is to be whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuaranteedAlarm:
+    """A threshold of the statistic that at most a given share of nominal episodes exceeds.
+
+    Parameters
+    ----------
+    standardization
+        Of the scores, for the CUSUM; None where the score itself is the statistic.
+    threshold
+        An episode alarms at the first row whose statistic is larger; infinite where no number of
+        episodes could promise the level.
+
+    Examples
+    --------
+    >>> calibration = [np.array([0.0, peak]) for peak in range(1, 20)]
+    >>> rule = GuaranteedAlarm.fit(calibration, 0.05, "score")
+    >>> rule.threshold, rule.first(np.array([3.0, 19.0, 20.0])), rule.first(np.array([19.0]))
+    (19.0, 2, None)
+    """
+
+    standardization: Standardization | None
+    threshold: float
+
+    @classmethod
+    def fit(
+        cls, calibration: Sequence[Floats], level: float, kind: AlarmKind = "cusum"
+    ) -> GuaranteedAlarm:
+        """Find the threshold on the scores of nominal episodes, kept apart from the fit.
+
+        Parameters
+        ----------
+        calibration
+            Scores by episode, in an order that has nothing to do with the scores.
+        level
+            Largest share of nominal episodes with an alarm, such as 0.05.
+        kind
+            ``"cusum"``: the CUSUM, without a new start after an alarm, of scores that the episodes
+            number 0, 2, 4, ... standardize; the threshold is from the others. ``"score"``: the
+            score itself, for a detector that accumulates by itself; the threshold is from all.
+        """
+        return cls.fits(calibration, [level], kind)[0]
+
+    @classmethod
+    def fits(
+        cls, calibration: Sequence[Floats], levels: Sequence[float], kind: AlarmKind = "cusum"
+    ) -> list[GuaranteedAlarm]:
+        """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
+        unbounded, episodes = cls(None, math.inf), calibration
+        if kind == "cusum":
+            unbounded = cls(Standardization.fit(calibration[0::2]), math.inf)
+            episodes = calibration[1::2]
+        largest = np.sort([unbounded.largest(scores) for scores in episodes])
+        ranks = [quantile_rank(len(largest), level) for level in levels]
+        return [
+            cls(unbounded.standardization,
+                float(largest[rank - 1]) if rank <= len(largest) else math.inf)
+            for rank in ranks
+        ]  # fmt: skip
+
+    def statistic(self, scores: Floats) -> Floats:
+        """Return the statistic of an episode, row by row; minus infinity where there is none."""
+        if self.standardization is None:
+            return np.where(np.isnan(scores), -np.inf, scores)
+        return cusum(self.standardization(scores), threshold=math.inf)[0]
+
+    def largest(self, scores: Floats) -> float:
+        """Return the largest statistic of an episode."""
+        return float(self.statistic(scores).max(initial=-math.inf))
+
+    def first(self, scores: Floats) -> int | None:
+        """Return the row of an episode's first alarm; None without one."""
+        above = self.statistic(scores) > self.threshold
+        return int(above.argmax()) if above.any() else None
+
+
+def quantile_rank(n: int, level: float) -> int:
+    """Return the rank, from 1, of the threshold among n largest statistics.
+
+    It is the smallest k with ``1 - k / (n + 1) <= level``; above n no number of the n will do.
+
+    Examples
+    --------
+    >>> quantile_rank(19, 0.05), quantile_rank(18, 0.05), quantile_rank(20, 0.10)
+    (19, 19, 19)
+    """
+    return n + 1 - math.floor((n + 1) * level + _ROUNDING)
+
+
+def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
+    """Return the levels, by suffix, that a number of calibration episodes is enough for.
+
+    Parameters
+    ----------
+    episodes
+        All of them, those that standardize the scores included.
+    kind
+        The statistic: with the CUSUM half of them standardize the scores.
+
+    Examples
+    --------
+    >>> list(offered_levels(40, "cusum")), list(offered_levels(40, "score"))
+    (['at_10pct', 'at_5pct'], ['at_10pct', 'at_5pct'])
+    >>> list(offered_levels(18, "cusum")), list(offered_levels(19, "score"))
+    (['at_10pct'], ['at_10pct', 'at_5pct'])
+    """
+    n = episodes // 2 if kind == "cusum" else episodes
+    return {suffix: level for suffix, level in LEVELS.items() if quantile_rank(n, level) <= n}
+
+
+def guaranteed_contributions(
+    anomalous: Sequence[Floats], twins: Sequence[Floats], effects: Sequence[int],
+    rule: GuaranteedAlarm,
+) -> dict[str, Contribution]:  # fmt: skip
+    """Return the metrics of guaranteed alarms of one cell, in the order of the catalogue.
+
+    Only the first alarm of an episode counts. Where it precedes the effect the episode is
+    ``early`` and undefined in all that follows. The nulls are of the twins at their partners'
+    effects; a twin that ended before its partner's effect is undefined there, too.
+    ``found_within_k`` and its null count alarms in rows that both episodes have: an anomaly may
+    prolong an episode, and whatever knows no more than the time would find it in the rows that the
+    twin lacks.
+
+    Parameters
+    ----------
+    anomalous, twins
+        Scores of the n anomalous trajectories and of their nominal twins.
+    effects
+        The first row of each anomalous trajectory that differs from its twin.
+    rule
+        Made by `GuaranteedAlarm.fit`.
+    """
+    loud, quiet = ([rule.first(scores) for scores in part] for part in (anomalous, twins))
+    found = {"false_episodes": mean_of([float(first is not None) for first in quiet])}
+    lengths = [[len(scores) for scores in part] for part in (anomalous, twins)]
+    ends = list(map(min, *lengths))
+    own = _from_effect(loud, lengths[0], ends, effects)
+    nulls = _from_effect(quiet, lengths[1], ends, effects)
+    for name, contribution in own.items():
+        found[name] = contribution
+        found[f"{name}_null"] = nulls[name]
+    return found
+
+
+def _from_effect(
+    firsts: Sequence[int | None], lengths: Sequence[int], ends: Sequence[int],
+    effects: Sequence[int],
+) -> dict[str, Contribution]:  # fmt: skip
+    """Return the share of early episodes, and delays and shares of all others.
+
+    `ends` are the numbers of rows that an episode and its partner both have.
+    """
+    nothing = math.nan
+    early, delays, missed, censored = [], [], [], []
+    within: dict[int, list[float]] = {k: [] for k in FOUND_WITHIN}
+    for first, length, end, effect in zip(firsts, lengths, ends, map(int, effects), strict=True):
+        before = first is not None and first < effect
+        delay = nothing if first is None else float(first - effect)
+        remainder = length - effect
+        defined = not before and remainder > 0
+        early.append(float(before))
+        delays.append(delay if defined else nothing)
+        missed.append(float(first is None) if defined else nothing)
+        censored.append((remainder if first is None else delay) if defined else nothing)
+        for k, found in within.items():
+            seen = first is not None and first < end and delay < k
+            found.append(float(seen) if defined and effect < end else nothing)
+    values = {"early": early, "delay": delays, "missed": missed, "delay_censored": censored}
+    values |= {f"found_within_{k}": found for k, found in within.items()}
+    return {name: mean_of(own) for name, own in values.items()}
 
 
 class Monitor:
     """Alarms of one episode as its scores come in, beside a running robot.
 
-    The statistic and the alarms are those of `cusum.cusum` on the whole episode, bit for bit.
+    The statistic and the alarms are those of the whole episode, bit for bit: with an `AlarmRule`
+    those of `cusum.cusum`, whose sum starts again after an alarm, with a `GuaranteedAlarm` its own,
+    whose alarm lasts as long as the statistic is above the threshold.
 
     Attributes
     ----------
     statistic : float
-        ``S_t`` after the last score, before the reset that an alarm brings; 0 at the beginning.
+        After the last score, before the new start that an alarm of an `AlarmRule` brings.
 
     Examples
     --------
@@ -41,93 +220,29 @@ class Monitor:
     [(False, 0.25), (False, 0.5), (True, 2.25), (False, 0.0)]
     """
 
-    def __init__(self, rule: AlarmRule) -> None:
+    def __init__(self, rule: AlarmRule | GuaranteedAlarm) -> None:
         self.rule = rule
         self.reset()
 
     def reset(self) -> None:
         """Begin a new episode."""
-        self.statistic = self._carried = 0.0
+        self._carried = 0.0
+        # A score that has not come yet is below every threshold.
+        self.statistic = -math.inf if self.rule.standardization is None else 0.0
 
     def update(self, score: float) -> bool:
         """Take the next score, NaN where undefined; return whether it raises an alarm."""
-        x = float(self.rule.standardization(np.array([score]))[0]) - self.rule.drift
+        rule = self.rule
+        if rule.standardization is None:
+            self.statistic = -math.inf if math.isnan(score) else float(score)
+            return self.statistic > rule.threshold
+        drift = rule.drift if isinstance(rule, AlarmRule) else DRIFT
+        x = float(rule.standardization(np.array([score]))[0]) - drift
         if math.isnan(x):
             self.statistic = 0.0
             return False
         self._carried = self.statistic = max(0.0, self._carried + x)
-        alarm = self.statistic > self.rule.threshold
-        if alarm:
+        alarm = self.statistic > rule.threshold
+        if alarm and isinstance(rule, AlarmRule):
             self._carried = 0.0
         return alarm
-
-
-def false_alarm_rate(scores: Sequence[Floats], rule: AlarmRule) -> float:
-    """Alarms over defined steps, pooled over nominal trajectories; NaN without defined steps."""
-    steps = defined_steps(scores)
-    return sum(int(rule.alarms(s).sum()) for s in scores) / steps if steps else math.nan
-
-
-def defined_steps(scores: Sequence[Floats]) -> int:
-    """Return the number of scores of several trajectories that are not NaN."""
-    return sum(int(np.count_nonzero(~np.isnan(s))) for s in scores)
-
-
-def highest_statistic(scores: Sequence[Floats], rule: AlarmRule) -> float:
-    """Return the smallest threshold that none of several trajectories exceeds."""
-    unbounded = (
-        cusum(rule.standardization(s), drift=rule.drift, threshold=math.inf) for s in scores
-    )
-    return max(float(statistic.max(initial=0.0)) for statistic, _ in unbounded)
-
-
-def calibrate(scores: Sequence[Floats], rule: AlarmRule, target: float) -> float:
-    """Return the smallest threshold whose pooled false-alarm rate is at most the target.
-
-    Parameters
-    ----------
-    scores : sequence of float64 arrays
-        Scores of the calibration trajectories.
-    rule
-        Standardization and drift; its threshold is not used.
-    target
-        False-alarm rate per step, in (0, 1).
-
-    Returns
-    -------
-    float
-        In the unit of standardized scores; NaN without a defined score.
-
-    Notes
-    -----
-    The number of alarms never grows with the threshold, in spite of the resets: where the k-th
-    alarm under the higher threshold comes no earlier than the k-th under the lower one, the sum
-    under the lower one is from then on at least as large until its next alarm, which comes no later
-    either. So the thresholds that meet the target form a closed half-line; bisection finds its end.
-
-    Examples
-    --------
-    >>> from oodd_eval.metrics.cusum import Standardization
-    >>> rule = AlarmRule(Standardization(mean=0.0, std=0.01), drift=0.0)
-    >>> calibrate([np.array([3.0, -9.0, 1.0, -9.0, 2.0, -9.0])], rule, target=1 / 6)
-    2.0
-    """
-    defined = [rule.standardization(s) for s in scores]
-    steps = defined_steps(defined)
-    if not steps:
-        return math.nan
-
-    def enough(threshold: float) -> bool:
-        alarms = (cusum(x, drift=rule.drift, threshold=threshold)[1] for x in defined)
-        return sum(int(a.sum()) for a in alarms) <= target * steps
-
-    if enough(0.0):
-        return 0.0
-    low, high = 0.0, highest_statistic(scores, rule)
-    # Invariant: `low` gives too many alarms, `high` does not; ends at neighbouring doubles.
-    while (middle := low + (high - low) / 2) not in (low, high):
-        if enough(middle):
-            high = middle
-        else:
-            low = middle
-    return high

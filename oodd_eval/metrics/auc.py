@@ -1,24 +1,31 @@
-"""The metrics, as pure functions of score arrays.
+"""Metrics without a false-alarm guarantee: the AUCs, and alarms at the paper's threshold.
 
 Every metric is a ratio of sums over test trajectories, held as a `Contribution`: a mean over the
 trajectories where it is defined has denominators 1 and 0, a pooled rate has counts. From it come
 the value, its bootstrap interval, group means and paired comparisons.
 
-Time runs over observation rows; ``onset`` is the first row that may differ from the nominal twin's.
+Time runs over observation rows. The ``onset`` is the row from which on an anomaly is in force; the
+``effect`` is the first row that differs from the nominal twin's, at the onset or after it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.catalogue import POOLED, RATIOS
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, Standardization, cusum
 
 Floats = NDArray[np.float64]
+
+SMOOTHING: Final = 0.03
+"""Weight of the newest score in the moving average of ``auc_smoothed``."""
+
+FAR_START: Final = 20
+"""First row that ``far`` counts: horizons and warm-ups end here at the latest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,9 +101,28 @@ def auc_same_times(anomalous: Floats, nominal: Floats, start: int, stop: int) ->
     return auc(anomalous[start:stop], nominal[start:stop])
 
 
+def smoothed(x: Floats, weight: float = SMOOTHING) -> Floats:
+    """Return the exponentially weighted moving average of standardized scores, from 0 on.
+
+    NaN stays NaN and changes nothing. Once a score was infinite, so are all that follow.
+
+    Examples
+    --------
+    >>> smoothed(np.array([np.nan, 1.0, 1.0]), weight=0.5).tolist()
+    [nan, 0.5, 0.75]
+    """
+    found = np.full(len(x), np.nan)
+    level = 0.0
+    for t, value in enumerate(x.tolist()):
+        if value == value:  # noqa: PLR0124  # not NaN
+            level = (1 - weight) * level + weight * value
+            found[t] = level
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class AlarmRule:
-    """Standardization, drift and threshold that turn scores into alarms."""
+    """Standardization, drift and threshold that turn scores into the paper's alarms."""
 
     standardization: Standardization
     drift: float = DRIFT
@@ -115,38 +141,64 @@ def first_delay(alarms: NDArray[np.bool_], onset: int) -> float:
 
 
 def auc_contributions(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int]
-) -> dict[str, Contribution]:
-    """Return the four AUCs of one cell, from its n anomalous trajectories, their twins and onsets.
+    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
+    effects: Sequence[int], standardization: Standardization,
+) -> dict[str, Contribution]:  # fmt: skip
+    """Return the AUCs of one cell.
 
-    Matched comparisons use the times from the onset to the end of the shorter of the two. The
-    placebo compares twin i with twin i + 1 (the last with the first) at those of these times that
-    both have: with more times of one than of the other, their phase would be compared.
+    Parameters
+    ----------
+    anomalous, twins
+        Scores of the n anomalous trajectories and of their nominal twins.
+    onsets, effects
+        Rows from which on each anomaly is in force, and from which on it differs from its twin.
+    standardization
+        That of the calibration scores, for ``auc_smoothed``.
+
+    Notes
+    -----
+    ``auc`` and ``auc_null`` compare rows from the onset on with rows before it. The others compare
+    two trajectories at the same times, from the effect to the end of the shortest of those that
+    are involved: with more times of one than of the other, their phase would be compared.
+    ``auc_placebo`` compares twin i with twin i + 1 (the last with the first), ``auc_unpaired`` the
+    anomalous trajectory i with twin i + 1.
     """
-    found: dict[str, list[float]] = {name: [] for name in RATIOS if name.startswith("auc")}
-    for i, (a, b, t) in enumerate(zip(anomalous, twins, map(int, onsets), strict=True)):
+    found: dict[str, list[float]] = {
+        name: []
+        for name in ("auc", "auc_null", "auc_matched", "auc_placebo", "auc_unpaired",
+                     "auc_smoothed")
+    }  # fmt: skip
+    for i, (a, b, onset, effect) in enumerate(
+        zip(anomalous, twins, map(int, onsets), map(int, effects), strict=True)
+    ):
         stop = min(len(a), len(b))
-        found["auc"].append(auc_onset(a, t))
-        found["auc_null"].append(auc_onset(b, t))
-        found["auc_matched"].append(auc_same_times(a, b, t, stop))
         other = twins[(i + 1) % len(twins)] if len(twins) > 1 else np.zeros(0)
-        found["auc_placebo"].append(auc_same_times(b, other, t, min(stop, len(other))))
+        both = min(stop, len(other))
+        mean_a, mean_b = (smoothed(standardization(s[:stop])) for s in (a, b))
+        found["auc"].append(auc_onset(a, onset))
+        found["auc_null"].append(auc_onset(b, onset))
+        found["auc_matched"].append(auc_same_times(a, b, effect, stop))
+        found["auc_placebo"].append(auc_same_times(b, other, effect, both))
+        found["auc_unpaired"].append(auc_same_times(a, other, effect, both))
+        found["auc_smoothed"].append(auc_same_times(mean_a, mean_b, effect, stop))
     return {name: mean_of(values) for name, values in found.items()}
 
 
 def alarm_contributions(
     anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int], rule: AlarmRule
 ) -> dict[str, Contribution]:
-    """Delays, misses and false-alarm rates of one cell, sums running on over the onset.
+    """Delays, misses and false-alarm rates of one cell at the paper's fixed threshold.
 
-    A miss enters ``delay_censored`` as T - onset + 1, one more than the largest possible delay.
+    Sums run on over the onset. A miss enters ``delay_censored`` as T - onset + 1, one more than the
+    largest possible delay. ``far`` counts alarms and defined steps from row 20 to the onset.
     """
     times = [int(t) for t in onsets]
     loud, quiet = ([rule.alarms(s) for s in part] for part in (anomalous, twins))
     delays = np.array([first_delay(x, t) for x, t in zip(loud, times, strict=True)])
     remainders = np.array([len(a) - t for a, t in zip(anomalous, times, strict=True)])
     missed = np.isnan(delays)
-    early = [(x[:t], a[:t]) for x, a, t in zip(loud, anomalous, times, strict=True)]
+    before = [slice(FAR_START, t) for t in times]
+    early = [(x[rows], a[rows]) for x, a, rows in zip(loud, anomalous, before, strict=True)]
     return {
         "delay": mean_of(delays),
         "delay_null": mean_of([first_delay(x, t) for x, t in zip(quiet, times, strict=True)]),
@@ -158,53 +210,12 @@ def alarm_contributions(
 
 
 def cell_contributions(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int], rule: AlarmRule
-) -> dict[str, Contribution]:
-    """All metrics of one cell, in the order of `RATIOS`."""
-    found = auc_contributions(anomalous, twins, onsets)
-    found |= alarm_contributions(anomalous, twins, onsets, rule)
-    return {name: found[name] for name in RATIOS}
-
-
-def pooled_metrics(anomalous: Sequence[Floats], onsets: Sequence[int]) -> dict[str, float]:
-    """Pooled AUC, average precision and FPR95 of one cell, in the order of `POOLED`.
-
-    All defined scores of all anomalous trajectories form one pool, positive where t >= onset. With
-    TP and FP the positives and negatives at or above a threshold, P and N their totals, and the
-    thresholds descending over the distinct scores:
-
-    - ``auc_pooled`` is the area under TP / P over FP / N, ties one half;
-    - ``average_precision`` is the sum of (increase of TP / P) * TP / (TP + FP), without
-      interpolation;
-    - ``fpr95`` is FP / N at the highest threshold with TP / P >= 0.95.
-
-    All are NaN where a class is empty. A pool compares scores of different episodes and phases, and
-    its average precision moves with the share of positives, which the onsets decide: for reading
-    beside other work, not for ranking.
-
-    Examples
-    --------
-    >>> pooled_metrics([np.array([0.0, 2.0, 3.0]), np.array([0.0, 1.0, 0.0, 1.0])], [1, 3])
-    {'auc_pooled': 0.9583333333333334, 'average_precision': 0.9166666666666666, 'fpr95': 0.25}
-    """
-    scores = np.concatenate(anomalous)
-    late = [np.arange(len(a)) >= onset for a, onset in zip(anomalous, onsets, strict=True)]
-    defined = ~np.isnan(scores)
-    scores, positive = scores[defined], np.concatenate(late)[defined]
-    if not positive.any() or positive.all():
-        return dict.fromkeys(POOLED, float("nan"))
-    order = np.argsort(-scores, kind="stable")
-    scores, positive = scores[order], positive[order]
-    # Equal scores pass a threshold together: only the last of each run of them counts.
-    last = np.append(scores[1:] != scores[:-1], True)
-    tp, fp = np.cumsum(positive)[last], np.cumsum(~positive)[last]
-    # Twenty times the counts, so that 95 % is exact.
-    found = int(np.argmax(20 * tp >= 19 * tp[-1]))
-    return {
-        "auc_pooled": auc(scores[positive], scores[~positive]),
-        "average_precision": float(np.sum(np.diff(tp, prepend=0) * (tp / (tp + fp))) / tp[-1]),
-        "fpr95": float(fp[found] / fp[-1]),
-    }
+    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
+    effects: Sequence[int], rule: AlarmRule,
+) -> dict[str, Contribution]:  # fmt: skip
+    """Return all metrics of one cell that need no level, in the order of the catalogue."""
+    found = auc_contributions(anomalous, twins, onsets, effects, rule.standardization)
+    return found | alarm_contributions(anomalous, twins, onsets, rule)
 
 
 def _rate(pairs: Sequence[tuple[NDArray[np.bool_], Floats]]) -> Contribution:

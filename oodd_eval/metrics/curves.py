@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.metrics.alarms import defined_steps, highest_statistic
+from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Floats, auc_same_times, first_delay
 from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Alarms, cusum
 
@@ -56,7 +56,7 @@ def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
 def mean_matched_roc(
     anomalous: Sequence[Floats],
     twins: Sequence[Floats],
-    onsets: Sequence[int],
+    effects: Sequence[int],
     fpr: Floats | Sequence[float] = FPR,
 ) -> Floats:
     """Return the matched ROC curve of a cell: averaged over trajectories at equal rates.
@@ -65,7 +65,8 @@ def mean_matched_roc(
     average of the areas. NaN when no trajectory has a curve.
     """
     grid = np.asarray(fpr, dtype=np.float64)
-    spans = [slice(t, min(map(len, two))) for t, *two in zip(onsets, anomalous, twins, strict=True)]
+    triples = zip(effects, anomalous, twins, strict=True)
+    spans = [slice(t, min(map(len, two))) for t, *two in triples]
     pairs = zip(anomalous, twins, spans, strict=True)
     curves = np.array([roc(a[span], b[span], grid) for a, b, span in pairs])
     defined = curves[~np.isnan(curves[:, 0])]
@@ -78,7 +79,8 @@ def thresholds(twins: Sequence[Floats], rule: AlarmRule, n: int = THRESHOLDS) ->
     They are 0, the paper's, and a geometric sequence from a tenth of it to the first at which no
     twin raises an alarm any more, but at least to ten times the paper's.
     """
-    top = min(max(highest_statistic(twins, rule), 10 * THRESHOLD), LARGEST)
+    unbounded = GuaranteedAlarm(rule.standardization, math.inf)
+    top = min(max(10 * THRESHOLD, *map(unbounded.largest, twins)), LARGEST)
     between = np.geomspace(THRESHOLD / 10, top, n - 2)
     # The end is met exactly, so that the last false-alarm rate is 0.
     between[-1] = top
@@ -114,7 +116,7 @@ def delay_far(
     """
     names = ("threshold", "far", "delay_censored", "missed", "null_censored")
     rows = []
-    steps = defined_steps(sweep.twins)
+    steps = sum(int(np.count_nonzero(~np.isnan(b))) for b in sweep.twins)
     for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if steps else ():
         loud = [rule.alarms(a) for a in anomalous]
         missed = [math.isnan(first_delay(x, t)) for x, t in zip(loud, onsets, strict=True)]
@@ -131,8 +133,9 @@ def _censored(alarms: Sequence[Alarms], onsets: Sequence[int]) -> float:
 
 
 def example(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int], rule: AlarmRule
-) -> dict[str, Any]:
+    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
+    effects: Sequence[int], rule: AlarmRule,
+) -> dict[str, Any]:  # fmt: skip
     """Return the trajectory with the median matched AUC of a cell, around its onset.
 
     It is typical of what the detector does in this cell. Of an even number it is the lower median,
@@ -141,8 +144,8 @@ def example(
     alarm. None stands for what is undefined.
     """
     areas = [
-        auc_same_times(a, b, onset, min(len(a), len(b)))
-        for a, b, onset in zip(anomalous, twins, onsets, strict=True)
+        auc_same_times(a, b, effect, min(len(a), len(b)))
+        for a, b, effect in zip(anomalous, twins, effects, strict=True)
     ]
     ranked = sorted((area, i) for i, area in enumerate(areas) if not math.isnan(area))
     area, index = ranked[(len(ranked) - 1) // 2] if ranked else (math.nan, 0)
@@ -162,15 +165,16 @@ def example(
 
 
 def cell_curves(
-    sweep: Sweep, rule: AlarmRule, anomalous: Sequence[Floats], onsets: Sequence[int]
-) -> dict[str, Any]:
+    sweep: Sweep, rule: AlarmRule, anomalous: Sequence[Floats], onsets: Sequence[int],
+    effects: Sequence[int],
+) -> dict[str, Any]:  # fmt: skip
     """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
-    tpr = mean_matched_roc(anomalous, sweep.twins, onsets)
+    tpr = mean_matched_roc(anomalous, sweep.twins, effects)
     defined = not np.isnan(tpr).any()
     found: dict[str, Any] = rounded({
         "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
         "delay_far": delay_far(sweep, anomalous, onsets),
-        "example": example(anomalous, sweep.twins, onsets, rule),
+        "example": example(anomalous, sweep.twins, onsets, effects, rule),
     })  # fmt: skip
     return found
 

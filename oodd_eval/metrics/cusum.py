@@ -25,26 +25,46 @@ THRESHOLD: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Standardization:
-    """Mean and standard deviation (ddof 0) of all defined calibration scores; NaN without any."""
+    """Mean and standard deviation (ddof 0) of all defined calibration scores; NaN without any.
+
+    Scores that are all equal have that mean and the standard deviation 0, without rounding.
+    """
 
     mean: float
     std: float
 
     @classmethod
     def fit(cls, scores: Iterable[Floats]) -> Standardization:
-        """Pool all defined scores of the calibration trajectories."""
+        """Pool all defined scores of the calibration trajectories.
+
+        Scores whose sum or whose distance from their mean is no number raise `OverflowError`.
+        """
         pooled = np.concatenate([np.zeros(0), *(s[~np.isnan(s)] for s in scores)])
         if not pooled.size:
             return cls(math.nan, math.nan)
         mean = math.fsum(pooled) / pooled.size
+        if pooled.min() == pooled.max():
+            # The mean of equal numbers may be rounded to another one.
+            return cls(float(pooled[0]), 0.0)
         with np.errstate(over="ignore"):
-            std = math.sqrt(math.fsum((pooled - mean) ** 2) / pooled.size)
+            far = pooled - mean
+        largest = float(np.abs(far).max())
+        if math.isinf(largest):
+            raise OverflowError("the standard deviation of these scores is too large")
+        # Squares of large numbers are infinite, of small ones 0. A power of two as the unit rounds
+        # nothing.
+        unit = math.ldexp(1.0, math.frexp(largest)[1] - 1)
+        std = unit * math.sqrt(math.fsum((far / unit) ** 2) / pooled.size)
         return cls(mean, std)
 
     def __call__(self, scores: Floats) -> Floats:
-        """Return ``x_t = 0.01 (s_t - mean) / std``; 0 where std is 0; NaN stays NaN."""
+        """Return ``x_t = 0.01 (s_t - mean) / std``; NaN stays NaN.
+
+        Where std is 0, any score above the mean is infinitely far from all that is nominal: x_t is
+        infinite there, and 0 elsewhere. Without calibration scores x_t is 0.
+        """
         if not self.std > 0:
-            return np.where(np.isnan(scores), np.nan, 0.0)
+            return np.where(np.isnan(scores), np.nan, np.where(scores > self.mean, np.inf, 0.0))
         return UNIT * ((scores - self.mean) / self.std)
 
 
@@ -75,8 +95,8 @@ def cusum(
     Notes
     -----
     With the paper's drift and threshold, 0.18 and 1 standard deviation, expect an alarm at roughly
-    every tenth nominal step; `oodd_eval.metrics.alarms.calibrate` finds a threshold with a
-    false-alarm rate chosen in advance.
+    every tenth nominal step; `oodd_eval.metrics.alarms.GuaranteedAlarm` bounds the share of nominal
+    episodes with an alarm. With an infinite threshold the sum never starts again.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 """Ranks, ties and win rates of the rows of one table.
 
 A row is better than another when the paired bootstrap over test seeds says so after Holm's
-correction over all ordered pairs of the table. Ranks count the rows that are better; rows that
-share a tie group cannot be told apart.
+correction. Ranks count the primary rows that are better: one row a detector, so that variants of
+one detector push nobody down. Primary rows that share a tie group cannot be told apart.
 
 Rows are given as the numerators and denominators of a metric, per detector seed and cell. Higher
 is better.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, percentiles
+from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, bounds
 
 ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
@@ -72,9 +72,10 @@ class PairTest:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Ranked rows of one table: ranks by row, tie groups and the tests of all ordered pairs.
+    """Ranked rows of one table: ranks by row, tie groups of primary rows, and the tests.
 
-    A rank is 1 + the number of rows that are significantly better.
+    A rank is 1 + the number of primary rows that are significantly better. Tests are of all ordered
+    pairs with a primary row.
     """
 
     ranks: dict[str, int]
@@ -88,13 +89,19 @@ class Ranking:
         return "".join(_letter(i) for i, group in enumerate(shared) if row in group)
 
 
-def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
+def rank(
+    rows: Mapping[str, Row], primary: Collection[str] | None = None, *,
+    resamples: int | None = None,
+) -> Ranking:  # fmt: skip
     """Rank the rows of one table, in the same way for any order of rows, seeds and cells.
 
     Parameters
     ----------
     rows
         By name.
+    primary
+        Names of the rows that push others down; None means all. The other rows are variants, which
+        are compared with primary rows only.
     resamples
         Number of bootstrap resamples R; by default at least 10 000 and 50 per ordered pair.
 
@@ -113,14 +120,20 @@ def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
     ``2 ** -N`` with N test seeds in all environments together: if neither row is better, each
     seed's difference might as well have the other sign.
 
+    Holm's correction is over all ordered pairs of primary rows. A variant's tests are corrected as
+    if it were the one further primary row, so that its rank is the one that it would have.
+
     Test seeds are drawn jointly for all rows and anomalies of an environment, so that differences
     are paired. Several detector seeds of a row are drawn, too, independently of other rows; the two
     sources of noise are added.
     """
     names = sorted(rows)
     shape = _shape(rows)
-    pairs = list(itertools.combinations(names, 2))
-    count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * len(pairs))
+    first = [name for name in names if primary is None or name in primary]
+    variants = [name for name in names if name not in first]
+    pairs = list(itertools.combinations(first, 2))
+    most = len(pairs) + (len(first) if variants else 0)
+    count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * most)
     draws = {e: bootstrap_weights(n, key=e, resamples=count) for e, n in shape.items()}
     for name in names:
         own = f"{OWN_SEEDS} of {name}"
@@ -128,23 +141,37 @@ def rank(rows: Mapping[str, Row], *, resamples: int | None = None) -> Ranking:
     influences = {name: _influences(name, rows[name]) for name in names}
     floor = 2.0 ** -sum(shape.values())
     means = {name: _mean(rows[name]) for name in names}
-    found = []
-    for a, b in pairs:
-        effect = _difference(influences[a], influences[b])
-        difference = means[a] - means[b]
-        shifts, exceeding, falling = _test(difference, effect, draws)
-        low, high = percentiles(difference + shifts)
-        for first, second, sign, k in ((a, b, 1, exceeding), (b, a, -1, falling)):
-            ends = (low, high) if sign > 0 else (-high, -low)
-            p = max((1 + k) / (count + 1), floor)
-            found.append(PairTest(first, second, sign * difference, *ends, p, math.nan))
-    corrected = holm(np.array([c.p for c in found]))
-    comparisons = [replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
+
+    def tests(of: Iterable[tuple[str, str]]) -> list[PairTest]:
+        found = []
+        for a, b in of:
+            effect = _difference(influences[a], influences[b])
+            difference = means[a] - means[b]
+            shifts, exceeding, falling = _test(difference, effect, draws)
+            low, high = bounds(difference + shifts, difference, list(shape.values()))
+            for one, other, sign, k in ((a, b, 1, exceeding), (b, a, -1, falling)):
+                ends = (low, high) if sign > 0 else (-high, -low)
+                p = max((1 + k) / (count + 1), floor)
+                found.append(PairTest(one, other, sign * difference, *ends, p, math.nan))
+        return found
+
+    among = tests(pairs)
+    comparisons = _corrected(among, [])
+    for variant in variants:
+        comparisons += _corrected(tests((variant, name) for name in first), among)
     better = {(c.first, c.second) for c in comparisons if c.better}
-    ranks = {name: 1 + sum((other, name) in better for other in names) for name in names}
+    ranks = {name: 1 + sum((other, name) in better for other in first) for name in names}
     order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
     ranks = {name: ranks[name] for name in order}
-    return Ranking(ranks, tie_groups(order, better), comparisons, count)
+    apart = {pair for pair in better if pair[0] in first and pair[1] in first}
+    groups = tie_groups([name for name in order if name in first], apart)
+    return Ranking(ranks, groups, comparisons, count)
+
+
+def _corrected(tests: Sequence[PairTest], others: Sequence[PairTest]) -> list[PairTest]:
+    """Return tests with Holm's correction over them and others together."""
+    p = holm(np.array([c.p for c in (*tests, *others)]))
+    return [replace(c, p_holm=float(own)) for c, own in zip(tests, p, strict=False)]
 
 
 def holm(p: Floats) -> Floats:

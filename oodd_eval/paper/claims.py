@@ -1,8 +1,9 @@
 """The paper's claims, each as a number and a region in which it lies if the claim is true.
 
-The 95 % interval alone decides a verdict: *confirmed* where all of it lies in the region, *refuted*
-where all of it lies outside (or an advantage is smaller than matters), else *undecided*. Each is
-put to the paper's measure and to one without its flaw, if there is one. ``claims.toml`` has them.
+The 95 % interval alone decides a verdict: *negligible* where all of it is closer to 0 than matters,
+then *confirmed* where all of it lies in the region, *refuted* where all of it lies outside, else
+*undecided*. Each is put to the paper's measure and to one without its flaw, if there is one. Claims
+that are settled by definition or by construction say so instead. ``claims.toml`` has them.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ NOT_RUN: Final = "not run"
 RETURN: Final = "return"
 """The measure of claims about the policies' returns, that is about data instead of detectors."""
 
-Verdict = Literal["confirmed", "refuted", "undecided", "not run"]
+Settled = Literal["by definition", "by construction"]
+Verdict = Literal["confirmed", "negligible", "refuted", "undecided", "not run", Settled]
 ORDER: Final[tuple[Verdict, ...]] = get_args(Verdict)
 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """The open interval of a true claim; numbers within `negligible` of 0 are no advantage."""
+    """The open interval of a true claim; a number within `negligible` of 0 makes no difference."""
 
     above: float = -math.inf
     below: float = math.inf
@@ -42,11 +44,12 @@ class Region:
         """Return the verdict on an estimate."""
         if math.isnan(estimate.low) or math.isnan(estimate.high):
             return "undecided" if estimate.environments else "not run"
+        if -self.negligible < estimate.low and estimate.high < self.negligible:
+            return "negligible"
         if self.above < estimate.low and estimate.high < self.below:
             return "confirmed"
         outside = estimate.high <= self.above or estimate.low >= self.below
-        negligible = -self.negligible < estimate.low and estimate.high < self.negligible
-        return "refuted" if outside or negligible else "undecided"
+        return "refuted" if outside else "undecided"
 
     def describe(self, metric: str) -> str:
         """Return the region as printed: ``"> 0"``, ``"between -0.02 and 0.02"``."""
@@ -71,6 +74,8 @@ class Claim:
     environments: tuple[str, ...] = tuple(ENVIRONMENTS)
     everywhere: bool = False
     offset: float = 0.0
+    settled: Settled | None = None
+    source: str = ""
     note: str = ""
 
     @classmethod
@@ -84,6 +89,8 @@ class Claim:
         check_known("metric", filter(None, (metric, others.get("fair"))), (*NAMES, RETURN))
         if any(bool(side.settings) == (metric == RETURN) for side in sides):
             raise ValueError("expected settings on every side, unless the metric is 'return'")
+        if (settled := others.get("settled")) not in (None, *get_args(Settled)):
+            raise ValueError(f"settled is {settled!r}, expected {' or '.join(get_args(Settled))}")
         return cls(metric=metric, sides=sides, region=Region(**ends), environments=environments,
                    **others)  # fmt: skip
 
@@ -99,6 +106,10 @@ class Judgement:
     estimate: Estimate
     verdict: Verdict
     by_environment: Mapping[str, Verdict] = field(default_factory=dict)
+
+
+_WORST_FIRST: Final[tuple[Verdict, ...]] = ("refuted", "negligible", "undecided", "not run")
+"""Verdicts on one environment that decide a claim about every one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +133,9 @@ def judge(
 ) -> Judgement:
     """Put a claim to one measure."""
 
+    def verdict(found: Estimate) -> Verdict:
+        return claim.settled or claim.region.verdict(found) if found.environments else "not run"
+
     def estimated(environments: Sequence[str]) -> Estimate:
         if metric == RETURN:
             found = lost_return(returns or {}, claim.sides, environments)
@@ -132,30 +146,41 @@ def judge(
 
     if not claim.everywhere:
         mean = estimated(claim.environments)
-        return Judgement(metric, mean, "undecided" if mean.partial else claim.region.verdict(mean))
+        partial = mean.partial and not claim.settled
+        return Judgement(metric, mean, "undecided" if partial else verdict(mean))
     estimates = [estimated([e]) for e in claim.environments]
-    said = [claim.region.verdict(e) for e in estimates]
+    said = [verdict(e) for e in estimates]
     by_environment = dict(zip(claim.environments, said, strict=True))
     run = [(v, e) for v, e in zip(said, estimates, strict=True) if e.environments]
     if not run:
         return Judgement(metric, Estimate(expected=len(said)), "not run", by_environment)
-    verdict: Verdict = "confirmed" if set(said) == {"confirmed"} else "undecided"
-    verdict = "refuted" if "refuted" in said else verdict
-    worst = min((e for v, e in run if v == verdict), key=lambda e: e.value, default=run[0][1])
-    return Judgement(metric, worst, verdict, by_environment)
+    # As good as the worst environment; one that was not run leaves the claim undecided.
+    worst: Verdict = next((v for v in _WORST_FIRST if v in said), claim.settled or "confirmed")
+    worst = "undecided" if worst == "not run" else worst
+    decisive = [e for v, e in run if v == worst] or [e for _, e in run]
+    number = min(decisive, key=lambda e: e.value)
+    return Judgement(metric, number, worst, by_environment)
 
 
 def summary(made: Sequence[Ruling]) -> str:
-    """Return how many claims came to which verdict, under either kind of measure."""
+    """Return how many claims came to which verdict, under either kind of measure.
+
+    Claims that are settled by definition or by construction are told apart and not counted.
+    """
 
     def counted(judged: Sequence[Judgement], claims: str) -> str:
         count = Counter(j.verdict for j in judged)
         counts = ", ".join(f"{count[v]} {v}" for v in ORDER if count[v])
         return f"of {len(judged)}{claims} {counts}"
 
-    own = counted([r.own for r in made], " claims")
-    fair = counted([r.fair for r in made if r.fair], "")
-    return f"By the paper's measures, {own}; by matched AUC and censored delay, {fair}."
+    open_ = [r for r in made if not r.claim.settled]
+    own = counted([r.own for r in open_], " claims")
+    fair = counted([r.fair for r in open_ if r.fair], "")
+    text = f"By the paper's measures, {own}; by matched AUC and censored delay, {fair}."
+    if not (settled := len(made) - len(open_)):
+        return text
+    are = "is" if settled == 1 else "are"
+    return f"{text} {settled} more {are} settled by definition or by construction and not counted."
 
 
 def claims_table(made: Sequence[Ruling]) -> Table:
@@ -165,7 +190,8 @@ def claims_table(made: Sequence[Ruling]) -> Table:
     rows = []
     for r in made:
         c = r.claim
-        text, true_if = f"{c.text} ({c.note})" if c.note else c.text, c.region.describe(c.metric)
+        text = f"{c.text} ({c.note})" if c.note else c.text
+        true_if = c.region.describe(c.metric) + (f" ({c.source})" if c.source else "")
         judged = _shown(r.own), _shown(r.fair) if r.fair else ""
         rows.append([text, *judged, c.number, true_if, str(r.own.estimate.seeds or ""), c.place])
     return Table("Claims", header, rows, labels=len(header))

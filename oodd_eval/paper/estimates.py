@@ -69,13 +69,25 @@ class Estimate:
         return 0 < self.environments < self.expected
 
 
-def _estimate(found: Sequence[Samples], expected: int, seeds: int = 0) -> Estimate:
-    """Return the mean over those of the expected environments where there is a number."""
+def _estimate(
+    found: Sequence[Samples], sizes: Sequence[int], expected: int, seeds: int = 0
+) -> Estimate:
+    """Return the mean over those of the expected environments where there is a number.
+
+    `sizes` are the numbers of test trajectories by environment.
+    """
     if not found:
         return Estimate(expected=expected)
     mean = mean_samples(found)
     defined = sum(not math.isnan(one[0]) for one in found) or len(found)
-    return Estimate(float(mean[0]), *bootstrap.percentiles(mean[1:]), defined, expected, seeds)
+    ends = bootstrap.bounds(mean[1:], float(mean[0]), sizes)
+    return Estimate(float(mean[0]), *ends, defined, expected, seeds)
+
+
+def _defined(records: Iterable[Record], metric: str) -> int:
+    """Return the least number of trajectories that a metric of some cells is defined for."""
+    terms = (contribution(r, metric) for r in records if metric in r.per_trajectory)
+    return min((own.n for own in terms if own.n), default=0)
 
 
 class Estimator:
@@ -102,7 +114,7 @@ class Estimator:
 
         Only detector seeds count that all sides have, and those of `same_seeds` that were run.
         """
-        found, counts = [], []
+        found, counts, sizes = [], [], []
         for environment in environments:
             held = [self._by_seed(setting, environment, side.anomalies)
                     for side in sides for setting in side.settings]  # fmt: skip
@@ -115,7 +127,8 @@ class Estimator:
             if common:
                 found.append(self._sum(sides, metric, environment, sorted(common)))
                 counts.append(len(common))
-        return _estimate(found, len(environments), min(counts, default=0))
+                sizes.append(_defined((r for own in held for s in common for r in own[s]), metric))
+        return _estimate(found, sizes, len(environments), min(counts, default=0))
 
     def _by_seed(
         self, setting: Setting, environment: str, anomalies: Sequence[str]
@@ -158,12 +171,12 @@ def _samples(environment: str, own: Contribution | ArrayLike) -> Samples:
 def mean_return(returns: Returns, environment: str, kind: str) -> Estimate:
     """Return a mean over test seeds with its interval; undefined where it was not recorded."""
     values = returns.get(environment, {}).get(kind)
-    return _estimate([_samples(environment, values)] if values else [], 1)
+    return _estimate([_samples(environment, values)] if values else [], [len(values or ())], 1)
 
 
 def lost_return(returns: Returns, sides: Sequence[Side], environments: Sequence[str]) -> Estimate:
     """Return a sum of sides of the lost share of the return, (nominal - anomalous) / |nominal|."""
-    found = []
+    found, sizes = [], []
     for environment in environments:
         own = {k: np.asarray(v) for k, v in returns.get(environment, {}).items()}
         if any(kind not in own for kind in KINDS):
@@ -173,7 +186,8 @@ def lost_return(returns: Returns, sides: Sequence[Side], environments: Sequence[
             lost = own["nominal"] - np.mean([own[a] for a in side.anomalies], axis=0)
             total = total + side.weight * _samples(environment, lost) / whole
         found.append(total)
-    return _estimate(found, len(environments))
+        sizes.append(len(own["nominal"]))
+    return _estimate(found, sizes, len(environments))
 
 
 @dataclass(frozen=True, slots=True)

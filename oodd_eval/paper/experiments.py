@@ -110,7 +110,7 @@ class Tier:
     seeds_far: int
 
     def seeds(self, setting: Setting) -> range:
-        """Return the detector seeds of a setting; detectors without training have one."""
+        """Return the detector seeds of a setting; deterministic detectors have one."""
         if setting.detector in CONTROLS:
             return range(1)
         expensive = setting.horizon > 1 or "samples" in setting.overrides  # a sweep of sizes
@@ -152,7 +152,7 @@ def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...
     return tuple(made.values())
 
 
-# Detectors without training; all experiments but Table 2, in the order of the page.
+# Deterministic detectors; all experiments but Table 2, in the order of the page.
 CONTROLS: Final[tuple[str, ...]] = tuple(tomllib.loads(FILE.read_text("utf-8"))["controls"])
 EXPERIMENTS: Final = read_tables(FILE, "experiment", Experiment.of)
 TIERS: Final = {tier.name: tier for tier in read_tables(FILE, "tier", Tier)}

@@ -12,8 +12,6 @@ The same records give the same bytes.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -33,8 +31,8 @@ from oodd_eval.paper.inputs import KINDS, Reproduction, Returns, write_changed
 from oodd_eval.paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables.rendering import csv_text, number
 from oodd_eval.results.tables.rendering import markdown as padded_table
-from oodd_eval.results.tables.rendering import number
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 
@@ -56,7 +54,7 @@ def publish(
     own = reproduction.own(records)
     estimator = Estimator(own)
     made = rulings(estimator, returns)
-    write_changed(directory / "claims.csv", _csv(claims_csv(made)))
+    write_changed(directory / "claims.csv", csv_text(claims_csv(made)))
     sections = [_of_returns(reproduction, returns)]
     sections += [_of_experiment(reproduction, e, estimator) for e in EXPERIMENTS]
     lines = [line for one in sections for line in _write(directory, one, figures=figures)]
@@ -80,7 +78,7 @@ def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
     """Write a section's files, no picture twice, and return its part of the page."""
     if not one.csv:
         return [f"## {one.title}", "", "Not run.", ""]
-    write_changed(directory / "tables" / f"{one.id}.csv", _csv(one.csv))
+    write_changed(directory / "tables" / f"{one.id}.csv", csv_text(one.csv))
     whole = "\n".join([f"# {one.title}", "", one.caption, "", *one.tables])
     write_changed(directory / "tables" / f"{one.id}.md", whole)
     links = []
@@ -285,9 +283,3 @@ def _seeds(used: Mapping[str, set[int]]) -> str:
 def markdown_table(table: Table) -> str:
     """Return a table as Markdown without the padding, which would make up most of the page."""
     return re.sub(r"-{3,}", "---", re.sub(r" {2,}", " ", padded_table(table)))
-
-
-def _csv(lines: Sequence[Sequence[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()

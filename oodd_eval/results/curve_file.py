@@ -66,8 +66,10 @@ def make_curves(
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
             anomalous = scores[f"test/{record.anomaly}"]
-            onsets = environment.anomalous(record.anomaly).onsets[: len(anomalous)].tolist()
-            curves = cell_curves(sweep, rule, anomalous, onsets)
+            known = environment.anomalous(record.anomaly)
+            onsets, effects = (part[: len(anomalous)].tolist()
+                               for part in (known.onsets, known.effects))  # fmt: skip
+            curves = cell_curves(sweep, rule, anomalous, onsets, effects)
             units.append({"cell": str(record.cell), **identity(record), **curves})
     return {"schema": SCHEMA, "units": units}
 

@@ -36,16 +36,23 @@ WRITING_SHARE: Final = 0.05
 """Records are written again once the last writing took less than this share of the time since."""
 
 
+ORDER_BITS: Final = 53
+"""Random bits that decide the order of groups: as many as a float64 attribute keeps exactly."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScoreFile:
     """Scores of one unit by part (``calibration``, ``test/nominal``, ``test/iid`` and so on).
 
     `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit, and
-    ``steps_scored``, the number of observations that ``seconds_score`` is for.
+    ``steps_scored``, the number of observations that ``seconds_score`` is for. `order` is the seed
+    of the order in which groups were scored; each part keeps its own where parts of several runs
+    lie in one file.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
+    order: int | None = None
 
 
 class ResultsDirectory:
@@ -139,12 +146,15 @@ class ResultsDirectory:
 
     def write_scores(self, key: str, scores: ScoreFile) -> None:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
-        parts = {**self._all_parts(key), **scores.parts}
+        own = {part: (sequences, scores.order) for part, sequences in scores.parts.items()}
+        parts = {**self._all_parts(key), **own}
         place = self.path / "scores" / f"{key}.h5"
         with files.replacing(place) as path, h5py.File(path, "w") as file:
             file.attrs.update(scores.cost)
-            for part, sequences in sorted(parts.items()):
+            for part, (sequences, order) in sorted(parts.items()):
                 group = file.create_group(part)
+                if order is not None:
+                    group.attrs["order"] = float(order)
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
                 group.create_dataset(
                     "scores", data=np.concatenate(sequences), compression="gzip", shuffle=True
@@ -177,12 +187,15 @@ class ResultsDirectory:
             return None
         return ScoreFile(parts, cost)
 
-    def _all_parts(self, key: str) -> dict[str, list[NDArray[np.float64]]]:
-        parts: dict[str, list[NDArray[np.float64]]] = {}
+    def _all_parts(self, key: str) -> dict[str, tuple[list[NDArray[np.float64]], float | None]]:
+        """Return the scores of all parts, each with the order in which groups were scored."""
+        parts: dict[str, tuple[list[NDArray[np.float64]], float | None]] = {}
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
-                parts[name] = np.split(item["scores"][:], item["offsets"][1:-1])
+                sequences = np.split(item["scores"][:], item["offsets"][1:-1])
+                # Files of earlier versions have one order for all parts.
+                parts[name] = sequences, item.attrs.get("order", item.file.attrs.get("order"))
 
         try:
             with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:

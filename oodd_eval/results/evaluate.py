@@ -2,72 +2,71 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.alarms import MIN_STEPS, calibrate
-from oodd_eval.metrics.auc import (
-    AlarmRule,
-    Contribution,
-    alarm_contributions,
-    cell_contributions,
-    pooled_metrics,
+from oodd_eval.metrics.alarms import (
+    AlarmKind,
+    GuaranteedAlarm,
+    guaranteed_contributions,
+    offered_levels,
 )
-from oodd_eval.metrics.bootstrap import interval, shared_weights
-from oodd_eval.metrics.catalogue import CALIBRATED, TARGETS
+from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
+from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
+from oodd_eval.metrics.catalogue import GUARANTEED, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.record import Metric, Record
+from oodd_eval.results.record import NAN, Metric, Record
 
 
 @dataclass(frozen=True, slots=True)
 class Rules:
     """The alarm rules of one fitted detector, made from its calibration scores.
 
-    `standard` has the paper's drift and threshold. `calibrated` are rules by suffix, such as
-    ``"at_1pct"``, with the smallest threshold that keeps the calibration trajectories' false-alarm
-    rate at the target; targets with too few calibration steps are left out.
+    `paper` has the paper's drift and threshold. `guaranteed` are rules by suffix, such as
+    ``"at_5pct"``, that raise an alarm in at most that share of nominal episodes; levels that need
+    more calibration episodes are left out.
     """
 
-    standard: AlarmRule
-    calibrated: dict[str, AlarmRule]
+    paper: AlarmRule
+    guaranteed: dict[str, GuaranteedAlarm]
 
     @classmethod
-    def fit(cls, calibration: Sequence[Scores]) -> Rules:
-        """Standardize and calibrate on the scores of nominal trajectories."""
-        rule = AlarmRule(Standardization.fit(calibration))
-        steps = sum(int(np.count_nonzero(~np.isnan(s))) for s in calibration)
-        return cls(
-            rule,
-            {
-                suffix: replace(rule, threshold=calibrate(calibration, rule, target))
-                for suffix, target in TARGETS.items()
-                if steps >= MIN_STEPS[suffix]
-            },
-        )
+    def fit(cls, calibration: Sequence[Scores], alarm: AlarmKind = "cusum") -> Rules:
+        """Standardize and find thresholds on the scores of nominal trajectories."""
+        levels = offered_levels(len(calibration), alarm)
+        rules = GuaranteedAlarm.fits(calibration, list(levels.values()), alarm)
+        paper = AlarmRule(Standardization.fit(calibration))
+        return cls(paper, dict(zip(levels, rules, strict=True)))
 
 
 def cell_metrics(
-    anomalous: Sequence[Scores], twins: Sequence[Scores], onsets: Sequence[int], rules: Rules, *,
-    environment: str,
+    anomalous: Sequence[Scores], twins: Sequence[Scores], onsets: Sequence[int],
+    effects: Sequence[int], rules: Rules, *, environment: str,
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:  # fmt: skip
     """Compute all metrics of one cell with their intervals."""
-    found = cell_contributions(anomalous, twins, onsets, rules.standard)
-    for suffix, rule in rules.calibrated.items():
-        alarms = alarm_contributions(anomalous, twins, onsets, rule)
-        found |= {f"{name}_{suffix}": alarms[name] for name in CALIBRATED}
-    weights = shared_weights(environment, len(anomalous))
-    metrics = {name: Metric(c.value, *interval(c, weights), n=c.n) for name, c in found.items()}
-    thresholds = {f"threshold_{s}": Metric(r.threshold) for s, r in rules.calibrated.items()}
-    defined = sum(not np.isnan(scores).all() for scores in anomalous)
-    pooled = pooled_metrics(anomalous, onsets)
-    return metrics | thresholds | {k: Metric(v, n=defined) for k, v in pooled.items()}, found
+    found = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
+    thresholds = {}
+    for suffix, rule in rules.guaranteed.items():
+        alarms = guaranteed_contributions(anomalous, twins, effects, rule)
+        found |= {f"{name}_{suffix}": alarms[name] for name in GUARANTEED}
+        # JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
+        finite = math.isfinite(rule.threshold)
+        thresholds[f"threshold_{suffix}"] = Metric(rule.threshold if finite else NAN)
+    metrics = {name: metric_of(name, c, environment) for name, c in found.items()}
+    return metrics | thresholds, found
+
+
+def metric_of(name: str, contribution: Contribution, environment: str) -> Metric:
+    """Return a metric of a cell with its interval, from its terms."""
+    cell = drawn_cell(environment, 0, contribution)
+    ends = mean_interval([cell], kind=metric_info(name).interval)
+    return Metric(contribution.value, *ends, n=contribution.n)
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
@@ -76,26 +75,32 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
     Cells whose scores cannot be standardized become ``invalid``.
     """
     try:
-        rules = Rules.fit(scores.parts[CALIBRATION])
+        rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm)
     except OverflowError:
         reason = "scores are too large: their sum over the calibration trajectories overflows"
+        return [replace(record, status="invalid", reason=reason) for record in records]
+    if records[0].alarm == "score" and math.isnan(rules.paper.standardization.mean):
+        # Any score would be an alarm.
+        reason = "no score of the calibration trajectories is defined, so there is no threshold"
         return [replace(record, status="invalid", reason=reason) for record in records]
     return [_with_metrics(record, data, scores, rules) for record in records]
 
 
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
     anomalous = scores.parts[f"test/{record.anomaly}"]
+    known = data.anomalous(record.anomaly)
     metrics, contributions = cell_metrics(
         anomalous,
         scores.parts[TWINS],
-        data.anomalous(record.anomaly).onsets[: len(anomalous)].tolist(),
+        known.onsets[: len(anomalous)].tolist(),
+        known.effects[: len(anomalous)].tolist(),
         rules,
         environment=record.environment,
     )
     per_trajectory = {
         name: (c.numerator.tolist(), c.denominator.tolist()) for name, c in contributions.items()
     }
-    return replace(record, metrics=metrics, per_trajectory=per_trajectory)
+    return replace(record, metrics=metrics, per_trajectory=per_trajectory, brief=bool(known.brief))
 
 
 def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) -> list[Record]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 from oodd_eval.errors import ResultsError
 from oodd_eval.results.identity import Cell, Setting
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of the layout of a record; a reader refuses others."""
 
 Status = Literal["ok", "error", "timeout", "oom", "invalid", "incompatible", "unavailable"]
@@ -68,6 +68,11 @@ class Record:
         All parameters that decide scores, defaults included; those that are not at their default.
     inputs
         ``"observations"`` or ``"observations+actions"``.
+    alarm
+        Statistic of its guaranteed alarms: ``"cusum"``, or ``"score"`` for a detector that
+        accumulates by itself.
+    deterministic
+        Whether its seed changes nothing.
     environment, anomaly, strength, group, horizon, seed, split, split_digest, limit
         The evaluation. `strength` is empty where an anomaly has only one; `limit` is the number of
         trajectories of each part that were used, None for all.
@@ -75,6 +80,9 @@ class Record:
         ``"ok"``, or the way in which the detector failed and one line about it.
     metrics
         Metrics by name; empty for a failed cell.
+    brief
+        Whether half of the cell's episodes are so short that fewer than 20 rows are left to detect
+        anything in.
     counts
         Numbers of trajectories used, by part.
     per_trajectory
@@ -106,10 +114,13 @@ class Record:
     plugin_source: str = ""
     overrides: dict[str, Any] = field(default_factory=dict)
     inputs: str = ""
+    alarm: Literal["cusum", "score"] = "cusum"
+    deterministic: bool = False
     strength: str = ""
     limit: int | None = None
     reason: str = ""
     metrics: dict[str, Metric] = field(default_factory=dict)
+    brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
     per_trajectory: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
     scores: str = ""

@@ -16,17 +16,21 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
 from oodd_eval.leaderboard.entry import EntryInfo
 from oodd_eval.leaderboard.sections import LeaderboardSection
 from oodd_eval.metrics import bootstrap
-from oodd_eval.metrics.bootstrap import Samples
-from oodd_eval.metrics.catalogue import POOLED, RATIOS, TARGETS, metric_info
+from oodd_eval.metrics.bootstrap import DrawnCell
+from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.board import Standing, contribution
 
-_COMPARED: Final = ("delay", "delay_censored", "missed", "far_twin")
+_COMPARED: Final = (
+    "false_episodes", "early", "delay", "delay_censored", "missed", "found_within_20",
+    "found_within_100",
+)  # fmt: skip
 WITH_INTERVALS: Final = (
-    "auc_matched", "auc", "delay", "delay_null", "delay_censored", "missed", "far", "far_twin",
-    *(f"{name}_{suffix}" for suffix in TARGETS for name in _COMPARED),
+    "auc_matched", "auc_smoothed", "auc_unpaired", "auc", "delay", "delay_null", "delay_censored",
+    "missed", "far", "far_twin",
+    *(f"{name}_{HEADLINE}" for name in _COMPARED),
 )  # fmt: skip
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
@@ -80,8 +84,8 @@ def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Jso
     ranks, board = section.ranks, section.ranks.board
     found = {name for r in board.records for name in r.metrics}
     # The plain ones stand there even where every cell of the board has failed.
-    calibrated = [f"{m}_{suffix}" for suffix in TARGETS for m in (*RATIOS, "threshold")]
-    names = [*RATIOS, *(name for name in (*calibrated, *POOLED) if name in found)]
+    by_level = [f"{m}_{suffix}" for suffix in LEVELS for m in (*GUARANTEED, "threshold")]
+    names = [*METRICS, *(name for name in by_level if name in found)]
     have = {(r.environment, r.anomaly) for r in board.records}
     chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
     return {
@@ -115,7 +119,8 @@ def _row(
         "version": records[0].detector_version, "plugin": records[0].plugin, "horizon": row.horizon,
         "parameters": records[0].parameters, "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        **_fields(standing, "trivial", "inputs", "rank", "ties", "state"),
+        **_fields(standing, "trivial", "primary", "inputs", "rank", "alarm_rank", "ties",
+                  "state"),
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in _fields(standing.cost, "fit", "step", "peak").items()},
         "trust": section.trust[row],
@@ -223,20 +228,22 @@ def selection_intervals(
     They are those of `Board.mean`, with each cell resampled once. Left out are selections with a
     failed cell, without an interval, and of one record, which has its own.
     """
-    draws: dict[tuple[int, str, str], Samples] = {}
+    draws: dict[tuple[int, str, str], DrawnCell] = {}
     for r in records:
         if metric in r.per_trajectory:
-            drawn = bootstrap.cell_samples(r.environment, contribution(r, metric))
+            drawn = bootstrap.drawn_cell(r.environment, r.seed, contribution(r, metric))
             draws[r.seed, r.environment, r.anomaly] = drawn
+    if not draws:
+        return {}
+    kind = metric_info(metric).interval
     seeds = list(dict.fromkeys(seed for seed, _, _ in draws))
     failed = {(r.environment, r.anomaly) for r in records if not r.ok}
     found = {}
     for key, cells in chosen.items():
-        by_seed = [[draws[s, *cell] for cell in cells if (s, *cell) in draws] for s in seeds]
-        means = [bootstrap.mean_samples(own) for own in by_seed if own]
+        own = [draws[s, *cell] for s in seeds for cell in cells if (s, *cell) in draws]
         one = len(seeds) == len(cells) == 1
-        if means and not one and not failed.intersection(cells):
-            low, high = bootstrap.percentiles(bootstrap.mean_over_seeds(means))
+        if own and not one and not failed.intersection(cells):
+            low, high = bootstrap.mean_interval(own, kind=kind)
             if not math.isnan(low):
                 found[key] = low, high
     return found

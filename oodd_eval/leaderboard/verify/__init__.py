@@ -19,7 +19,7 @@ from oodd_eval.data.files import GZIP
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, place_of, recorded_versions
-from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files
+from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, shown
 from oodd_eval.leaderboard.verify.formats import read_info, read_records
 from oodd_eval.leaderboard.verify.records import (
     Records,
@@ -135,6 +135,12 @@ def _check_statements(entry: EntryInfo, records: Records, findings: Findings) ->
     )
     used = {(r.plugin, r.detector_version, r.plugin_source) for r in records.values()}
     findings.expect(ENTRY, "plugins", sorted(used), listed, why)
+    rows = {str(record.setting): record.detector for record in records.values()}
+    named = [rows.get(row, "") for row in entry.primary]
+    for row, detector in zip(entry.primary, named, strict=True):
+        if not detector or named.count(detector) > 1:
+            message = f"names {shown(row)}, expected rows of these records, one a detector"
+            findings.refuse(ENTRY, "primary", message)
     stated = entry.environment["packages"] | {"python": entry.environment["python"]}
     for package, version in recorded_versions(records.values()).items():
         field = f"environment.{'' if package == 'python' else 'packages.'}{package}"

@@ -25,10 +25,12 @@ from pydantic import (
 )
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
+from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo, Trust
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
 from oodd_eval.results import record as record_format
 from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record, Status
 
 MOST_RECORDS: Final = 20_000
@@ -83,6 +85,13 @@ def _is_day(value: str) -> bool:
         return False
 
 
+def _is_row(value: str) -> bool:
+    try:
+        return str(Setting.parse(value)) == value
+    except UsageError:
+        return False
+
+
 def _is_command(value: str) -> bool:
     """Tell commands of oodd-eval joined by ``&&`` from all else.
 
@@ -111,6 +120,8 @@ def _is_free(value: Any, levels: int = _DEEPEST) -> bool:
 
 
 # fmt: off
+Row = Annotated[str, _text(300, least=1), _rule(
+    _is_row, "detector and settings as on the board, such as 'riqn[h=5]'")]
 EntryId = Annotated[str, _matching(
     r"(?!.*\.\.)[a-z0-9][a-z0-9._-]{0,79}",
     "at most 80 lower-case letters, digits, '.', '_', '-', no '..'")]
@@ -202,6 +213,7 @@ class _Entry(_Strict):
     created: Annotated[str, _rule(_is_day, "a date such as 2026-11-21")]
     command: Command
     caption: Annotated[str, _text(500)]
+    primary: Annotated[list[Row], Field(max_length=100)]
     files: dict[FileName, _File]
 
 
@@ -240,6 +252,8 @@ class _Record(_Strict):
     parameters: Parameters
     overrides: Parameters
     inputs: Literal["observations", "observations+actions", ""]
+    alarm: Literal["cusum", "score"]
+    deterministic: bool
     environment: Annotated[str, _one_of(ENVIRONMENTS)]
     anomaly: Annotated[str, _one_of(ANOMALIES)]
     strength: Strength
@@ -252,6 +266,7 @@ class _Record(_Strict):
     status: Status
     reason: Annotated[str, _text(1000)]
     metrics: dict[str, _Metric]
+    brief: bool
     counts: _Counts
     per_trajectory: dict[str, Pair]
     scores: ScoreKey

@@ -1,8 +1,8 @@
 """Recompute the metrics of records, and compare records with each other and with their split.
 
-Every metric but the thresholds and the pooled ones is a ratio of sums over test trajectories, and a
-record carries the terms of both sums. So value, interval and number of trajectories are recomputed;
-the terms themselves obey rules of their own, which no scores can break.
+Every metric but the thresholds is a ratio of sums over test trajectories, and a record carries the
+terms of both sums. So value, interval and number of trajectories are recomputed; the terms
+themselves obey rules of their own (`terms`), which no scores can break.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from typing import Any, Final
 
@@ -22,72 +22,31 @@ from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import Split
 from oodd_eval.leaderboard.entry import EntryInfo, place_of
 from oodd_eval.leaderboard.verify.files import Findings, plain, shown
-from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import cell_samples, percentiles
-from oodd_eval.metrics.catalogue import CALIBRATED, POOLED, RATIOS, TARGETS
+from oodd_eval.leaderboard.verify.terms import Mask, Sums, delays_of, wrong_terms
+from oodd_eval.metrics.alarms import offered_levels
+from oodd_eval.metrics.auc import FAR_START
+from oodd_eval.metrics.catalogue import (
+    FOUND_WITHIN,
+    GUARANTEED,
+    LEVELS,
+    METRICS,
+    split_name,
+)
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.evaluate import metric_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
+from oodd_eval.results.tables.board import contribution
 
 Records = Mapping[str, Record]
 """Records by where they stand."""
 
-Sums = Mapping[str, Contribution]
-"""Numerators and denominators of a record by metric."""
-
-Mask = NDArray[np.bool_]
-"""Trajectories in which something is wrong."""
-
 TOLERANCE: Final = 1e-12
 """Relative and absolute: sums may be taken in another order on another processor."""
 
-SUFFIXES: Final = ("", *(f"_{suffix}" for suffix in TARGETS))
-"""Of the metrics under the standard alarm rule, and under each calibrated one."""
-
 MOST_ROWS: Final = 64
 """Rows of one entry; the paper's comparisons are some twenty."""
-
-_RATES: Final = {"far", "far_twin"}
-_MEANS: Final = set(RATIOS) - _RATES
-_AUCS: Final = {name for name in RATIOS if name.startswith("auc")}
-
-_TERMS: Final[tuple[tuple[set[str], Callable[[Any, Any], Mask], str], ...]] = (
-    (_RATES, lambda _, n: (n < 0) | (n % 1 != 0), "a whole number of steps as denominator"),
-    (_RATES, lambda k, n: (k < 0) | (k > n) | (k % 1 != 0), "a whole number of alarms in them"),
-    (_MEANS, lambda _, n: (n != 0) & (n != 1), "the denominator 0 or 1"),
-    (_MEANS, lambda k, n: (n == 0) & (k != 0), "the numerator 0 where the denominator is 0"),
-    ({"missed", "delay_censored"}, lambda _, n: n == 0, "the denominator 1: it is always defined"),
-    (_AUCS, lambda k, _: (k < 0) | (k > 1), "an AUC within [0, 1]"),
-    ({"missed"}, lambda k, _: (k != 0) & (k != 1), "the numerator 0 or 1"),
-    (_MEANS - _AUCS - {"missed"}, lambda k, _: (k < 0) | (k % 1 != 0), "a whole number of steps"),
-)
-"""Metrics, their impossible numerators and denominators, and what is expected instead."""
-
-
-def _found(own: Sums) -> Mask:
-    return np.equal(own["delay"].denominator, 1)
-
-
-# Scores are defined from some step on, the same for a trajectory and its twin up to the onset.
-_RELATIONS: Final[tuple[tuple[str, Callable[[Sums, Sums], Mask], str], ...]] = (
-    ("missed", lambda own, _: (own["missed"].numerator == 1) == _found(own),
-     "a trajectory either missed or with a delay"),
-    ("delay_censored",
-     lambda own, _: _found(own) & (own["delay_censored"].numerator != own["delay"].numerator),
-     "its delay"),
-    ("delay_censored", lambda own, _: ~_found(own) & (own["delay_censored"].numerator < 1),
-     "at least 1: a miss counts the remainder of the episode"),
-    *((name, lambda own, plain, name=name: own[name].denominator != plain[name].denominator,
-       f"the steps of {name}, which no threshold changes") for name in sorted(_RATES)),
-    *((name, lambda own, _, name=name: (own[name].denominator == 1) != (own["far"].denominator > 0),
-       "a defined one where far counts steps before the onset") for name in ("auc", "auc_null")),
-    ("auc_matched",
-     lambda own, _: (own["far"].denominator > 0) & (own["auc_matched"].denominator == 0),
-     "a defined one where there are scores before the onset"),
-)  # fmt: skip
-"""Metrics, where they contradict others of one alarm rule or the plain ones, and what is expected
-instead."""
 
 
 def same(first: float, second: float) -> bool:
@@ -95,19 +54,6 @@ def same(first: float, second: float) -> bool:
     if math.isnan(first) or math.isnan(second):
         return math.isnan(first) and math.isnan(second)
     return math.isclose(first, second, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
-
-
-def contributions(record: Record) -> dict[str, Contribution]:
-    """Return numerators and denominators of a record's metrics as arrays."""
-    return {
-        name: Contribution(np.array(top, dtype=np.float64), np.array(bottom, dtype=np.float64))
-        for name, (top, bottom) in record.per_trajectory.items()
-    }
-
-
-def recomputed(environment: str, sums: Contribution) -> Metric:
-    """Return a metric with its interval, from its terms."""
-    return Metric(sums.value, *percentiles(cell_samples(environment, sums)), n=sums.n)
 
 
 def check_record(where: str, record: Record, findings: Findings) -> Sums | None:
@@ -118,22 +64,13 @@ def check_record(where: str, record: Record, findings: Findings) -> Sums | None:
     _check_fields(where, record, findings)
     if not record.ok or not _is_complete(where, record, findings):
         return None
-    sums = contributions(record)
-    fresh = {name: recomputed(record.environment, c) for name, c in sums.items()}
+    sums = {name: contribution(record, name) for name in record.per_trajectory}
+    fresh = {name: metric_of(name, c, record.environment) for name, c in sums.items()}
     compare_metrics(where, record, fresh, "per_trajectory gives", findings)
-    for suffix in SUFFIXES:
-        own = {kind: sums[kind + suffix] for kind in RATIOS if kind + suffix in sums}
-        wrong = [
-            (kind, mask(c.numerator, c.denominator), expected)
-            for kind, c in own.items()
-            for kinds, mask, expected in _TERMS
-            if kind in kinds
-        ]
-        wrong += [(kind, mask(own, sums), text) for kind, mask, text in _RELATIONS if kind in own]
-        for kind, mask, expected in wrong:
-            _refuse_terms(where, kind + suffix, sums, mask, expected, findings)
+    for name, mask, expected in wrong_terms(sums):
+        _refuse_terms(where, name, sums, mask, expected, findings)
     for name in (n for n in record.metrics if n not in sums):
-        _check_single(where, name, record.metrics[name], sums["far"], findings)
+        _check_threshold(where, name, record, findings)
     return sums
 
 
@@ -179,11 +116,9 @@ def _check_fields(where: str, record: Record, findings: Findings) -> None:
 def _is_complete(where: str, record: Record, findings: Findings) -> bool:
     """Check that all metrics are there, each with a term for every trajectory."""
     before = findings.count
-    sums, single = set(RATIOS), set(POOLED)
-    for suffix in TARGETS:
-        if any(name.endswith(f"_{suffix}") for name in record.metrics):
-            sums |= {f"{name}_{suffix}" for name in CALIBRATED}
-            single.add(f"threshold_{suffix}")
+    levels = offered_levels(record.counts["calibration"], record.alarm)
+    sums = {*METRICS, *(f"{name}_{suffix}" for suffix in levels for name in GUARANTEED)}
+    single = {f"threshold_{suffix}" for suffix in levels}
     for part, expected in (("metrics", sums | single), ("per_trajectory", sums)):
         present = getattr(record, part).keys()
         for name in sorted(expected - present):
@@ -198,28 +133,26 @@ def _is_complete(where: str, record: Record, findings: Findings) -> bool:
     return findings.count == before
 
 
-def _check_single(
-    where: str, name: str, metric: Metric, far: Contribution, findings: Findings
-) -> None:
-    """Check a threshold or a pooled metric, which have no terms.
-
-    Pooled metrics are defined where there are scores on both sides of an onset.
-    """
-    threshold = name.startswith("threshold")
-    undefined = not threshold and far.denominator.sum() == 0
-    most = math.inf if threshold else 1.0 + TOLERANCE
-    least_n, most_n = (0, 0) if threshold else (far.n, len(far.denominator))
+def _check_threshold(where: str, name: str, record: Record, findings: Findings) -> None:
+    """Check a threshold, which has no terms; one that no statistic exceeds is null."""
+    metric = record.metrics[name]
+    known = not math.isnan(metric.value) and record.alarm == "cusum"
     for end, holds, expected in (
-        ("value", undefined == math.isnan(metric.value),
-         "a number where far counts scored steps before the onset, else null"),
-        ("value", math.isnan(metric.value) or 0 <= metric.value <= most, f"0 to {most:.0f}"),
+        ("value", not known or metric.value >= 0, "at least 0, or null: the CUSUM is never below"),
         ("low", math.isnan(metric.low), "null: it has no interval"),
         ("high", math.isnan(metric.high), "null: it has no interval"),
-        ("n", least_n <= metric.n <= most_n, f"{least_n} to {most_n} trajectories"),
-    ):  # fmt: skip
+        ("n", metric.n == 0, "0"),
+    ):
         if not holds:
             message = f"is {getattr(metric, end)}, expected {expected}"
             findings.refuse(where, f"metrics.{name}.{end}", message)
+    _, suffix = split_name(name)
+    lower = list(LEVELS)[: list(LEVELS).index(suffix)]
+    for other in lower[-1:]:
+        least = record.value(f"threshold_{other}")
+        if metric.value < least or math.isnan(least) > math.isnan(metric.value):
+            message = f"is {metric.value}, expected at least that of a larger level, {least}"
+            findings.refuse(where, f"metrics.{name}.value", message)
 
 
 # -- records with each other ----------------------------------------------------------------------
@@ -249,8 +182,10 @@ def _exact(value: Any) -> str:
 def _agreements(record: Record) -> Iterator[tuple[str, Any, Any, str]]:
     """Yield fields, what they are of, and their values: equal in all records that share these."""
     detector = record.detector
-    for field in ("plugin", "detector_version", "plugin_source"):
+    for field in ("plugin", "detector_version", "plugin_source", "alarm", "deterministic"):
         yield field, detector, getattr(record, field), "a detector has one source in an entry"
+    place = record.environment, record.anomaly
+    yield "brief", place, record.brief, "both are of the same trajectories"
     yield "parameters", detector, sorted(record.parameters), "a detector has one set of parameters"
     for name, value in record.parameters.items():
         if name not in record.overrides:
@@ -263,13 +198,16 @@ def _agreements(record: Record) -> Iterator[tuple[str, Any, Any, str]]:
     if not record.ok:
         return
     yield "scores", fit, record.scores, "both are of the same fit"
-    for suffix in SUFFIXES:
-        name = f"far_twin{suffix}"
-        twins = record.per_trajectory.get(name)
-        yield f"per_trajectory.{name}", fit, twins, "both are of the same fit on the same twins"
-        if suffix:
-            value = repr(record.value(f"threshold{suffix}"))
-            yield f"metrics.threshold{suffix}.value", fit, value, "both are of the same fit"
+    if record.deterministic:
+        row = str(record.setting), *place
+        yield "per_trajectory", row, record.per_trajectory, "its seed changes nothing"
+    of_twins = ["far_twin", *(n for n in record.per_trajectory if n.startswith("false_episodes"))]
+    for name in of_twins:
+        terms = record.per_trajectory.get(name)
+        yield f"per_trajectory.{name}", fit, terms, "both are of the same fit on the same twins"
+    for name in (n for n in record.metrics if n.startswith("threshold")):
+        value = repr(record.value(name))
+        yield f"metrics.{name}.value", fit, value, "both are of the same fit"
 
 
 def _check_rows(records: Records, findings: Findings) -> None:
@@ -299,21 +237,21 @@ def _check_rows(records: Records, findings: Findings) -> None:
 
 def _check_misses(records: Records, sums: Mapping[str, Sums], findings: Findings) -> None:
     """Check that a miss counts the remainder of the episode, the same for every detector."""
-    remainders: dict[tuple[str, str, int], NDArray[np.float64]] = {}
+    remainders: dict[tuple[str, str, str, int], NDArray[np.float64]] = {}
     # Misses first: a delay is compared with the remainder that they tell.
     for misses in (True, False):
         for where, own in sums.items():
-            for suffix in (s for s in SUFFIXES if f"missed{s}" in own):
-                steps = own[f"delay_censored{suffix}"].numerator
-                chosen = (own[f"missed{suffix}"].numerator == 1) == misses
-                cell = records[where].environment, records[where].anomaly, len(steps)
+            for start, missed, censored in delays_of(own):
+                steps, defined = own[censored].numerator, own[censored].denominator == 1
+                chosen = defined & ((own[missed].numerator == 1) == misses)
+                cell = records[where].environment, records[where].anomaly, start, len(steps)
                 known = remainders.setdefault(cell, np.full(len(steps), np.nan))
                 if misses:
                     first = chosen & np.isnan(known)
                     known[first] = steps[first]
                 wrong = chosen & ((steps != known) if misses else (steps >= known))
                 expected = "the remainder of the episode, as in other misses, or less with an alarm"
-                _refuse_terms(where, f"delay_censored{suffix}", own, wrong, expected, findings)
+                _refuse_terms(where, censored, own, wrong, expected, findings)
 
 
 # -- records and their split ----------------------------------------------------------------------
@@ -335,6 +273,23 @@ def check_against_split(
                 _check_trajectories(where, record, sums.get(where), data, findings)
 
 
+def _check_found(
+    where: str, missed: str, shared: NDArray[np.int64], sums: Sums, findings: Findings
+) -> None:
+    """Check what was found in the rows from the effect on that an episode and its twin share."""
+    delay = sums[missed.replace("missed", "delay")]
+    defined = (sums[missed].denominator == 1) & (shared > 0)
+    for k in FOUND_WITHIN:
+        name = missed.replace("missed", f"found_within_{k}")
+        within = (delay.denominator == 1) & (delay.numerator < np.minimum(k, shared))
+        wrong = (sums[name].denominator == 1) != defined
+        expected = f"defined where {missed} is and both episodes have rows from the effect on"
+        _refuse_terms(where, name, sums, wrong, expected, findings)
+        expected = f"1 for a delay below {k} in the rows that both episodes have"
+        wrong = defined & ((sums[name].numerator == 1) != within)
+        _refuse_terms(where, name, sums, wrong, expected, findings)
+
+
 def _check_trajectories(
     where: str, record: Record, sums: Sums | None, data: EnvironmentData, findings: Findings
 ) -> None:
@@ -349,17 +304,36 @@ def _check_trajectories(
         findings.expect(where, f"counts.{name}", len(part), record.counts[name], "as the split has")
     if sums is None or findings.count > before:
         return
-    anomalous = data.anomalous(record.anomaly)
-    remainders = anomalous.lengths + 1 - anomalous.onsets
+    anomalous, twins = data.anomalous(record.anomaly), data.twins
+    findings.expect(where, "brief", anomalous.brief, record.brief, "as the split has")
+    ends = np.minimum(anomalous.lengths, twins.lengths) + 1
+    remainders = {
+        "onset": anomalous.lengths + 1 - anomalous.onsets,
+        "effect": anomalous.lengths + 1 - anomalous.effects,
+        "effect on the twin": twins.lengths + 1 - anomalous.effects,
+    }
+    for start, missed, censored in delays_of(sums):
+        rest, defined = remainders[start], sums[censored].denominator == 1
+        miss, steps = sums[missed].numerator == 1, sums[censored].numerator
+        wrong = defined & np.where(miss, steps != rest, steps >= rest)
+        expected = f"the number of observations from the {start} on, or less with an alarm"
+        _refuse_terms(where, censored, sums, wrong, expected, findings)
+        if start != "onset":
+            early = sums[missed.replace("missed", "early")].numerator == 1
+            wrong = defined != (~early & (rest > 0))
+            expected = f"a defined one if and only if no alarm precedes the {start}"
+            _refuse_terms(where, missed, sums, wrong, expected, findings)
+            _check_found(where, missed, ends - anomalous.effects, sums, findings)
+    scored = sums["far"].denominator > 0
+    wrong = scored & ((sums["auc_matched"].denominator == 1) != (ends > anomalous.effects))
+    expected = "a defined one where both episodes have scores from the effect on"
+    _refuse_terms(where, "auc_matched", sums, wrong, expected, findings)
     undefined = max(record.horizon, MAX_WARM_UP)
-    for suffix in (s for s in SUFFIXES if f"missed{s}" in sums):
-        missed = sums[f"missed{suffix}"].numerator == 1
-        censored = sums[name := f"delay_censored{suffix}"].numerator
-        wrong = np.where(missed, censored != remainders, censored >= remainders)
-        expected = "the number of observations from its onset on, or less with an alarm"
+    for name, rows, least in (
+        ("far", np.maximum(anomalous.onsets - FAR_START, 0), undefined - FAR_START),
+        ("far_twin", twins.lengths + 1, undefined),
+    ):
+        steps = sums[name].denominator
+        wrong = (steps > rows) | (steps < rows - least)
+        expected = f"as many steps as rows, of which {least} may be undefined"
         _refuse_terms(where, name, sums, wrong, expected, findings)
-        for kind, rows in (("far", anomalous.onsets), ("far_twin", data.twins.lengths + 1)):
-            steps = sums[name := f"{kind}{suffix}"].denominator
-            wrong = (steps > rows) | (steps < rows - undefined)
-            expected = f"as many steps as rows, of which {undefined} may be undefined"
-            _refuse_terms(where, name, sums, wrong, expected, findings)

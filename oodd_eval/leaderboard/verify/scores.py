@@ -29,7 +29,7 @@ from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, compl
 from oodd_eval.leaderboard.verify.records import Records, compare_metrics, same
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -101,10 +101,7 @@ def check_scores(
 def _file(file: h5py.File, horizon: int) -> Complaints:
     if file.userblock_size:
         yield "userblock", f"has {file.userblock_size} bytes, expected none"
-    for key, value in file.attrs.items():
-        cost = isinstance(value, float | np.integer) and 0 <= value <= MOST_COST
-        if complaint(ParameterName, key) or not cost:
-            yield f"attribute {plain(key)}", f"is {shown(value)}, expected a cost of the fit"
+    yield from _attributes(file)
     groups: dict[str, Any] = {}
     yield from _children(file, "", groups)
     if isinstance(groups.get("test"), h5py.Group):
@@ -126,8 +123,19 @@ def _children(group: h5py.Group, prefix: str, found: dict[str, Any]) -> Complain
             found[prefix + key] = group[key]
         else:
             yield prefix + plain(key), f"is a link ({type(link).__name__}), expected data"
-    if prefix and len(group.attrs):
+    if prefix.rstrip("/") in PARTS:
+        yield from _attributes(group, {"order"})
+    elif prefix and len(group.attrs):
         yield prefix.rstrip("/"), "has attributes, expected none"
+
+
+def _attributes(group: h5py.Group, names: Collection[str] = ()) -> Complaints:
+    """Find attributes that are no costs, nor the order of groups, or not among some names."""
+    for key, value in group.attrs.items():
+        most = 2**ORDER_BITS if key == "order" else MOST_COST
+        number = isinstance(value, float | np.integer) and 0 <= value <= most
+        if complaint(ParameterName, key) or not number or (names and key not in names):
+            yield f"attribute {plain(key)}", f"is {shown(value)}, expected a cost, or the order"
 
 
 def _part(group: h5py.Group, part: str, horizon: int) -> Complaints:

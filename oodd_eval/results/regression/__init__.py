@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
+from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import NAMES, metric_info
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.regression.reference import Conditions, RecordSet
-from oodd_eval.results.tables.board import nan_mean
 
 By = Literal["cell", "group", "mean"]
 Side = Literal["+", "-", "±"]

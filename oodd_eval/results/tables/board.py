@@ -1,23 +1,27 @@
-"""Records arranged for comparison: rows of detectors with means over cells, and their ranking."""
+"""Records arranged for comparison: rows of detectors with means over cells, and their rankings."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import mean_value, percentiles, samples
-from oodd_eval.metrics.catalogue import RANKING
+from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
+from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, metric_info
 from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
+
+SEEDS: Final = 3
+"""Detector seeds that a primary row of a detector with randomness needs to be ranked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +29,7 @@ class Value:
     """A mean over some cells and its interval, NaN where undefined or not asked for.
 
     `state` is the status of the first failed cell, without which there is a value; `partial` says
-    that other rows have cells here that this one lacks.
+    that other rows have cells here that this one lacks, `brief` that all of the cells are brief.
     """
 
     value: float = NAN
@@ -34,6 +38,7 @@ class Value:
     state: str = ""
     cells: int = 0
     partial: bool = False
+    brief: bool = False
 
 
 class Board:
@@ -54,6 +59,9 @@ class Board:
         self.environments = [e for e in ENVIRONMENTS if any(e == own for _, own, _ in self._cells)]
         self.anomalies = [a for a in ANOMALIES if any(a == own for _, _, own in self._cells)]
         self.horizons = sorted({entry.horizon for entry in self.entries})
+        brief = {(r.environment, r.anomaly) for r in self.records if r.brief}
+        everywhere = itertools.product(self.environments, self.anomalies)
+        self.brief = [place for place in everywhere if place in brief]
 
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
@@ -81,24 +89,23 @@ class Board:
         cells = [self._cells[entry, *p] for p in wanted if (entry, *p) in self._cells]
         records = [record for cell in cells for record in cell]
         partial = 0 < len(cells) < len(wanted)
+        brief = bool(records) and all(r.brief for r in records)
         if failed := next((r for r in records if not r.ok), None):
-            return Value(state=failed.status, cells=len(records), partial=partial)
+            return Value(state=failed.status, cells=len(records), partial=partial, brief=brief)
         terms = [r for r in records if intervals and metric in r.per_trajectory]
-        ratios = [(r.environment, r.seed, contribution(r, metric)) for r in terms]
-        low, high = percentiles(samples(ratios)) if ratios else (NAN, NAN)
-        return Value(_mean(records, metric), low, high, cells=len(records), partial=partial)
+        drawn = [drawn_cell(r.environment, r.seed, contribution(r, metric)) for r in terms]
+        low, high = mean_interval(drawn, kind=metric_info(metric).interval) if drawn else (NAN, NAN)
+        return Value(_mean(records, metric), low, high, "", len(records), partial, brief)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
         pairs = []
         for place in itertools.product(self.environments, self.anomalies):
             cells = [self._cells.get((entry, *place), []) for entry in (first, second)]
-            if all(cells) and all(r.ok for cell in cells for r in cell):
-                pairs.append([_mean(cell, metric) for cell in cells])
-        pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
-        if not pairs:
-            return NAN, NAN, 0
-        one, two = np.mean(pairs, axis=0).tolist()
+            ok = all(cells) and all(r.ok for cell in cells for r in cell)
+            if ok and not any(math.isnan(_mean(cell, metric)) for cell in cells):
+                pairs.append(cells)
+        one, two = (_mean((r for pair in pairs for r in pair[i]), metric) for i in (0, 1))
         return one, two, len(pairs)
 
     def failures(self) -> list[Record]:
@@ -117,23 +124,19 @@ def boards(records: Sequence[Record]) -> list[Board]:
     return [Board(group) for group in groups.values()]
 
 
-def nan_mean(values: Iterable[float]) -> float:
-    """Return the mean of the values that are not NaN; NaN without any."""
-    defined = [v for v in values if not math.isnan(v)]
-    return math.fsum(defined) / len(defined) if defined else NAN
-
-
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
     numerators, denominators = record.per_trajectory[metric]
     return Contribution(np.array(numerators), np.array(denominators))
 
 
-def _mean(records: Sequence[Record], metric: str) -> float:
+def _mean(records: Iterable[Record], metric: str) -> float:
     """Return the mean over the cells where a metric is defined."""
-    found = [contribution(r, metric) for r in records if metric in r.per_trajectory]
-    # Pooled metrics and thresholds are no ratios of sums.
-    return mean_value(found) if found else nan_mean(r.value(metric) for r in records)
+    return mean_over_cells(
+        # Thresholds are no ratios of sums.
+        (r.seed, contribution(r, metric).value if metric in r.per_trajectory else r.value(metric))
+        for r in records
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,17 +152,22 @@ class Cost:
 class Standing:
     """One row of a board with its place.
 
-    `rank` is None, and `state` says why, for a row that is not ranked. `ties` are the letters of
-    its tie groups, `wins` is the mean of its win rates against the other ranked rows, and `inputs`
-    is empty where no record names the detector's inputs.
+    `rank` is None, and `state` says why, for a row that is not ranked; `alarm_rank` is its rank by
+    alarms, None where `alarm_state` says why. `primary` rows are one a detector; the others are
+    variants, whose rank is the one that they would have. `ties` are the letters of its tie groups,
+    `wins` is the mean of its win rates against the other ranked rows, and `inputs` is empty where
+    no record names the detector's inputs.
     """
 
     entry: Setting
     records: list[Record]
     trivial: bool
+    primary: bool
     rank: int | None
+    alarm_rank: int | None
     ties: str
     state: str
+    alarm_state: str
     wins: float
     inputs: str
     cost: Cost
@@ -172,21 +180,54 @@ class Standing:
 
 @dataclass(frozen=True, slots=True)
 class RankedBoard:
-    """A board with its ranking and win rates, both by the labels of the ranked rows.
+    """A board with its rankings and win rates, by the labels of the ranked rows.
 
     All have the order of the standings: ranked rows by rank and mean, then the others by name.
+    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric.
     """
 
     board: Board
     standings: list[Standing]
     ranking: Ranking
+    alarms: Ranking
     rates: dict[tuple[str, str], float]
 
 
-def ranked(records: Sequence[Record]) -> RankedBoard:
+def primary_settings(records: Iterable[Record]) -> set[Setting]:
+    """Return one row of each detector: of those with most cells and seeds enough the simplest.
+
+    That is the row with the fewest other than default parameters, and then the least horizon. Cells
+    and seeds come first, so that part of a row does not stand for a detector that has a whole one.
+    """
+    by_row: dict[Setting, list[Record]] = {}
+    for r in records:
+        by_row.setdefault(r.setting, []).append(r)
+
+    def order(row: Setting) -> tuple[Any, ...]:
+        cells = {(r.environment, r.anomaly) for r in by_row[row]}
+        return -len(cells), _few_seeds(by_row[row]), len(row.parameters), *_name(row)
+
+    found: dict[str, Setting] = {}
+    for row in sorted(by_row, key=order):
+        found.setdefault(row.detector, row)
+    return set(found.values())
+
+
+def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None) -> RankedBoard:
     """Rank the rows of one board that have a value in every cell, with all their detector seeds.
 
-    ResultsError: such rows differ in their numbers of test trajectories, or two rows have one name.
+    Parameters
+    ----------
+    records
+        Of one board.
+    primary
+        The rows that push others down, one a detector; by default `primary_settings`. They need
+        three detector seeds, unless the seed changes nothing.
+
+    Raises
+    ------
+    ResultsError
+        When such rows differ in their numbers of test trajectories, or two rows have one name.
     """
     by_row: dict[Setting, list[Record]] = {}
     for r in sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly)):
@@ -197,14 +238,13 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
             f"two rows of a board are both called {twice[0]!r}, expected names and settings that "
             "tell rows apart: give one of the detectors another name"
         )
+    first = primary_settings(records) if primary is None else set(primary)
     cells = {(r.environment, r.anomaly) for r in records}
-    states = {entry: _state(own, len(cells)) for entry, own in by_row.items()}
-    rows: dict[str, dict[int, dict[Place, Contribution]]] = {}
-    for entry in (e for e, state in states.items() if not state):
-        row = rows.setdefault(str(entry), {})
-        for r in by_row[entry]:
-            row.setdefault(r.seed, {})[r.environment, r.anomaly] = contribution(r, RANKING)
-    ranking = rank(rows)
+    states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
+    ranking, rows = _ranking(by_row, states, first, RANKING)
+    by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
+                 for e, own in by_row.items()}  # fmt: skip
+    alarms, _ = _ranking(by_row, by_alarms, first, ALARM_RANKING)
     rates = win_rates({
         label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}
         for label in ranking.ranks
@@ -217,16 +257,38 @@ def ranked(records: Sequence[Record]) -> RankedBoard:
             entry=entry,
             records=by_row[entry],
             trivial=board.is_trivial(entry),
+            primary=entry in first,
             rank=ranking.ranks.get(str(entry)),
+            alarm_rank=alarms.ranks.get(str(entry)),
             ties=ranking.letters(str(entry)),
             state=states[entry],
+            alarm_state=by_alarms[entry],
             wins=nan_mean(rate for (one, _), rate in rates.items() if one == str(entry)),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
         )
         for entry in order
     ]
-    return RankedBoard(board, standings, ranking, rates)
+    return RankedBoard(board, standings, ranking, alarms, rates)
+
+
+_Rows = dict[str, dict[int, dict[Place, Contribution]]]
+
+
+def _ranking(
+    by_row: Mapping[Setting, Sequence[Record]], states: Mapping[Setting, str],
+    primary: Collection[Setting], metric: str,
+) -> tuple[Ranking, _Rows]:  # fmt: skip
+    """Rank the rows without a state by a metric; where lower is better its sign is turned."""
+    rows: _Rows = {}
+    for entry in (e for e, state in states.items() if not state):
+        row = rows.setdefault(str(entry), {})
+        for r in by_row[entry]:
+            own = contribution(r, metric)
+            if metric_info(metric).better == "lower":
+                own = Contribution(-own.numerator, own.denominator)
+            row.setdefault(r.seed, {})[r.environment, r.anomaly] = own
+    return rank(rows, {str(entry) for entry in primary}), rows
 
 
 def cost_of(records: Iterable[Record]) -> Cost:
@@ -242,18 +304,27 @@ def cost_of(records: Iterable[Record]) -> Cost:
     )
 
 
-def _state(records: Sequence[Record], cells: int) -> str:
-    """Return why a row is not ranked; empty if it is."""
-    expected = cells * len({r.seed for r in records})
+def _state(records: Sequence[Record], cells: int, metric: str, primary: bool) -> str:
+    """Return why a row is not ranked by a metric; empty if it is."""
+    seeds = len({r.seed for r in records})
+    expected = cells * seeds
     failed = Counter(r.status for r in records if not r.ok)
     reasons = [f"{status} in {n} of {expected} cells" for status, n in failed.items()]
     if len(records) < expected:
         reasons.append(f"{expected - len(records)} of {expected} cells missing")
-    stored = [contribution(r, RANKING) for r in records if r.ok and RANKING in r.per_trajectory]
+    stored = [contribution(r, metric) for r in records if r.ok and metric in r.per_trajectory]
     defined = sum(not math.isnan(c.value) for c in stored)
     if undefined := sum(r.ok for r in records) - defined:
         reasons.append(f"undefined in {undefined} of {expected} cells")
+    if primary and _few_seeds(records):
+        reasons.append(f"{seeds} of {SEEDS} detector seeds")
     return ", ".join(reasons)
+
+
+def _few_seeds(records: Sequence[Record]) -> bool:
+    """Tell whether a row has fewer detector seeds than a primary row needs."""
+    seeds = {r.seed for r in records}
+    return len(seeds) < SEEDS and not all(r.deterministic for r in records)
 
 
 def _name(entry: Setting) -> tuple[str, int, str]:

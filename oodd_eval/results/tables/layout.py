@@ -9,26 +9,40 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
-from oodd_eval.metrics.catalogue import POOLED, RANKING, RATIOS, TARGETS, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import (
+    ALARM_RANKING,
+    FOUND_WITHIN,
+    GUARANTEED,
+    HEADLINE,
+    LEVELS,
+    METRICS,
+    RANKING,
+    UNDEFINED,
+    metric_info,
+)
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables.board import Board, RankedBoard, Standing, Value
 
-_SIMPLE: Final = ("random", "persistence", "clock", "rf")
+_BLIND: Final = ("clock", "comb")
+"""Rows that know the time alone: their AUC says nothing of dynamics."""
+
+_SIMPLE: Final = ("random", "persistence", *_BLIND, "range", "mahalanobis", "rf", "rf-ewma")
 """Rows that a detector with a learned model of the dynamics should beat."""
 
 _FEW: Final = 30
 """Test seeds per environment below which a board says that its comparisons are weak."""
 
-_ALARMS: Final = {
-    "delay_censored_at_1pct": "delay censored at 1 %",
-    "missed_at_1pct": "missed at 1 %",
-    "far_twin_at_1pct": "FAR twin at 1 %",
-    "delay": "delay",
-    "delay_null": "delay null",
-    "missed": "missed",
-    "far_twin": "FAR twin",
-}
-"""Columns of a ranking's table of alarms."""
+_BRIEF: Final = "\N{DAGGER}"
+"""Marks the figures of brief cells."""
+
+_ALARMS: Final = (
+    "delay", "missed", *(f"found_within_{k}" for k in FOUND_WITHIN),
+    f"found_within_{FOUND_WITHIN[-1]}_null", "false_episodes", "early",
+)  # fmt: skip
+"""Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
+
+_PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
+"""Columns of alarms at the paper's threshold."""
 
 _LABELS: Final = ("rank", "detector", "settings")
 
@@ -62,7 +76,8 @@ class Table:
 def show_value(value: Value, metric: str) -> str:
     """Return a mean as printed: percent or number, a dash where undefined, a failure's state.
 
-    A star marks a mean over fewer cells than other rows have; an empty text, no cell at all.
+    A star marks a mean over fewer cells than other rows have, a dagger one of brief cells only; an
+    empty text, no cell at all.
     """
     if not value.cells:
         return ""
@@ -70,7 +85,7 @@ def show_value(value: Value, metric: str) -> str:
     text = value.state or number(value.value)
     if not math.isnan(value.low):
         text += f" [{number(value.low)}, {number(value.high)}]"
-    return text + "*" * value.partial
+    return text + "*" * value.partial + _BRIEF * value.brief
 
 
 class _Mean(NamedTuple):
@@ -102,16 +117,68 @@ def _overall(board: Board, names: Iterable[str], intervals: Collection[str] = ()
     return [_Mean(metric_info(n).title, n, *over, n in intervals) for n in names]
 
 
-def by_environment(board: Board, *, intervals: bool = False) -> Table:
-    """Return matched AUC by anomaly group and by environment, the best mean first."""
+def separability(board: Board, *, intervals: bool = False) -> Table:
+    """Return matched AUC by anomaly group and by environment, the best mean first.
+
+    Beside the mean over all cells stand that of smoothed scores and that against another twin.
+    """
     columns = _by_group(board, "mean", intervals=intervals)
+    more = "auc_smoothed", "auc_unpaired"
+    columns += [c._replace(title=c.metric.removeprefix("auc_"))
+                for c in _overall(board, more, more if intervals else ())]  # fmt: skip
     columns += [_Mean(e, RANKING, [e], board.anomalies, intervals) for e in board.environments]
     over = board.environments, board.anomalies, RANKING
     means = {entry: board.mean(entry, *over).value for entry in board.entries}
     order = sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
     rows = [[str(entry), *_texts(board, entry, columns)] for entry in order]
-    title = "Matched AUC (%), higher is better. The leaderboard ranks by this."
+    title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
     return Table(title, ["detector", *(c.title for c in columns)], rows)
+
+
+def guaranteed(
+    board: Board, suffix: str = "", *, intervals: bool = False, nulls: bool = False,
+    standings: Sequence[Standing] = (),
+) -> Table | None:  # fmt: skip
+    """Return guaranteed alarms at a level, mean over cells; None when no record has them.
+
+    Parameters
+    ----------
+    board
+        The records.
+    suffix
+        Of the level; by default ``at_5pct``, or the strictest that the records have.
+    intervals
+        Whether all figures have intervals; false episodes always have.
+    nulls
+        Whether each figure stands beside what false alarms alone give.
+    standings
+        Where given, rows are in their order and have their places.
+    """
+    suffix = suffix or _strictest(board)
+    bases = _ALARMS if not nulls else GUARANTEED
+    names = _present(board, (f"{name}_{suffix}" for name in bases))
+    if not names:
+        return None
+    shown = [n for n in names if intervals or n.startswith("false_episodes")]
+    columns = [c._replace(title=_short_title(c.metric)) for c in _overall(board, names, shown)]
+    level = f"{100 * LEVELS[suffix]:g} %"
+    title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
+    note = (
+        f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
+        "is the share of this split's nominal twins that raised one."
+    )
+    return replace(_by_metric(board, title, columns, standings), note=note)
+
+
+def _strictest(board: Board) -> str:
+    """Return the suffix of the headline level, or of the strictest one that records have."""
+    found = [s for s in LEVELS if _present(board, [f"false_episodes_{s}"])]
+    return HEADLINE if HEADLINE in found or not found else found[-1]
+
+
+def _short_title(metric: str) -> str:
+    """Return the title of a metric in a table that is of one level."""
+    return metric_info(metric).title.partition(" at ")[0].lower()
 
 
 def anomaly_groups(
@@ -149,25 +216,15 @@ def anomaly_groups(
 
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
-    """Return every metric by detector, mean over all cells, with the null and placebo columns."""
-    columns = _overall(board, RATIOS, RATIOS if intervals else ())
+    """Return every metric without a level, mean over all cells, with nulls and the placebo."""
+    columns = _overall(board, METRICS, METRICS if intervals else ())
     return _by_metric(board, "All metrics, mean over cells", columns)
 
 
-def calibrated(board: Board, *, intervals: bool = False) -> Table | None:
-    """Return alarms under calibrated thresholds; None when no record has them."""
-    bases = ("far_twin", "far", "delay", "delay_censored", "missed")
-    names = _present(board, (f"{name}_{suffix}" for suffix in TARGETS for name in bases))
-    title = "Alarms at a false-alarm rate calibrated to 1 % (and 0.1 %), mean over cells"
-    columns = _overall(board, names, names if intervals else ())
-    return _by_metric(board, title, columns) if names else None
-
-
-def pooled(board: Board, standings: Sequence[Standing] = ()) -> Table | None:
-    """Return pooled AUC, average precision and FPR95; None when no record has them."""
-    columns = _overall(board, _present(board, POOLED))
-    title = "Pooled over steps (%), not for ranking"
-    return _by_metric(board, title, columns, standings) if columns else None
+def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
+    """Return guaranteed alarms at every level that records have, with their nulls."""
+    tables = (guaranteed(board, suffix, intervals=intervals, nulls=True) for suffix in LEVELS)
+    return [table for table in tables if table]
 
 
 def by_anomaly(
@@ -194,25 +251,26 @@ def failures(board: Board) -> Table | None:
 def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     """Return ranks by matched AUC, with what a reader needs to judge them; trust is by row."""
     columns = _by_group(ranks.board, metric_info(RANKING).title, intervals=True)
-    columns += _overall(ranks.board, ("auc", "auc_placebo"))
+    columns += _overall(ranks.board, ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo"))
     rows = []
     for one in ranks.standings:
         rank, detector, settings = _labels(one)
         inputs = one.inputs.replace("observations+actions", "+actions") or UNDEFINED
-        rows.append([rank, one.ties or UNDEFINED, detector, settings, inputs,
+        alarms = UNDEFINED if one.alarm_rank is None else str(one.alarm_rank)
+        rows.append([rank, one.ties or UNDEFINED, alarms, detector, settings, inputs,
                      trust.get(one.entry, UNDEFINED), *_texts(ranks.board, one.entry, columns),
                      _percent(one.wins)])  # fmt: skip
-    header = ["rank", "ties", "detector", "settings", "inputs", "trust",
+    header = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust",
               *(c.title for c in columns), "win rate"]  # fmt: skip
-    return Table("Ranking by matched AUC (%)", header, rows, labels=6)
+    return Table("Ranking by matched AUC (%)", header, rows, labels=7)
 
 
-def alarms(ranks: RankedBoard) -> Table:
-    """Return alarms at a calibrated false-alarm rate of 1 %, and with the paper's threshold."""
-    names = _present(ranks.board, _ALARMS)
-    columns = _overall(ranks.board, names, [n for n in names if n.endswith("_at_1pct")])
-    columns = [c._replace(title=_ALARMS[c.metric]) for c in columns]
-    return _by_metric(ranks.board, "Alarms", columns, ranks.standings)
+def alarms(ranks: RankedBoard) -> list[Table]:
+    """Return guaranteed alarms at the headline level, and alarms at the paper's threshold."""
+    first = guaranteed(ranks.board, intervals=True, standings=ranks.standings)
+    columns = _overall(ranks.board, _present(ranks.board, _PAPER))
+    title = "Alarms at the paper's threshold"
+    return [*filter(None, [first]), _by_metric(ranks.board, title, columns, ranks.standings)]
 
 
 def cost(ranks: RankedBoard) -> Table:
@@ -237,14 +295,14 @@ def wins(ranks: RankedBoard) -> Table | None:
 def findings(board: Board) -> list[str]:
     """Return a sentence for every detector that a simple row beats, in matched AUC or AUC.
 
-    The clock's AUC is left out: it is 1 by construction.
+    The AUC of what knows the time alone is left out: the clock's is 1 by construction.
     """
     sentences = []
     for entry, simple in itertools.product(board.entries, board.entries):
         own_kind = board.is_trivial(entry) or simple.detector == entry.detector
         if simple.detector not in _SIMPLE or simple.horizon != entry.horizon or own_kind:
             continue
-        names = ("auc_matched",) if simple.detector == "clock" else ("auc_matched", "auc")
+        names = ("auc_matched",) if simple.detector in _BLIND else ("auc_matched", "auc")
         for info in map(metric_info, names):
             theirs, own, cells = board.compare(simple, entry, info.name)
             if theirs > own:
@@ -266,6 +324,12 @@ def notes(board: Board) -> list[str]:
         own = [a.id for a in ANOMALIES.values() if a.group == group]
         if missing := [a for a in own if a not in board.anomalies]:
             lines.append(f"Means over {group} anomalies are without {', '.join(missing)}.")
+    if board.brief:
+        names = ", ".join("/".join(place) for place in board.brief)
+        lines.append(
+            f"Brief cells, marked {_BRIEF}: {names}. Half of their episodes end within 20 rows of "
+            "the onset."
+        )
     lines.append(
         f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
         "* marks a mean over fewer cells than other rows have. A failure is shown as its state."
@@ -276,6 +340,16 @@ def notes(board: Board) -> list[str]:
 def ranking_notes(ranks: RankedBoard) -> list[str]:
     """Return what has to stand below a ranking."""
     lines = [f"Not ranked: {one.entry}, {one.state}." for one in ranks.standings if one.state]
+    if not all(one.primary for one in ranks.standings):
+        lines.append(
+            "A variant is a further row of a detector. It has the rank that it would have, and "
+            "pushes no other row down."
+        )
+    if ranks.alarms.ranks:
+        title = metric_info(ALARM_RANKING).title[0].lower() + metric_info(ALARM_RANKING).title[1:]
+        lines.append(f"Alarm rank: the same by {title}, lower is better.")
+        without = (one for one in ranks.standings if one.alarm_state and not one.state)
+        lines += [f"Without an alarm rank: {one.entry}, {one.alarm_state}." for one in without]
     seeds = ranks.board.test_seeds()
     if seeds and seeds[0] < _FEW and len(ranks.ranking.ranks) > 1:
         lines.append(
@@ -307,7 +381,7 @@ def _labels(one: Standing) -> list[str]:
     several = [f"{one.seeds} seeds"] if one.seeds > 1 else []
     return [
         UNDEFINED if one.rank is None else str(one.rank),
-        f"{one.entry.detector} (trivial)" if one.trivial else one.entry.detector,
+        one.entry.detector + " (trivial)" * one.trivial + " (variant)" * (not one.primary),
         ", ".join([f"Δ={one.entry.horizon}", *overrides, *several]),
     ]
 

@@ -41,10 +41,11 @@ def report(records: Sequence[Record], *, intervals: bool = False) -> str:
 def _section(board: Board, *, intervals: bool) -> str:
     ok = sum(r.ok for r in board.records)
     found = [
-        layout.by_environment(board, intervals=intervals),
+        layout.separability(board, intervals=intervals),
+        layout.guaranteed(board, intervals=intervals),
         *(layout.anomaly_groups(board, h, intervals=intervals) for h in board.horizons),
         layout.all_metrics(board, intervals=intervals),
-        layout.calibrated(board, intervals=intervals),
+        *layout.all_alarms(board, intervals=intervals),
         *(layout.by_anomaly(board, e, intervals=intervals) for e in board.entries),
         layout.failures(board),
     ]
@@ -104,9 +105,10 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     board = ranks.board
     wanted = [(name, name, board.anomalies) for name in _metrics(ranks)]
     wanted += [(f"{RANKING}_{g}", RANKING, board.in_group(g)) for g in GROUPS if board.in_group(g)]
-    header = ["rank", "ties", "state", "detector", "horizon", "overrides", "trivial", "seeds",
-              "inputs", "trust", "win_rate", "seconds_fit", "microseconds_per_step",
-              "peak_rss_mb", *_with_ends(column for column, _, _ in wanted)]  # fmt: skip
+    header = ["rank", "ties", "alarm_rank", "state", "detector", "horizon", "overrides",
+              "trivial", "primary", "seeds", "inputs", "trust", "win_rate", "seconds_fit",
+              "microseconds_per_step", "peak_rss_mb",
+              *_with_ends(column for column, _, _ in wanted)]  # fmt: skip
     lines = []
     for one in ranks.standings:
         entry, cost = one.entry, one.cost
@@ -115,25 +117,26 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
             for _, metric, anomalies in wanted
         ]
         lines.append([
-            one.rank, one.ties, one.state, *_setting(entry), str(one.trivial).lower(), one.seeds,
-            one.inputs, trust.get(entry, ""),
-            *map(number, (one.wins, cost.fit, cost.step, cost.peak)), *_ends(values),
+            one.rank, one.ties, one.alarm_rank, one.state, *_setting(entry),
+            str(one.trivial).lower(), str(one.primary).lower(), one.seeds, one.inputs,
+            trust.get(entry, ""), *map(number, (one.wins, cost.fit, cost.step, cost.peak)),
+            *_ends(values),
         ])  # fmt: skip
-    return _lines(header, lines)
+    return csv_text([header, *lines])
 
 
 def cells_csv(ranks: RankedBoard) -> str:
     """Return one line per cell with its stored metrics and their intervals."""
     names = _metrics(ranks)
     header = ["detector", "horizon", "overrides", "seed", "environment", "group", "anomaly",
-              "status", *_with_ends(names)]  # fmt: skip
+              "status", "brief", *_with_ends(names)]  # fmt: skip
     lines = [
         [*_setting(one.entry), r.seed, r.environment, r.group, r.anomaly, r.status,
-         *_ends(map(r.metrics.get, names))]
+         str(r.brief).lower(), *_ends(map(r.metrics.get, names))]
         for one in ranks.standings
         for r in one.records
     ]  # fmt: skip
-    return _lines(header, lines)
+    return csv_text([header, *lines])
 
 
 def comparisons_csv(ranks: RankedBoard) -> str:
@@ -146,7 +149,7 @@ def comparisons_csv(ranks: RankedBoard) -> str:
          str(c.better).lower(), number(ranks.rates[c.first, c.second])]
         for c in sorted(ranks.ranking.comparisons, key=lambda c: (place[c.first], place[c.second]))
     ]  # fmt: skip
-    return _lines(header, lines)
+    return csv_text([header, *lines])
 
 
 def number(value: float) -> str:
@@ -178,8 +181,9 @@ def _ends(values: Iterable[Value | Metric | None]) -> list[str]:
     return [number(end) for three in ends for end in three]
 
 
-def _lines(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+def csv_text(lines: Iterable[Sequence[object]]) -> str:
+    """Return lines of fields as CSV."""
     text = io.StringIO()
     # The same bytes on every system.
-    csv.writer(text, lineterminator="\n").writerows([header, *lines])
+    csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()

@@ -1,7 +1,7 @@
 // What the columns of the main table are: one list for each of its views.
 
 /** Values that others are read beside: large or small, they are no merit in a row. */
-const BESIDE = ["auc_null", "auc_placebo", "delay_null", "far_at_", "far_twin_at_"];
+const BESIDE = ["auc_null", "auc_placebo", "delay_null", "found_within_100_null", "early_at_"];
 
 /** Whether a metric's best value is marked: delays at different false-alarm rates do not compare. */
 const isMarked = (metric, kind) =>
@@ -66,6 +66,10 @@ const LISTS = {
         }
       }
       columns.push(
+        metricColumn(board, "auc_smoothed"),
+        metricColumn(board, "auc_unpaired"),
+        plainColumn("alarm_rank", "Alarm rank", "", "The same rank by the censored delay of guaranteed alarms at 5 %",
+          (row) => row.alarm_rank, { text: (rank) => isNumber(rank) ? String(rank) : UNDEFINED }),
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
         plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",
@@ -78,15 +82,26 @@ const LISTS = {
     title: "AUCs",
     columns: (board) => [
       metricColumn(board, "auc_matched", { interval: true }),
+      metricColumn(board, "auc_smoothed", { interval: true }),
+      metricColumn(board, "auc_unpaired", { interval: true }),
       metricColumn(board, "auc_placebo"),
       metricColumn(board, "auc", { interval: true }),
       paperColumn("auc", "Paper\u2019s AUC", "%", "percent"),
       metricColumn(board, "auc_null"),
-      ...["auc_pooled", "average_precision", "fpr95"].filter((m) => board.metrics.includes(m)).map((m) => metricColumn(board, m)),
     ],
   },
+  guaranteed: {
+    title: "Guaranteed alarms",
+    columns: (board) => ["at_5pct", "at_10pct", "at_1pct"].flatMap((suffix) =>
+      ["delay", "missed", "found_within_20", "found_within_100", "found_within_100_null",
+        "false_episodes", "early"]
+        .map((m) => `${m}_${suffix}`)
+        .filter((m) => board.metrics.includes(m))
+        .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),
+    empty: "No record of this board has guaranteed alarms: too few calibration episodes.",
+  },
   alarms: {
-    title: "Alarms",
+    title: "Paper\u2019s alarms",
     columns: (board) => [
       metricColumn(board, "delay", { interval: true }),
       metricColumn(board, "delay_null", { interval: true }),
@@ -97,15 +112,6 @@ const LISTS = {
       paperColumn("delay", "Paper\u2019s delay", "steps", "steps"),
       paperColumn("far", "Paper\u2019s FAR", "", "rate"),
     ],
-  },
-  calibrated: {
-    title: "Calibrated alarms",
-    columns: (board) => ["at_1pct", "at_01pct"].flatMap((suffix) =>
-      ["delay_censored", "missed", "far_twin", "delay", "far"]
-        .map((m) => `${m}_${suffix}`)
-        .filter((m) => board.metrics.includes(m))
-        .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),
-    empty: "No record of this board has calibrated alarms: too few calibration steps.",
   },
   environments: {
     title: "By environment",

@@ -82,7 +82,7 @@ function figure(drawings, legend, caption, numbers) {
     element("div", { class: "scroll" }, drawings),
     legend.length ? element("ul", { class: "legend" }, legend.map(([kind, text]) => element("li", {},
       shape("svg", { width: 26, height: 10, viewBox: "0 0 26 10", "aria-hidden": "true" },
-        kind === "point" || kind === "calibrated"
+        kind === "point"
           ? shape("circle", { class: kind, cx: 13, cy: 5, r: 4 })
           : shape("line", { class: `line ${kind}`, x1: 1, x2: 25, y1: 5, y2: 5 })), text))) : null,
     element("figcaption", {}, caption),
@@ -116,7 +116,7 @@ function farAxis(far) {
   return { range: [0, top], ticks: marks, label: "achieved false-alarm rate on nominal twins (alarms per step)", bend: Math.sqrt };
 }
 
-function delayFigure(points, calibrated) {
+function delayFigure(points) {
   if (!points.far.length) return element("p", { class: "note" }, "No curve: no score of the twins is defined.");
   const x = farAxis(points.far);
   const high = Math.max(1, ...points.delay_censored, ...points.null_censored) * 1.05;
@@ -132,10 +132,6 @@ function delayFigure(points, calibrated) {
     plot.drawing.append(shape("circle", { class: "point", cx: plot.sx(points.far[at]), cy: plot.sy(points.delay_censored[at]), r: 4.5 }));
     missed.drawing.append(shape("circle", { class: "point", cx: missed.sx(points.far[at]), cy: missed.sy(points.missed[at]), r: 4.5 }));
     legend.push(["point", `the paper\u2019s threshold, ${DATA.threshold}`]);
-  }
-  if (calibrated && calibrated.every(isNumber) && calibrated[0] <= x.range[1] && calibrated[1] <= high) {
-    plot.drawing.append(shape("circle", { class: "calibrated", cx: plot.sx(calibrated[0]), cy: plot.sy(calibrated[1]), r: 4.5 }));
-    legend.push(["calibrated", "threshold calibrated to a false-alarm rate of 1 %"]);
   }
   return figure([plot.drawing, missed.drawing], legend,
     "Mean delay from the onset to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. The scale of false-alarm rates is a square root. Left is stricter: fewer false alarms, longer delay.",
