@@ -93,7 +93,7 @@ class NetworkDetector(StorableWindowDetector):
     and time. Source: Danesh & Fern (2021), section 3 and appendix B.
     """
 
-    kind: ClassVar[str] = "networks/2"
+    kind: ClassVar[str] = "networks/3"
 
     def __init__(
         self,
@@ -125,7 +125,8 @@ class NetworkDetector(StorableWindowDetector):
             levels=levels,
             rates=tuple(RATES[i % len(RATES)] for i in members),
             widths=tuple(WIDTHS[i % len(WIDTHS)] for i in members),
-            scheduled_sampling=parameters.scheduled_sampling,
+            # A forecast of the next observation is never made from a forecast.
+            scheduled_sampling=parameters.scheduled_sampling if horizon > 1 else 0.0,
         )
         found = torch.cuda.is_available()
         if parameters.device == "cuda" and not found:
@@ -206,7 +207,11 @@ class NetworkDetector(StorableWindowDetector):
         save_file(weights, directory / WEIGHTS)
 
     def _saved_with(self) -> dict[str, Any]:
-        return {"members": self.parameters.members, **self.architecture}
+        return {
+            "members": self.parameters.members,
+            "scheduled_sampling": self.schedule.scheduled_sampling,
+            **self.architecture,
+        }
 
     def _arrays(self) -> Arrays:
         return {"history": np.array(self.history_)}

@@ -14,7 +14,11 @@ class NetworkParameters:
     batch: int = parameter(16, low=1, help="episodes in a batch")
     chunk: int = parameter(100, low=1, help="steps through which gradients flow")
     scheduled_sampling: float = parameter(
-        0.0, low=0, high=1, help="share of inputs that are own samples at the end of training"
+        0.5,
+        low=0,
+        high=1,
+        help="probability at the end of training that an input is the network's own sample; "
+        "without effect at horizon 1",
     )
     trunk: str = parameter(
         "shared",

@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 from oodd_common.windows import windows
 from torch import Tensor
 
-from oodd_torch.network import GRID, Ensemble
+from oodd_torch.network import Ensemble
 
 BETAS: Final = (0.9, 0.999)
 EPSILON: Final = 1e-8
 
 CLIP: Final = 1.0
 """Largest norm of one member's gradient."""
+
+
+SAMPLED: Final = 256
+"""Quantile levels that the samples of one update are drawn from, one of each equal part of (0, 1).
+
+Embedding the levels of every step and sensor would take longer than the rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +54,8 @@ class Schedule:
         Width of the quadratic part of each member's quantile loss, kappa, in standard deviations
         of a sensor's change.
     scheduled_sampling
-        Share of inputs replaced by samples at the end of training; rises linearly from 0.
+        Probability, at the end of training, that an input is the network's own sample; rises
+        linearly from 0.
     evaluations
         How often the loss on held-out episodes is looked at.
     patience
@@ -232,13 +240,24 @@ def _wide(per_member: Tensor) -> Tensor:
 
 @torch.no_grad()
 def evaluate(
-    network: Ensemble, episodes: Sequence[NDArray[np.float32]], levels: int, kappa: Tensor
+    network: Ensemble,
+    episodes: Sequence[NDArray[np.float32]],
+    levels: int,
+    kappa: Tensor,
+    share: float = 0.0,
 ) -> Tensor:
-    """Return the held-out loss of every network, (K,), at evenly spaced levels."""
+    """Return the held-out loss of every network, (K,), at evenly spaced levels.
+
+    With scheduled sampling a `share` of the inputs are samples here, too, by the same draws every
+    time: on true inputs alone the best look would be the one before sampling sets in.
+    """
     a = network.architecture
     x, y, mask = (v.to(network.device) for v in arrange([list(episodes)], a.window))
     x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
     mask = mask.expand(network.members, -1, -1)
+    if share > 0:
+        rngs = [np.random.default_rng(e) for e in range(network.members)]
+        x = feed_back(network, x, network.start(x.shape[2]), share, rngs)
     even = (torch.arange(levels, device=network.device) + 0.5) / levels
     tau = even.expand(network.members, -1)
     heads = network.heads_at(tau) if a.quantiles else None
@@ -282,13 +301,13 @@ def train(
         done = update / schedule.updates
         share = schedule.scheduled_sampling * done
         if share > 0:
-            x = _mix(network, x, memory, share, rngs)
+            x = feed_back(network, x, memory, share, rngs)
         memory = descend(network, x, y, mask, memory, tau, kappa)
         warm = min(1.0, update / 20)
         decay = 0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done))
         optimiser.step(rates * warm * float(decay))
         if update % every == 0 or update == schedule.updates:
-            found = evaluate(network, held_out, schedule.levels, kappa)
+            found = evaluate(network, held_out, schedule.levels, kappa, schedule.scheduled_sampling)
             history.append(found.tolist())
             better = found < best
             best = torch.where(better, found, best)
@@ -310,29 +329,55 @@ def _stratified(rngs: Sequence[np.random.Generator], levels: int) -> Tensor:
 
 
 @torch.no_grad()
-def _mix(
+def feed_back(
     network: Ensemble,
     x: Tensor,
     memory: Tensor,
     share: float,
     rngs: Sequence[np.random.Generator],
 ) -> Tensor:
-    """Replace a share of the newest inputs by one-step samples: parallel scheduled sampling.
+    """Replace inputs by the network's own samples: scheduled sampling (Bengio et al. 2015).
 
-    The samples are those of a pass over the true inputs, so that all steps are drawn at once
-    instead of one after the other.
+    Each observation after the first of the chunk is replaced with probability `share`, by a sample
+    that was made from the inputs before it as they are by then. Samples of samples are therefore
+    among them, as in a rollout. Windows hold what was fed in. Levels are drawn per step and sensor.
+
+    Parameters
+    ----------
+    x : (E, T, B, W * D)
+        True inputs, newest observation first.
+    memory : (K, B, H)
+        Memory before the chunk.
+    share
+        Probability of a sample.
+    rngs
+        A generator of each member.
+
+    Returns
+    -------
+    Inputs of the same shape.
     """
-    a = network.architecture
-    heads = None
-    if a.quantiles:
-        shape = (x.shape[1], 1, a.features)
-        drawn = np.stack([rng.integers(GRID, size=shape) for rng in rngs])
-        heads = network.heads_from(torch.from_numpy(drawn).to(x.device), network.table())
-    change = predict(network, x, memory, heads)[0][..., 0, :]  # (E, T, B, D)
-    sampled = x[..., : a.features] + network.unit * change  # of the next rows
+    a, steps = network.architecture, x.shape[1]
+    d = a.features
     replaced = np.stack([rng.random(x.shape[1:3]) < share for rng in rngs])
     chosen = torch.from_numpy(replaced).to(x.device)[..., None]
-    mixed = x.clone()
-    d = a.features
-    mixed[:, 1:, :, :d] = torch.where(chosen[:, 1:], sampled[:, :-1], x[:, 1:, :, :d])
-    return mixed
+    heads = None
+    if a.quantiles:
+        levels = _stratified(rngs, SAMPLED).to(x.device)
+        drawn = np.stack([rng.integers(SAMPLED, size=(steps, 1, d)) for rng in rngs])
+        table = network.embedding(network.spread(levels))
+        heads = network.heads_from(torch.from_numpy(drawn).to(x.device), table)
+    cell = network.cell() if a.recurrent else None
+    out = (network.out,) * steps if heads is None else heads.unbind(1)
+    true = x[..., :d].unbind(1)
+    fed = [x[:, 0]]
+    for head, own, following in zip(out, chosen.unbind(1)[1:], true[1:], strict=False):
+        f = network.inputs(fed[-1])
+        memory = f if cell is None else cell(f, memory)
+        change = network.gather(
+            torch.baddbmm(network.out_bias, network.trunk(f, memory), head)
+        )  # (E, B, D)
+        sample = torch.addcmul(fed[-1][..., :d], network.unit, change)
+        newest = torch.where(own, sample, following)
+        fed.append(torch.cat([newest, fed[-1][..., :-d]], dim=2))
+    return torch.stack(fed, dim=1)

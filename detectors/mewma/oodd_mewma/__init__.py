@@ -56,6 +56,8 @@ def oodd_detectors() -> list[DetectorSpec]:
             factory=make_mewma,
             summary="linear forecast, residuals accumulated with their sign",
             reference=_REFERENCE,
+            deterministic=True,
+            alarm="score",
             parameters=MewmaParameters,
         ),
         DetectorSpec(
@@ -64,6 +66,8 @@ def oodd_detectors() -> list[DetectorSpec]:
             summary="mewma whose forecast uses the commanded actions too",
             reference=_REFERENCE,
             inputs="observations+actions",
+            deterministic=True,
+            alarm="score",
             parameters=MewmaParameters,
         ),
     ]

@@ -68,7 +68,7 @@ class MewmaDetector(StorableWindowDetector):
     control chart", Technometrics 34 (1992).
     """
 
-    kind: ClassVar[str] = "mewma/2"
+    kind: ClassVar[str] = "mewma/3"
 
     def __init__(
         self, name: str, parameters: MewmaParameters, *, seed: int, horizon: int, actions: bool
@@ -81,8 +81,7 @@ class MewmaDetector(StorableWindowDetector):
         """Return one score per observation, NaN for t < horizon."""
         self._scale()
         fitted = (len(self.observation_scale_.mean), len(self.action_scale_.mean))
-        found = (trajectory.observation_dim, trajectory.action_dim)
-        if found != fitted:
+        if (found := self._widths(trajectory)) != fitted:
             raise TrajectoryError(
                 f"detector {self.name!r} was fitted on (sensors, action columns) {fitted} "
                 f"and asked to score a trajectory of {found}: score trajectories of the "
@@ -139,7 +138,7 @@ class MewmaDetector(StorableWindowDetector):
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         usable = [x for x in nominal if x.transitions >= self._first]
-        widths = {(x.observation_dim, x.action_dim) for x in nominal}
+        widths = {self._widths(x) for x in nominal}
         if not usable or len(widths) != 1:
             raise TrajectoryError(
                 f"detector {self.name!r} cannot be fitted on {len(nominal)} trajectories, of "
@@ -148,7 +147,8 @@ class MewmaDetector(StorableWindowDetector):
                 "same shape"
             )
         self.observation_scale_ = _scale_of([x.observations for x in usable])
-        self.action_scale_ = _scale_of([x.actions for x in usable])
+        known = usable if self.actions else [x.without_actions() for x in usable]
+        self.action_scale_ = _scale_of([x.actions for x in known])
         folds = [usable[i :: min(FOLDS, len(usable))] for i in range(min(FOLDS, len(usable)))]
 
         ridge = self.parameters.ridge
@@ -189,6 +189,10 @@ class MewmaDetector(StorableWindowDetector):
         self.distance_mean_ = pooled.mean(axis=1, keepdims=True)
         self.distance_std_ = _positive(pooled.std(axis=1, keepdims=True))
         return self.observation_scale_
+
+    def _widths(self, x: Trajectory) -> tuple[int, int]:
+        """Return the numbers of sensors and of action columns that the forecast looks at."""
+        return x.observation_dim, x.action_dim if self.actions else 0
 
     def _targets(self, x: Trajectory) -> Floats:
         return _standard(x.observations[self._first :], self.observation_scale_)

@@ -35,6 +35,5 @@ def oodd_detectors() -> list[DetectorSpec]:
             parameters=NetworkParameters,
             requires=("torch", "safetensors"),
             extra="oodd-eval[reference]",
-            horizon_decides_fit=False,
         )
     ]

@@ -1,4 +1,4 @@
-"""Random forests that predict the next observation: the plug-in `rf`."""
+"""Random forests that predict the next observation: `rf`, and its running mean `rf-ewma`."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +7,7 @@ from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.plugins.parameters import checked, parameter
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ForestParameters:
     """Parameters of `rf`."""
 
@@ -19,6 +19,15 @@ class ForestParameters:
     draws: int = parameter(6000, low=1, help="bootstrap sample of a tree, at most `rows`")
 
 
+@dataclass(frozen=True)
+class SmoothedForestParameters(ForestParameters):
+    """Parameters of `rf-ewma`."""
+
+    weight: float = parameter(
+        0.03, above=0, high=1, decides="scores", help="weight of the newest score"
+    )
+
+
 def make_rf(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return an unfitted `RandomForestDetector`."""
     from oodd_rf.detector import RandomForestDetector  # noqa: PLC0415  keeps the listing quick
@@ -27,18 +36,38 @@ def make_rf(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     return RandomForestDetector("rf", given, seed=seed, horizon=horizon)
 
 
+def make_rf_ewma(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+    """Return an unfitted `SmoothedForestDetector`."""
+    from oodd_rf.smoothed import SmoothedForestDetector  # noqa: PLC0415  keeps the listing quick
+
+    given = checked(SmoothedForestParameters, "rf-ewma", parameters)
+    return SmoothedForestDetector("rf-ewma", given, seed=seed, horizon=horizon)
+
+
 @hookimpl
 def oodd_detectors() -> list[DetectorSpec]:
-    """Offer the ensemble of random forests."""
+    """Offer the ensemble of random forests, by its score and by a running mean of it."""
+    common: dict[str, Any] = {
+        "reference": "Danesh & Fern (2021), section 3; Breiman (2001)",
+        "requires": ("sklearn",),
+        "extra": "oodd-eval[reference]",
+        "horizon_decides_fit": False,
+        "fit_name": "rf",
+    }
     return [
         DetectorSpec(
             name="rf",
             factory=make_rf,
             summary="ensemble of random forests on a window of observations",
-            reference="Danesh & Fern (2021), section 3; Breiman (2001)",
             parameters=ForestParameters,
-            requires=("sklearn",),
-            extra="oodd-eval[reference]",
-            horizon_decides_fit=False,
-        )
+            **common,
+        ),
+        DetectorSpec(
+            name="rf-ewma",
+            factory=make_rf_ewma,
+            summary="exponentially weighted running mean of rf's score",
+            alarm="score",
+            parameters=SmoothedForestParameters,
+            **common,
+        ),
     ]

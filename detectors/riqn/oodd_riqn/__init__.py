@@ -63,7 +63,6 @@ def oodd_detectors() -> list[DetectorSpec]:
         "reference": "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
         "requires": ("torch", "safetensors"),
         "extra": "oodd-eval[reference]",
-        "horizon_decides_fit": False,
     }
     return [
         DetectorSpec(
