@@ -28,7 +28,7 @@ from tabulate import tabulate
 
 from oodd_eval import load_split
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.metrics.auc import auc_contributions
+from oodd_eval.metrics.auc import auc_same_times
 from oodd_eval.names import select
 
 SCORES = ("E|o - X|", "CRPS", "median")
@@ -69,6 +69,12 @@ def three_scores(detector, samples, trajectory):
     return [np.concatenate([[np.nan], each.mean(1)]) for each in found]
 
 
+def matched_auc(scores, twins, effects):
+    """Return the mean over trajectories of the AUC from the effect on."""
+    both = zip(scores, twins, effects, strict=True)
+    return np.mean([auc_same_times(s, t, e, min(len(s), len(t))) for s, t, e in both])
+
+
 def evaluated(data, detector, samples):
     """Return matched AUCs (%) and nominal means of every score."""
 
@@ -80,8 +86,8 @@ def evaluated(data, detector, samples):
     for anomaly in ANOMALIES:
         group = data.anomalous(anomaly)
         pairs = zip(scored(group), twins, strict=True)
-        onsets = list(group.onsets)
-        cells.append([auc_contributions(s, t, onsets)["auc_matched"].value for s, t in pairs])
+        effects = list(group.effects)
+        cells.append([matched_auc(s, t, effects) for s, t in pairs])
     nominal = [np.nanmean(np.concatenate(scores)) for scores in scored(data.calibration)]
     return [*(100 * np.mean(cells, axis=0)), *nominal]
 

@@ -70,7 +70,12 @@ class Good:
 
 
 GOOD = DetectorSpec(
-    "good", Good, "", parameters=declared_by({"power": 1.0}), horizon_decides_fit=False
+    "good",
+    Good,
+    "",
+    deterministic=True,
+    parameters=declared_by({"power": 1.0}),
+    horizon_decides_fit=False,
 )
 
 
@@ -146,6 +151,32 @@ class NoMood(Good):
 class Exits(Good):
     def fit(self, nominal):
         sys.exit(3)
+
+
+@breaks(
+    "inputs",
+    "without actions, fit raised IndexError: index 0 is out of bounds for axis 1 with size 0 "
+    '(broken_detectors.py:<n>); with them it works: expected inputs="observations+actions" in the '
+    "spec, as a detector that declares observations is handed actions of width 0",
+)
+class LearnsActions(Good):
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.std_ = self.std_ + np.concatenate([x.actions[:, 0] for x in nominal]).std()
+
+
+@breaks(
+    "inputs",
+    "without actions, score raised IndexError: index 0 is out of bounds for axis 1 with size 0 "
+    '(broken_detectors.py:<n>); with them it works: expected inputs="observations+actions" in the '
+    "spec, as a detector that declares observations is handed actions of width 0",
+)
+class ScoresActions(Good):
+    def score(self, x):
+        scores = super().score(x)
+        if self.std_ is not None:
+            scores[1:] += np.abs(x.actions[:, 0])
+        return scores
 
 
 @breaks(
@@ -311,6 +342,16 @@ class ReadsTheGlobalState(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ *= 1 + np.random.get_state()[1][0] % 1000 / 2000  # noqa: NPY002
+
+
+@breaks(
+    "deterministic",
+    "a detector of seed 1 has other scores than one of seed 0: at t = 1 it is <n> instead of <n>; "
+    "expected deterministic=False",
+)
+class Draws(Good):
+    def score(self, x):
+        return super().score(x) + self.seed
 
 
 @breaks(
@@ -630,6 +671,16 @@ class LeavesAThread(Good):
         super().fit(nominal)
         ENDS.append(threading.Event())
         threading.Thread(target=ENDS[-1].wait, name="pump").start()
+
+
+@breaks("leftovers", "left running: daemon thread pump: end what was started")
+class LeavesADaemonThread(Good):
+    save = load = None
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        ENDS.append(threading.Event())
+        threading.Thread(target=ENDS[-1].wait, name="pump", daemon=True).start()
 
 
 @breaks("leftovers", "left running: process <n> (sleep): end what was started")

@@ -2,6 +2,7 @@
 
 import sys
 import textwrap
+from pathlib import Path
 
 HEADER = """
 import json, os, signal, subprocess, sys, threading, time
@@ -44,3 +45,10 @@ def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", 
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, module)
     return path / f"{module}.py"
+
+
+def install_adversaries(monkeypatch, path, code=""):
+    """Install `adversaries.py` as a plug-in, or other code, here and in processes started here."""
+    code = code or Path(__file__).with_name("adversaries.py").read_text()
+    install(monkeypatch, path, "adversaries", code, header="")
+    monkeypatch.setenv("PYTHONPATH", str(path))

@@ -27,10 +27,11 @@ class Slow(Good):
     def fit(self, nominal):
         with open(os.environ["FITS"], "a") as log:
             log.write(f"{os.getpid()} {nominal[0].observation_dim} {self.horizon} {self.seed}\\n")
-        reached("fit", os.getppid())
+        self.harness = os.getppid()
+        reached("fit", self.harness)
         time.sleep(3600 if os.environ.get("ENDLESS") == str(self.seed) else self.pause)
     def score(self, x):
-        reached("score", os.getppid())
+        reached("score", self.harness)  # the parent of a fork is the worker
         time.sleep(self.pause / 100)
         return super().score(x) + self.seed
 
@@ -46,7 +47,8 @@ class Keeps(Slow):
             reached("save", os.getppid())
             time.sleep(self.pause)
     def load(self, directory):
-        reached("load", os.getppid())
+        self.harness = os.getppid()
+        reached("load", self.harness)
         self.dimension = int((directory / "one").read_text())
 
 @hookimpl

@@ -3,18 +3,21 @@
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES
-from oodd_eval.metrics.catalogue import RATIOS
+from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.results.record import Metric, Record
 
 
 def make_record(
     detector="riqn", environment="hopper", anomaly="iid", *, values=None, status="ok", reason="",
-    seed=0, horizon=1, plugin=None, overrides=None, digest="ab" * 32, limit=None,
+    seed=0, horizon=1, plugin=None, overrides=None, digest="ab" * 32, limit=None, **fields,
 ):  # fmt: skip
-    """One record; `values` gives numerators per metric over two trajectories (default 0.5)."""
+    """One record; `values` gives numerators per metric over two trajectories (default 0.5).
+
+    Its detector is deterministic, so that one seed is enough for a rank.
+    """
     plugin = plugin or ("trivial" if detector in ("clock", "persistence", "random") else detector)
     given = values or {}
-    numbers = {name: list(given.get(name, [0.5, 0.5])) for name in RATIOS}
+    numbers = {name: list(given.get(name, [0.5, 0.5])) for name in {**METRICS, **given}}
     per_trajectory = {
         name: ([0.0 if v is None else float(v) for v in column],
                [0.0 if v is None else 1.0 for v in column])
@@ -34,7 +37,7 @@ def make_record(
         split_digest=digest, status=status, protocol=1, reason=reason,
         metrics=metrics if ok else {}, counts={"test": 2},
         per_trajectory=per_trajectory if ok else {},
-        limit=limit, overrides=overrides or {},
+        limit=limit, overrides=overrides or {}, **{"deterministic": True, **fields},
     )  # fmt: skip
 
 
@@ -54,6 +57,12 @@ def example():
                     "delay": [4.0, None] if anomaly == "gravity" else [2.0, 3.0],
                     "missed": [0.0, 1.0] if anomaly == "gravity" else [0.0, 0.0],
                     "far": [0.1, 0.05],
+                    "false_episodes_at_5pct": [0.0, 1.0],
+                    "early_at_5pct": [0.0, 0.0],
+                    "delay_at_5pct": [8.0, None],
+                    "missed_at_5pct": [0.0, 1.0],
+                    "found_within_20_at_5pct": [1.0, 0.0],
+                    "found_within_20_null_at_5pct": [0.0, 1.0],
                 }
                 failed = detector == "rf" and environment == "ant"
                 records.append(

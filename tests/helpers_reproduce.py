@@ -24,7 +24,8 @@ class Quick:
         scores[self.horizon:] = moved + self.noise * noise
         return scores
 
-NOISE = {"riqn": 0.5, "riqn-ms": 1.0, "n-riqn": 6.0, "npn": 3.0, "rf": 10.0, "mewma": 1.0}
+NOISE = {"riqn": 0.5, "riqn-ms": 1.0, "n-riqn": 6.0, "npn": 3.0, "rf": 10.0, "mewma": 1.0,
+         "mewma-a": 1.0, "rf-ewma": 9.0}
 SLOW = float(os.environ.get("QUICK_SECONDS", 0))
 
 def make(name):

@@ -51,7 +51,8 @@ def make_group(environment, seeds, length, anomaly=None):
     arrays["seeds"] = np.array(seeds)
     arrays["terminated"] = np.zeros(len(seeds), np.uint8)
     if anomaly:
-        arrays["onsets"] = np.array(found["onsets"])
+        # A sensor gets 3 more from the onset on, noise another scale: the first row differs.
+        arrays["onsets"] = arrays["effects"] = np.array(found["onsets"])
         arrays["redraws"] = np.zeros(len(seeds), np.int64)
         arrays["parameters"] = pack_parameters(
             [{"anomaly": anomaly, "unit": "µ", "seed": int(s)} for s in seeds]
@@ -85,8 +86,10 @@ def make_split(
         groups[TWINS] = make_group(environment, seeds["test"], length)
         for anomaly in ANOMALIES:
             groups[f"test/{anomaly}"] = make_group(environment, seeds["test"], length, anomaly)
+        info = ENVIRONMENTS[environment]
         entries[environment] = write_environment(
-            directory / f"{environment}.h5", groups.items(), "0" * 64
-        )
+            directory / f"{environment}.h5", groups.items(), "0" * 64,
+            sensors=info.sensors, actions=info.actions,
+        )  # fmt: skip
     write_manifest(directory, definition, entries, generator=1, versions={})
     return directory

@@ -117,7 +117,10 @@ class Spy:
 
     def score_many(self, xs):
         note("score", xs)
-        look("score")
+        # Every group is scored by a process like the first two; a look takes seconds.
+        order = sorted(OUTPUT.glob("*.json"), key=lambda path: int(path.name.partition("-")[0]))
+        if len(order) < 2 or not all(path.stem.endswith("score") for path in order[-2:]):
+            look("score")
         return [self.score(x) for x in xs]
 
 
@@ -147,7 +150,8 @@ class Findings:
     """
 
     def __init__(self, directory):
-        self.looks = sorted(Path(directory).glob("*.json"))
+        looks = Path(directory).glob("*.json")
+        self.looks = sorted(looks, key=lambda path: int(path.name.partition("-")[0]))
         self._directory = Path(directory)
 
     @property

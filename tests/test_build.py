@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("gymnasium")
 from oodd_training.freeze import freeze_policy
 
-from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.simulate import build
 from oodd_eval.data.simulate.build import Chunk, build_split
 from oodd_eval.data.simulate.policies import FROZEN, load_policy
@@ -65,6 +65,8 @@ def test_a_built_split_holds_what_recording_gives(built):
     np.testing.assert_array_equal(stored[1].observations, episode.trajectory.observations)
     np.testing.assert_array_equal(stored[1].actions, episode.trajectory.actions)
     assert (stored.onsets[1], stored.redraws[1]) == (episode.onset, episode.redraws)
+    assert stored.effects[1] == episode.effect
+    assert data.sensors == ENVIRONMENTS["cartpole"].sensors
     assert stored.parameters[1] == episode.parameters
     assert stored.returns[1] == episode.rewards.sum()
 

@@ -7,43 +7,74 @@ import pytest
 
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import (
-    CALIBRATED,
+    ALARM_RANKING,
+    GUARANTEED,
+    HEADLINE,
+    LEVELS,
     METRICS,
     NAMES,
-    POOLED,
-    RATIOS,
+    RANKING,
     UNDEFINED,
     metric_info,
+    split_name,
 )
 
 
 def test_every_name_has_facts_and_every_null_is_a_metric():
-    assert len(set(NAMES)) == len(NAMES) == 25
+    assert len(set(NAMES)) == len(NAMES) == 12 + 3 * 14
     for name in NAMES:
         info = metric_info(name)
         assert info.name == name
-        assert info.null in ("", *METRICS)
-    assert (*RATIOS, *POOLED) == tuple(METRICS)
-    assert set(CALIBRATED) < set(RATIOS)
+        assert info.null in ("", *NAMES)
+    for name in (RANKING, ALARM_RANKING):
+        assert name in NAMES
+    assert HEADLINE in LEVELS
 
 
-def test_the_suffix_of_a_target_is_understood():
-    info = metric_info("far_at_01pct")
-    assert (info.title, info.unit, info.better) == ("FAR at 0.1 %", "rate", "lower")
-    assert info.summary.endswith("calibrated to 0.1 %")
+def test_the_names_of_a_level_are_those_of_its_metrics_their_nulls_and_the_threshold():
+    own = ["early", "delay", "missed", "delay_censored", "found_within_20", "found_within_100"]
+    expected = ["false_episodes", *(n for name in own for n in (name, f"{name}_null"))]
+    assert list(GUARANTEED) == expected
+    assert {n for n in NAMES if n.endswith("_at_5pct")} == {
+        f"{name}_at_5pct" for name in [*expected, "threshold"]
+    }
+
+
+def test_the_suffix_of_a_level_is_understood():
+    info = metric_info("missed_at_10pct")
+    assert (info.title, info.unit, info.better) == ("Missed at 10 %", "percent", "lower")
+    assert (info.null, info.level) == ("missed_null_at_10pct", "10 %")
+    assert info.summary.endswith("in at most 10 % of nominal episodes")
     assert metric_info("threshold_at_1pct").title == "Threshold at 1 %"
+    for name in NAMES:
+        base, suffix = split_name(name)
+        assert name == (f"{base}_{suffix}" if suffix else base)
+        assert bool(suffix) == bool(metric_info(name).level)
 
 
-@pytest.mark.parametrize("name", ["auc_mached", "auc_at_1pct", "far_at_2pct", "threshold", ""])
+@pytest.mark.parametrize(
+    "name", ["auc_mached", "auc_at_1pct", "far_at_5pct", "missed_at_2pct", "threshold", "", "early"]
+)
 def test_other_names_are_refused(name):
     with pytest.raises(UnknownNameError, match="unknown metric"):
         metric_info(name)
 
 
 def test_better_sides():
-    better = {side: {n for n in METRICS if METRICS[n].better == side} for side in ("higher", "")}
-    assert better["higher"] == {"auc", "auc_matched", "auc_pooled", "average_precision"}
-    assert better[""] == {"auc_null", "auc_placebo", "delay_null"}
+    better = {side: {n for n in NAMES if metric_info(n).better == side} for side in ("higher", "")}
+    found = {n for n in NAMES if n.startswith("found") and "null" not in n}
+    assert better["higher"] == {"auc", "auc_matched", "auc_unpaired", "auc_smoothed"} | found
+    beside = {n for n in NAMES if "null" in n or n.startswith(("auc_placebo", "threshold"))}
+    assert better[""] == beside
+
+
+def test_kinds_of_intervals():
+    kinds = {name: metric_info(name).interval for name in NAMES}
+    assert {n for n in NAMES if kinds[n] == "exact"} == {f"false_episodes_{s}" for s in LEVELS}
+    assert {n for n in NAMES if not kinds[n]} == {f"threshold_{s}" for s in LEVELS}
+    assert {split_name(n)[0] for n in NAMES if kinds[n] == "mean"} == {
+        "delay", "delay_null", "delay_censored", "delay_censored_null",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -52,6 +83,7 @@ def test_better_sides():
         ("auc", 0.98765, "98.8"),
         ("delay_at_1pct", 12.34, "12.3"),
         ("far", 0.01234, "0.012"),
+        ("missed_at_5pct", 0.25, "25.0"),
         ("threshold_at_1pct", 0.19491, "0.195"),
         ("delay", float("nan"), UNDEFINED),
     ],
@@ -62,4 +94,10 @@ def test_numbers_are_printed_by_their_unit(name, value, text):
 
 def test_the_documented_metrics_are_those_of_the_catalogue():
     text = (Path(__file__).parents[1] / "docs/metrics.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(METRICS)
+    own = [name for name in GUARANTEED if not name.endswith("_null")]
+    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == [
+        *(n for n in METRICS if n.startswith("auc")),
+        *own,
+        "threshold",
+        *(n for n in METRICS if not n.startswith("auc")),
+    ]

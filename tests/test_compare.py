@@ -89,8 +89,8 @@ def parsed(text):
         ("auc:-0.01", Tolerance("auc", "-", 0.01)),
         ("auc:0.01", Tolerance("auc", "-", 0.01)),
         ("delay:+10%", Tolerance("delay", "+", 10, percent=True)),
-        ("far_twin_at_1pct:+.5", Tolerance("far_twin_at_1pct", "+", 0.5)),
-        ("fpr95:2.", Tolerance("fpr95", "+", 2)),
+        ("missed_at_1pct:+.5", Tolerance("missed_at_1pct", "+", 0.5)),
+        ("delay_null:2.", Tolerance("delay_null", "±", 2)),
         ("auc_null:0.1", Tolerance("auc_null", "±", 0.1)),
         ("auc_null:-0.1", Tolerance("auc_null", "-", 0.1)),
         (" missed:0 ", Tolerance("missed", "+", 0)),
@@ -128,9 +128,11 @@ def test_a_sign_on_the_better_side_is_explained(text, message):
 def test_every_metric_has_its_worse_side():
     falls = {m for m in NAMES if worse_side(m) == "-"}
     neither = {m for m in NAMES if worse_side(m) == "±"}
-    assert falls == {"auc", "auc_matched", "auc_pooled", "average_precision"}
-    assert neither == {"auc_null", "auc_placebo", "delay_null", "threshold_at_1pct",
-                       "threshold_at_01pct"}  # fmt: skip
+    aucs = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired"}
+    assert {m for m in falls if not m.startswith("found")} == aucs
+    assert {m.partition("_at_")[0] for m in falls - aucs} == {"found_within_20", "found_within_100"}
+    beside = ("null", "placebo", "threshold")
+    assert neither == {m for m in NAMES if any(word in m for word in beside)}
     assert worse_side("of_another_version") == "±"
 
 
@@ -206,14 +208,17 @@ def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
     changed = record(auc=0.4, auc_null=0.9, delay=0.4, far=0.6)
     found = against([changed], [record()])
     assert {d.metric for d in found.differences} == {
-        "auc", "auc_matched", "delay", "delay_censored", "missed", "far", "far_twin",
+        "auc", "auc_matched", "auc_smoothed", "auc_unpaired", "delay", "delay_censored", "missed",
+        "far", "far_twin",
     }  # fmt: skip
     assert {d.metric for d in found.failures} == {"auc", "far"}
 
 
 def test_a_metric_that_the_reference_lacks_is_an_error_and_not_a_pass():
-    with pytest.raises(UsageError, match="metric 'fpr95' is not in records, expected one of auc, "):
-        against([record()], [record()], parse_tolerance("fpr95:0.1"))
+    with pytest.raises(
+        UsageError, match="metric 'missed_at_1pct' is not in records, expected one of auc, "
+    ):
+        against([record()], [record()], parse_tolerance("missed_at_1pct:0.1"))
 
 
 def test_of_several_records_of_a_cell_the_last_counts():
@@ -341,7 +346,7 @@ def changed(**changes):
     [
         ("{", "no record"),
         ("[1]", "no record"),
-        (changed(schema=1), "schema 1, expected 2"),
+        (changed(schema=2), "schema 2, expected 3"),
         (changed(protocol=True), "protocol"),
         (changed(split_digest=None), "split_digest"),
         (changed(limit="5"), "limit"),
@@ -421,7 +426,7 @@ def run(tmp_path, capsys, monkeypatch):
 def test_identical_results_are_exit_code_0_and_one_line(run, results, reference):
     code, out, err = run(results, "--against", reference)
     assert (code, err) == (0, "")
-    assert out == "3 cells compared in 7 metrics: 21 same.\n"
+    assert out == "3 cells compared in 9 metrics: 27 same.\n"
 
 
 def test_a_regression_is_exit_code_1_and_a_table(run):

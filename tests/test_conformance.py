@@ -20,6 +20,7 @@ NETWORK = {"updates": 3, "members": 2, "chunk": 20}
 QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
 SMALL = {
     "rf": {"members": 2, "trees": 2},
+    "rf-ewma": {"members": 2, "trees": 2},
     "riqn": QUANTILES,
     "riqn-ms": QUANTILES,
     "n-riqn": QUANTILES,
@@ -30,7 +31,7 @@ SMALL = {
 
 EXPECTED_FAILURES = {
     name: {"gross-anomaly": "a row for comparison: it knows nothing of the sensors"}
-    for name in ("random", "clock")
+    for name in ("random", "clock", "comb")
 }
 
 
@@ -69,5 +70,6 @@ def must_conform(name, horizon, parameters):
 
 def test_no_plugin_is_left_out():
     assert not PLUGINS.broken
-    assert {"random", "persistence", "clock", "rf", "riqn", "riqn-ms", "n-riqn", "npn", "mewma",
+    assert {"random", "persistence", "clock", "comb", "range", "mahalanobis", "rf", "rf-ewma",
+            "riqn", "riqn-ms", "n-riqn", "npn", "mewma",
             "mewma-a"} <= set(PLUGINS.offers)  # fmt: skip

@@ -107,7 +107,9 @@ def test_area_under_one_curve_is_its_auc(seed):
 def test_area_under_the_averaged_curve_is_the_matched_auc():
     anomalous, twins, onsets = cell(np.random.default_rng(0))
     area = np.trapezoid(mean_matched_roc(anomalous, twins, onsets, FINE), FINE)
-    matched = auc_contributions(anomalous, twins, onsets)["auc_matched"].value
+    matched = auc_contributions(anomalous, twins, onsets, onsets, RULE.standardization)[
+        "auc_matched"
+    ].value
     assert area == pytest.approx(matched, abs=2e-4)
     assert 0.6 < matched < 0.9
 
@@ -170,16 +172,16 @@ def test_example_is_the_trajectory_with_the_median_matched_auc():
     twins = [np.zeros(60)] * 4
     anomalous = [np.full(60, value) for value in (1.0, -1.0, 0.0, 1.0)]
     # Matched AUCs 1, 0, 1/2, 1: the lower median is 1/2.
-    found = example(anomalous, twins, [30] * 4, RULE)
+    found = example(anomalous, twins, [30] * 4, [30] * 4, RULE)
     assert (found["index"], found["auc_matched"]) == (2, 0.5)
-    found = example(anomalous[:2] + anomalous[3:], twins[:3], [30] * 3, RULE)
+    found = example(anomalous[:2] + anomalous[3:], twins[:3], [30] * 3, [30] * 3, RULE)
     assert (found["index"], found["auc_matched"]) == (0, 1.0)
 
 
 def test_example_shows_rows_around_the_onset_in_standard_deviations():
     scores = np.arange(200.0)
     rule = AlarmRule(Standardization(mean=100.0, std=50.0))
-    found = example([scores], [scores[:120]], [100], rule)
+    found = example([scores], [scores[:120]], [100], [100], rule)
     assert (found["start"], found["onset"], found["length"]) == (60, 100, 200)
     assert found["scores"] == pytest.approx([(t - 100) / 50 for t in range(60, 160)])
     assert len(found["twin"]) == 60
@@ -191,7 +193,7 @@ def test_example_shows_rows_around_the_onset_in_standard_deviations():
 
 def test_example_has_none_where_a_score_is_undefined():
     scores = np.concatenate([[NAN, NAN], np.ones(60)])
-    found = example([scores], [scores], [30], RULE)
+    found = example([scores], [scores], [30], [30], RULE)
     assert found["scores"][:3] == [None, None, 1.0]
     assert found["cusum"][:2] == [0.0, 0.0]
 

@@ -24,8 +24,35 @@ def test_standardized_scores_are_in_hundredths_of_a_standard_deviation():
     assert np.array_equal(x, [NAN, 0.0, 0.02, -0.02], equal_nan=True)
 
 
-def test_constant_calibration_scores_standardize_to_zero():
-    assert Standardization.fit([np.full(5, 7.0)])(np.array([NAN, 9.0])).tolist()[1] == 0.0
+@pytest.mark.parametrize("constant", [0.0, 7.0, 0.1, -1 / 3])
+def test_beside_constant_calibration_scores_any_higher_one_is_an_alarm_at_once(constant):
+    fitted = Standardization.fit([np.full(7, constant)] * 3)
+    assert (fitted.mean, fitted.std) == (constant, 0.0)
+    above, below = np.nextafter(constant, np.inf), np.nextafter(constant, -np.inf)
+    x = fitted(np.array([NAN, below, constant, above, constant]))
+    assert np.array_equal(x, [NAN, 0.0, 0.0, np.inf, 0.0], equal_nan=True)
+    assert cusum(x)[1].tolist() == [False, False, False, True, False]
+    # Without a new start the sum stays infinite.
+    assert cusum(x, threshold=np.inf)[0].tolist() == [0, 0, 0, np.inf, np.inf]
+
+
+@pytest.mark.parametrize("factor", [1e-9, 3.7, 1e10, 1e150])
+def test_a_large_unit_changes_no_bit_of_the_standard_deviation(factor):
+    scores = factor * np.random.default_rng(1).normal(size=200)
+    mean = math.fsum(scores) / 200
+    expected = math.sqrt(math.fsum((scores - mean) ** 2) / 200)
+    assert Standardization.fit([scores]) == Standardization(mean, expected)
+
+
+def test_the_squares_of_large_and_small_scores_are_numbers():
+    scores = np.random.default_rng(2).normal(size=50)
+    for factor in (1e200, 1e-200):
+        fitted = Standardization.fit([factor * scores])
+        assert fitted.std / factor == pytest.approx(scores.std())
+    # A sum that overflows, and a distance from the mean that does.
+    for beyond in ([1.7e308, 1.7e308, 0.0], [-1.7e308, 1.7e308, 1.7e308]):
+        with pytest.raises(OverflowError):
+            Standardization.fit([np.array(beyond)])
 
 
 def test_without_a_calibration_score_nothing_is_ever_alarming():

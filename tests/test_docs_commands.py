@@ -88,9 +88,9 @@ KNOWN = dict(
         ),
         page(
             "detectors/README.md",
-            files={"oodd_range.py": "```python", "pyproject.toml": "```toml"},
+            files={"oodd_bounds.py": "```python", "pyproject.toml": "```toml"},
             # It says so itself: too small to pass every check.
-            fails=(r"^oodd-eval check range$",),
+            fails=(r"^oodd-eval check bounds$",),
         ),
     ]
 )

@@ -5,15 +5,17 @@ import json
 import numpy as np
 import pytest
 import torch
-from helpers_forecast import Walker, slow_errors
+from helpers_forecast import Walker, one_step, slow_errors
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms
 from oodd_torch.forecast import Forecaster, quantile_levels, rollouts
 from oodd_torch.network import GRID, Architecture, Ensemble
 from oodd_torch.training import (
+    SAMPLED,
     Schedule,
     arrange,
     descend,
+    feed_back,
     predict,
     quantile_huber,
     quantile_huber_slope,
@@ -204,9 +206,83 @@ def test_padding_does_not_enter_the_loss():
     assert not y[0, 9:, 1].any()
 
 
-def test_scheduled_sampling_trains():
-    made = riqn(seed=0, horizon=2, scheduled_sampling=0.5, **SMALL).fit(waves())
-    assert np.isfinite(made.score(waves(1, 20, seed=9)[0])[2:]).all()
+def slow_feeding(made, rows, share, rngs):
+    """One member, one episode, one step after the other, each fed what came before."""
+    a, steps = made.architecture, len(rows[0]) - 1
+    fed = np.zeros((made.members, len(rows), steps, a.features), np.float32)
+    for e, rng in enumerate(rngs):
+        replaced, levels, index = rng.random((steps, len(rows))) < share, None, None
+        if a.quantiles:
+            levels = (np.arange(SAMPLED) + rng.random(SAMPLED)) / SAMPLED
+            index = rng.integers(SAMPLED, size=(steps, 1, a.features))
+        for b, episode in enumerate(rows):
+            stream = [episode[0]]
+            for t in range(1, steps):
+                # The oracle counts levels in steps of the forecasts' grid.
+                now = None if levels is None else levels[index[t - 1, 0]] * GRID - 0.5
+                sample = one_step(made, e, stream, now)
+                stream.append(sample if replaced[t, b] else episode[t])
+            fed[e, b] = stream
+    return fed
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(
+    "architecture",
+    [{}, {"recurrent": False, "window": 3}, {"quantiles": False}, {"per_feature": True}],
+    ids=["riqn", "n-riqn", "npn", "per-feature"],
+)
+def test_scheduled_sampling_feeds_back_what_a_slow_loop_does(architecture, share):
+    made = network(2, features=2, random_head=True, units=8, cosines=5, **architecture)
+    rows = [w.observations for w in waves(3, 12, 2)]
+    x, _, _ = arrange([rows, rows], made.architecture.window)
+    found = feed_back(made, x, made.start(3), share, [np.random.default_rng(e) for e in (4, 5)])
+    expected = slow_feeding(made, rows, share, [np.random.default_rng(e) for e in (4, 5)])
+    for w in range(made.architecture.window):
+        past = found[..., 2 * w : 2 * w + 2].transpose(1, 2).numpy()
+        # A window reaches back over what was fed, and repeats the first row before it.
+        lagged = expected[:, :, np.maximum(np.arange(expected.shape[2]) - w, 0)]
+        assert np.allclose(past, lagged, atol=1e-5)
+    replaced = (found[..., :2] != x[..., :2]).any(-1)[:, 1:].float().mean().item()
+    assert replaced == pytest.approx(share, abs=0.2)
+
+
+def test_the_probability_of_a_sample_rises_to_its_end_value(monkeypatch):
+    shares = []
+
+    def spy(network, x, memory, share, rngs):
+        shares.append(share)
+        return feed_back(network, x, memory, share, rngs)
+
+    monkeypatch.setattr("oodd_torch.training.feed_back", spy)
+    given = {"members": 2, "updates": 6, "scheduled_sampling": 0.6}
+    riqn(seed=0, horizon=2, **given).fit(waves())
+    # Every update and then its look at the held-out loss, which is at the end value.
+    assert shares[::2] == pytest.approx([0.6 * u / 6 for u in range(1, 7)])
+    assert shares[1::2] == [0.6] * 6
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+def test_scheduled_sampling_is_on_beyond_one_step_and_off_at_one(name):
+    def losses(horizon, **given):
+        return FACTORIES[name](seed=0, horizon=horizon, **SMALL, **given).fit(waves()).history_
+
+    true = losses(1, scheduled_sampling=0.0)
+    assert losses(1) == losses(1, scheduled_sampling=1.0) == losses(4, scheduled_sampling=0.0)
+    assert losses(1) == true
+    assert losses(4) == losses(9) != true
+
+
+def test_training_on_own_samples_makes_long_forecasts_better():
+    """A rollout of a network that never saw its own samples goes astray."""
+    x = waves(6, 80, 2, seed=9, noise=0.2)
+
+    def error(share):
+        given = {"members": 2, "updates": 100, "chunk": 40, "scheduled_sampling": share}
+        made = npn(seed=0, horizon=10, **given).fit(waves(20, 80, 2, noise=0.2))
+        return np.nanmean(np.concatenate(made.score_many(x)))
+
+    assert error(1.0) < error(0.0)
 
 
 def test_constant_sensors_have_scale_one():
@@ -266,14 +342,16 @@ def test_a_saved_fit_is_plain_files_and_keeps_the_losses(name, tmp_path):
     assert loaded.history_ == saved.history_
 
 
-def test_one_fit_serves_other_horizons_and_samples(tmp_path):
+def test_one_fit_serves_other_horizons_beyond_one_and_samples(tmp_path):
     episode = waves(1, 30, seed=9)[0]
     other = {**SMALL, "samples": 3}
-    riqn(seed=1, horizon=1, **SMALL).fit(waves()).save(tmp_path)
-    loaded = riqn(seed=1, horizon=4, **other)
+    riqn(seed=1, horizon=2, **SMALL).fit(waves()).save(tmp_path)
+    loaded = riqn_ms(seed=1, horizon=4, **other)
     loaded.load(tmp_path)
-    fresh = riqn(seed=1, horizon=4, **other).fit(waves())
+    fresh = riqn_ms(seed=1, horizon=4, **other).fit(waves())
     assert np.array_equal(loaded.score(episode), fresh.score(episode), equal_nan=True)
+    with pytest.raises(FittedStateError, match=r"'scheduled_sampling': 0\.5"):
+        riqn(seed=1, horizon=1, **SMALL).load(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -90,8 +90,7 @@ QUICK = {
              "error", "the detector wrote into the pipe between worker and harness"),
     "closer": ("def fit(self, nominal): os.closerange(0, 64)",
                "error", "the worker ended with exit code 1 while fitting"),
-    "forks": ("def fit(self, nominal): os.fork()",
-              "error", "the detector wrote into the pipe between worker and harness"),
+    "forks": ("def fit(self, nominal): os.fork()", "ok", ""),
     "orphan": ("""
         def fit(self, nominal):
             if os.fork() == 0:
@@ -162,9 +161,12 @@ QUICK = {
                 "ok", ""),
     "leaves": ("""
         def fit(self, nominal):
-            subprocess.Popen(["sleep", "600"], start_new_session=True)
+            subprocess.Popen(["sleep", "600"], start_new_session=True)""",
+               "incompatible", "processes run on after fit"),
+    "threads": ("""
+        def fit(self, nominal):
             for _ in range(50): threading.Thread(target=time.sleep, args=(600,)).start()""",
-               "ok", ""),
+                "incompatible", "threads or processes run on after fit"),
 }  # fmt: skip
 
 UNMARKED = f"600.{os.getpid()}"
@@ -313,8 +315,8 @@ def test_a_reason_is_one_line_of_bounded_length(hostile):
 
 def test_what_a_detector_does_to_its_trajectories_stays_with_it(hostile):
     """Trajectories of the worker are copies: the scores of the others are as they would be."""
-    found = {name: cells(hostile[0][1], name) for name in ("scribbles", "leaves")}
-    assert found["scribbles"][0]["metrics"] == found["leaves"][0]["metrics"]
+    found = {name: cells(hostile[0][1], name) for name in ("scribbles", "forks")}
+    assert found["scribbles"][0]["metrics"] == found["forks"][0]["metrics"]
 
 
 def test_plugins_that_kill_hang_or_fail_at_import_do_not_touch_runs_of_others(hostile):

@@ -11,16 +11,16 @@ import pytest
 from helpers_records import example, make_record
 
 from oodd_eval.cli.main import main
-from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.sections import sections
-from oodd_eval.metrics.catalogue import POOLED, RATIOS, UNDEFINED
+from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric
 from oodd_eval.results.tables import layout, rendering
-from oodd_eval.results.tables.board import cost_of, ranked
+from oodd_eval.results.tables.board import Board, cost_of, primary_settings, ranked
 
 GOLDEN = Path(__file__).parent / "golden"
 SEEDS = 12
@@ -28,22 +28,23 @@ SEEDS = 12
 
 def record(detector, matched, *, environment="hopper", anomaly="iid", **more):
     """A record of twelve test seeds with all metrics a board may show."""
-    values = {name: [0.5] * SEEDS for name in RATIOS}
+    values = {name: [0.5] * SEEDS for name in METRICS}
     values |= {"auc_matched": matched, "delay": [3.0] * (SEEDS - 1) + [None]}
     one = make_record(detector, environment, anomaly, values=values, **more)
     one = dataclasses.replace(one, counts={"test": SEEDS})
     if not one.ok:
         return one
-    far = ([1.0] * SEEDS, [100.0] * SEEDS)
+    none = [0.0] * SEEDS, [1.0] * SEEDS
     per_trajectory = one.per_trajectory | {
-        "far_twin_at_1pct": far,
-        "missed_at_1pct": one.per_trajectory["missed"],
-        "delay_censored_at_1pct": one.per_trajectory["delay_censored"],
+        "false_episodes_at_5pct": none,
+        "early_at_5pct": none,
+        "missed_at_5pct": one.per_trajectory["missed"],
+        "delay_censored_at_5pct": ([60 * (1 - (m or 0)) for m in matched], [1.0] * SEEDS),
     }
     metrics = one.metrics | {name: Metric(0.5) for name in per_trajectory}
     return dataclasses.replace(
         one,
-        metrics=metrics | {name: Metric(0.75) for name in POOLED},
+        metrics=metrics,
         per_trajectory=per_trajectory,
         seconds_fit=2.0,
         seconds_score=0.5,
@@ -153,6 +154,57 @@ def files_below(output):
 # Rendering
 
 
+def test_an_entry_declares_the_row_that_is_ranked_for_its_detector():
+    def primary(*declared):
+        records = [r for r in board() if r.detector != "rf"]
+        found = sections([entry("mine", records, primary=list(declared))])[0]
+        standings = found.ranks.standings
+        return {s.entry.horizon for s in standings if s.entry.detector == "riqn" and s.primary}
+
+    assert primary() == primary("riqn", "clock") == {1}
+    assert primary("riqn[h=10]") == {10}
+    with pytest.raises(ResultsError, match="expected one row a detector"):
+        primary("riqn", "riqn[h=10]")
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_stranger_does_not_choose_the_row_that_is_ranked(whole):
+    official = [r for r in board() if r.detector != "rf"]
+    row = [dataclasses.replace(r, overrides={"trees": 1}) for r in official
+           if r.detector == "riqn" and r.horizon == 1]  # fmt: skip
+    stranger = row if whole else row[:1]
+    with pytest.raises(
+        ResultsError, match=r"'stranger' declares .* 'official' has rows of it, too"
+    ):
+        sections(
+            [entry("official", official), entry("stranger", stranger, primary=["riqn[trees=1]"])]
+        )
+    # Without the statement it is a variant.
+    ranks = sections([entry("official", official), entry("stranger", stranger)])[0].ranks
+    assert {str(s.entry): s.rank for s in ranks.standings if s.primary} == {
+        "riqn": 1, "persistence": 2, "clock": 3,
+    }  # fmt: skip
+
+
+def test_a_declared_row_has_all_cells_of_the_usual_one():
+    records = [r for r in board() if r.detector != "rf"]
+    lacking = [r for r in records if r.horizon == 1 or r.environment == "ant"]
+    with pytest.raises(ResultsError, match="lacks 2 cells that 'riqn' has"):
+        sections([entry("mine", lacking, primary=["riqn[h=10]"])])
+
+
+@pytest.mark.parametrize("lacks", ["cells", "seeds"])
+def test_part_of_a_simpler_row_does_not_stand_for_a_whole_one(lacks):
+    def rows(horizon, seeds, anomalies=("iid", "gravity")):
+        return [record("foo", [0.7] * SEEDS, seed=s, anomaly=a, horizon=horizon,
+                       deterministic=False) for s in range(seeds) for a in anomalies]  # fmt: skip
+
+    part = rows(1, 3, ("iid",)) if lacks == "cells" else rows(1, 1)
+    own = [entry("official", rows(10, 3)), entry("stranger", part)]
+    ranks = sections(own)[0].ranks
+    assert [(str(s.entry), s.rank) for s in ranks.standings if s.primary] == [("foo[h=10]", 1)]
+
+
 def test_page_and_tables_are_the_golden_files():
     found = sections(entries())
     first = found[0]
@@ -169,14 +221,91 @@ def test_page_and_tables_are_the_golden_files():
 
 
 def test_equals_share_a_rank_and_a_letter_and_the_better_stand_before_the_trivial():
-    table = layout.ranking(ranked(board()), {})
-    places = [(r[0], r[1], r[2], r[3]) for r in table.rows]
-    assert set(places[:2]) == {("1", "a", "riqn", "Δ=1"), ("1", "a", "riqn", "Δ=10")}
-    assert places[2:] == [
-        ("3", UNDEFINED, "persistence (trivial)", "Δ=1"),
-        ("4", UNDEFINED, "clock (trivial)", "Δ=1"),
-        (UNDEFINED, UNDEFINED, "rf", "Δ=1"),
+    other = [
+        dataclasses.replace(r, detector="mine", horizon=1) if r.horizon == 10 else r
+        for r in board()
     ]
+    table = layout.ranking(ranked(other), {})
+    places = [(r[0], r[1], r[3]) for r in table.rows]
+    assert set(places[:2]) == {("1", "a", "riqn"), ("1", "a", "mine")}
+    assert places[2:] == [
+        ("3", UNDEFINED, "persistence (trivial)"),
+        ("4", UNDEFINED, "clock (trivial)"),
+        (UNDEFINED, UNDEFINED, "rf"),
+    ]
+
+
+def test_a_further_row_of_a_detector_is_a_variant_that_pushes_nobody_down():
+    ranks = ranked(board())
+    places = [(r[0], r[3], r[4]) for r in layout.ranking(ranks, {}).rows]
+    assert set(places[:2]) == {("1", "riqn", "Δ=1"), ("1", "riqn (variant)", "Δ=10")}
+    assert [place[0] for place in places[2:]] == ["2", "3", UNDEFINED]
+    assert any("pushes no other row down" in line for line in layout.ranking_notes(ranks))
+    # Another row may be declared primary.
+    ten = {s.entry for s in ranks.standings if s.entry.horizon == 10}
+    others = {s.entry for s in ranks.standings if s.entry.detector != "riqn"}
+    standings = ranked(board(), ten | others).standings
+    assert {s.entry.horizon: s.primary for s in standings if s.entry.detector == "riqn"} == {
+        1: False, 10: True,
+    }  # fmt: skip
+
+
+def test_the_primary_row_has_default_parameters_and_the_smallest_horizon():
+    given = [Setting.of("a", 5), Setting.of("a", 1, {"x": 1}), Setting.of("a", 10),
+             Setting.of("b", 2, {"x": 1, "y": 1}), Setting.of("b", 2, {"z": 1})]  # fmt: skip
+    records = [record(s.detector, [0.5] * SEEDS, horizon=s.horizon, overrides=s.overrides)
+               for s in given]  # fmt: skip
+    assert primary_settings(records) == {given[0], given[4]}
+
+
+def test_a_primary_row_with_randomness_needs_three_seeds():
+    def seeds(n, **more):
+        return [record("riqn", [0.7] * SEEDS, seed=s, deterministic=False, **more)
+                for s in range(n)]  # fmt: skip
+
+    clock = record("clock", [0.5] * SEEDS)
+    for n in (1, 2):
+        ranks = ranked([*seeds(n), clock])
+        assert f"Not ranked: riqn, {n} of 3 detector seeds." in layout.ranking_notes(ranks)
+        assert ranks.ranking.ranks == {"clock": 1}
+    assert ranked([*seeds(3), clock]).ranking.ranks == {"riqn": 1, "clock": 2}
+    # A variant is marked anyway.
+    variant = seeds(1, horizon=10)
+    assert ranked([*seeds(3), *variant, clock]).ranking.ranks["riqn[h=10]"] == 1
+
+
+def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
+    ranks = ranked(board())
+    assert {s.entry.detector: s.alarm_rank for s in ranks.standings if s.primary} == {
+        "riqn": 1, "persistence": 2, "clock": 3, "rf": None,
+    }  # fmt: skip
+    slow = [
+        dataclasses.replace(r, per_trajectory=r.per_trajectory | {
+            "delay_censored_at_5pct": ([90.0] * SEEDS, [1.0] * SEEDS)
+        }) if r.detector == "riqn" else r
+        for r in board()
+    ]  # fmt: skip
+    by_alarms = {s.entry.detector: s.alarm_rank for s in ranked(slow).standings if s.primary}
+    assert by_alarms == {"riqn": 3, "persistence": 1, "clock": 2, "rf": None}
+    # A row in which it is undefined says so.
+    undefined = [
+        dataclasses.replace(r, per_trajectory=r.per_trajectory | {
+            "delay_censored_at_5pct": ([0.0] * SEEDS, [0.0] * SEEDS)
+        }) if (r.setting, r.environment) == (Setting("riqn"), "ant") else r
+        for r in board()
+    ]  # fmt: skip
+    notes = layout.ranking_notes(ranked(undefined))
+    assert "Without an alarm rank: riqn, undefined in 2 of 4 cells." in notes
+    assert not any("Without an alarm rank" in line for line in layout.ranking_notes(ranks))
+    # A row without that metric has its other rank all the same.
+    none = [
+        dataclasses.replace(r, per_trajectory={
+            k: v for k, v in r.per_trajectory.items() if k != "delay_censored_at_5pct"
+        })
+        for r in board()
+    ]  # fmt: skip
+    assert ranked(none).alarms.ranks == {}
+    assert ranked(none).ranking.ranks == ranks.ranking.ranks
 
 
 def test_a_row_with_failures_is_listed_with_its_state_and_no_rank():
@@ -219,7 +348,7 @@ def test_inputs_come_from_the_records_and_may_be_absent():
     ]  # fmt: skip
     without = [make_record("riqn", e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
     tables = [layout.ranking(ranked(r), {}) for r in (with_actions, without)]
-    assert [t.rows[0][4] for t in tables] == ["+actions", UNDEFINED]
+    assert [t.rows[0][5] for t in tables] == ["+actions", UNDEFINED]
 
 
 def test_settings_name_horizon_overrides_and_number_of_seeds():
@@ -227,7 +356,7 @@ def test_settings_name_horizon_overrides_and_number_of_seeds():
         record("riqn", [0.7] * SEEDS, horizon=5, seed=s, overrides={"members": 1}) for s in (0, 1)
     ]
     (one,) = layout.ranking(ranked(records), {}).rows
-    assert one[3] == "Δ=5, members=1, 2 seeds"
+    assert one[4] == "Δ=5, members=1, 2 seeds"
 
 
 def test_win_rate_is_the_mean_over_the_other_rows():
@@ -318,8 +447,9 @@ def test_other_splits_follow_from_the_most_data_to_the_least():
     ]  # fmt: skip
 
 
-def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone():
-    digests = published_digests()
+def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone(monkeypatch):
+    digests = {name: f"{i:02d}" * 32 for i, name in enumerate(("mini", "reduced", "standard"))}
+    monkeypatch.setattr(rendering, "published_digests", lambda: digests)
 
     def words(split, digest):
         own = [dataclasses.replace(record("riqn", [0.6] * SEEDS, digest=digest), split=split)]
@@ -332,10 +462,10 @@ def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone():
     assert "20 test seeds" in reduced
     assert "the numbers are not those of standard" in reduced
     mini = words("mini", digests["mini"])
-    assert "**Trial tier.** Per environment 40 training and 20 calibration" in mini
+    assert "**Trial tier.** Per environment 40 training and 40 calibration" in mini
     assert "episodes of at most 300 steps" in mini
     standard = words("standard", digests["standard"])
-    assert "own split.** Per environment 500 training and 100 calibration trajectories" in standard
+    assert "own split.** Per environment 500 training and 200 calibration trajectories" in standard
     assert "**Not a published split.**" in words("standard", digests["mini"])
     assert "**Not a published split.** mini@12345678 was" in words("mini@12345678", "12" * 32)
 
@@ -540,3 +670,20 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "out" / "tables").write_text("")
     with pytest.raises(OSError, match="cannot be written"):
         leaderboard_build.build(found, tmp_path / "out")
+
+
+def test_a_mean_is_within_its_interval_where_a_cell_is_undefined_for_one_seed():
+    def one(seed, anomaly, steps):
+        made = record("riqn", [0.7] * SEEDS, seed=seed, anomaly=anomaly)
+        term = [steps or 0.0] * SEEDS, [float(steps is not None)] * SEEDS
+        return dataclasses.replace(made, per_trajectory=made.per_trajectory | {"delay": term})
+
+    unlike = [one(0, "iid", None), one(0, "gravity", 5.0), one(1, "iid", 50.0),
+              one(1, "gravity", 5.0)]  # fmt: skip
+    other = [dataclasses.replace(r, detector="rf") for r in unlike]
+    found = Board([*unlike, *other])
+    first, second = found.entries
+    mean = found.mean(first, found.environments, found.anomalies, "delay", intervals=True)
+    # Of the means 5 and 27.5 of the two seeds.
+    assert (mean.low, mean.value, mean.high) == (5.0, 16.25, 27.5)
+    assert found.compare(first, second, "delay") == (16.25, 16.25, 2)

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.metrics import average_precision_score, roc_auc_score, roc_curve
+from sklearn.metrics import roc_auc_score
 
 from oodd_eval.metrics.auc import (
     AlarmRule,
     Contribution,
     alarm_contributions,
     auc,
-    auc_contributions,
     cell_contributions,
-    pooled_metrics,
+    smoothed,
 )
-from oodd_eval.metrics.catalogue import POOLED, RATIOS
+from oodd_eval.metrics.auc import auc_contributions as every_auc
+from oodd_eval.metrics.catalogue import GUARANTEED, METRICS, NAMES
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.evaluate import Rules, cell_metrics
 
@@ -28,6 +28,12 @@ RULE = AlarmRule(Standardization(mean=0.0, std=0.01), drift=0.0, threshold=1.0)
 
 def arrays(*sequences):
     return [np.array(s, dtype=float) for s in sequences]
+
+
+def auc_contributions(anomalous, twins, onsets, effects=None, standardization=None):
+    """The AUCs where every anomaly has its effect at once."""
+    own = standardization or Standardization(0.0, 1.0)
+    return every_auc(anomalous, twins, onsets, effects or onsets, own)
 
 
 def test_auc_counts_ties_half():
@@ -65,6 +71,72 @@ def test_matched_auc_compares_the_same_times_of_anomalous_and_twin():
     # Times 1 and 2: the twin ends there.
     found = auc_contributions(arrays([9, 1, 2, 50]), arrays([9, 1, 1]), [1])
     assert found["auc_matched"].value == (0.5 + 0.5 + 1 + 1) / 4
+
+
+def test_matched_comparisons_begin_at_the_effect_and_the_papers_at_the_onset():
+    # Between onset 1 and effect 3 both are the same.
+    anomalous, twins = arrays([0, 5, 5, 9, 9]), arrays([0, 5, 5, 1, 1])
+    found = auc_contributions(anomalous, twins, [1], [3])
+    assert found["auc_matched"].value == 1
+    assert found["auc"].value == found["auc_null"].value == 1
+    assert auc_contributions(anomalous, twins, [1])["auc_matched"].value == 14 / 16
+
+
+def test_an_effect_beyond_the_end_of_the_twin_leaves_nothing_to_match():
+    found = auc_contributions(arrays([0, 1, 2, 9, 9]), arrays([0, 1, 2]), [1], [3])
+    assert [found[n].n for n in ("auc_matched", "auc_smoothed", "auc")] == [0, 0, 1]
+
+
+def test_unpaired_compares_with_the_next_twin_where_both_are():
+    anomalous = arrays([0, 2, 2, 2], [0, 1, 1, 1], [0, 0, 0, 9])
+    twins = arrays([0, 0, 0, 0], [0, 1, 3, 0], [0, 0])
+    found = auc_contributions(anomalous, twins, [1, 1, 1])
+    # 2, 2, 2 against 1, 3, 0; 1 against 0; and 0 (the own twin ends there) against 0.
+    assert found["auc_unpaired"].numerator.tolist() == [2 / 3, 1, 0.5]
+
+
+def test_unpaired_loses_what_accumulated_noise_of_the_twin_gives_away():
+    """A random walk shared until the effect: a small step is seen beside the own twin only."""
+    rng = np.random.default_rng(8)
+    steps = rng.normal(size=(40, 300))
+    twins = [np.cumsum(s) for s in steps]
+    anomalous = [t + 0.5 * (np.arange(300) >= 150) for t in twins]
+    found = auc_contributions(anomalous, twins, [150] * 40)
+    assert found["auc_matched"].value > 0.505
+    assert abs(found["auc_unpaired"].value - 0.5) < 3 * 0.5 / math.sqrt(40)
+
+
+def test_smoothing_is_a_moving_average_from_the_mean_on():
+    expected, level = [], 0.0
+    for x in (1.0, -2.0, 0.5):
+        level = 0.97 * level + 0.03 * x
+        expected.append(level)
+    assert smoothed(np.array([NAN, NAN, 1.0, -2.0, 0.5]))[2:] == pytest.approx(expected)
+    assert np.isnan(smoothed(np.array([NAN, NAN, 1.0]))).tolist() == [True, True, False]
+    assert smoothed(np.array([0.0, np.inf, 0.0])).tolist() == [0, np.inf, np.inf]
+
+
+@given(st.integers(0, 9))
+def test_smoothed_auc_is_the_matched_auc_of_the_smoothed_scores(seed):
+    rng = np.random.default_rng(seed)
+    a, b = [list(rng.normal(size=(2, 30))) for _ in range(2)]
+    own = Standardization(0.3, 2.0)
+    found = auc_contributions(a, b, [10, 20], [12, 20], own)["auc_smoothed"]
+    means = [[smoothed((s - 0.3) / 2) for s in part] for part in (a, b)]
+    expected = auc_contributions(*means, [10, 20], [12, 20])["auc_matched"]
+    assert found.numerator.tolist() == expected.numerator.tolist()
+
+
+def test_smoothing_helps_the_memoryless_and_not_what_accumulates_already():
+    rng = np.random.default_rng(9)
+    twins = list(rng.normal(size=(20, 400)))
+    anomalous = [b + 0.5 * (np.arange(400) >= 200) for b in rng.normal(size=(20, 400))]
+    weak = auc_contributions(anomalous, twins, [200] * 20)
+    assert weak["auc_smoothed"].value > weak["auc_matched"].value + 0.2
+    sums = [[smoothed(s) for s in part] for part in (anomalous, twins)]
+    strong = auc_contributions(*sums, [200] * 20)
+    gained = strong["auc_smoothed"].value - strong["auc_matched"].value
+    assert gained < 0.1
 
 
 def test_placebo_compares_each_twin_with_the_next():
@@ -116,11 +188,14 @@ def test_a_miss_has_no_delay_and_the_whole_remainder_as_censored_delay():
     assert found["delay_censored"].numerator.tolist() == [1, 3]
 
 
-def test_false_alarms_are_pooled_over_defined_steps_before_the_onset():
-    anomalous = arrays([NAN, 2, 0, 9], [NAN, 0, 0, 9])
-    found = alarm_contributions(anomalous, arrays([0] * 4, [0, 2, 2, 0]), [3, 3], RULE)
-    assert (found["far"].numerator.sum(), found["far"].denominator.sum()) == (1, 4)
-    assert found["far_twin"].value == 2 / 8
+def test_false_alarms_are_pooled_over_defined_steps_from_row_20_to_the_onset():
+    start = [2.0] * 20
+    anomalous = arrays([*start, NAN, 2, 0, 9], [*start, NAN, 0, 0, 9], [*start, 9])
+    twins = arrays([0] * 4, [0, 2, 2, 0], [0])
+    found = alarm_contributions(anomalous, twins, [23, 23, 20], RULE)
+    assert found["far"].denominator.tolist() == [2, 2, 0]
+    assert found["far"].value == 1 / 4
+    assert found["far_twin"].value == 2 / 9
 
 
 def test_an_alarm_before_the_onset_is_not_a_detection():
@@ -148,80 +223,34 @@ def test_values_do_not_depend_on_the_order_of_trajectories(order):
     def pick(values):
         return [values[i] for i in order]
 
-    first = cell_contributions(scores, twins, onsets, RULE)
-    second = cell_contributions(pick(scores), pick(twins), pick(onsets), RULE)
-    for name in set(RATIOS) - {"auc_placebo"}:  # the placebo pairs neighbours
+    effects = [6, 10, 18, 25]
+    first = cell_contributions(scores, twins, onsets, effects, RULE)
+    second = cell_contributions(pick(scores), pick(twins), pick(onsets), pick(effects), RULE)
+    for name in set(METRICS) - {"auc_placebo", "auc_unpaired"}:  # these pair neighbours
         assert first[name].value == pytest.approx(second[name].value, nan_ok=True)
 
 
 def test_cell_has_every_metric_in_order():
     flat = [np.zeros(50)] * 2
-    assert list(cell_contributions(flat, flat, [10, 20], RULE)) == list(RATIOS)
+    assert list(cell_contributions(flat, flat, [10, 20], [10, 20], RULE)) == list(METRICS)
+    metrics, found = cell_metrics(
+        flat, flat, [10, 20], [10, 20], Rules.fit([np.zeros(50)] * 198), environment="ant"
+    )
+    assert set(metrics) == set(NAMES)
+    assert [n for n in found if n.endswith("_at_5pct")] == [f"{n}_at_5pct" for n in GUARANTEED]
+
+
+def test_a_threshold_without_end_is_undefined_and_alarms_nowhere():
+    # An odd episode rises above the constant that the even ones have: no threshold is above that.
+    calibration = [np.full(30, float(i % 2 and t > 30)) for i in range(40) for t in [i]]
+    rules = Rules.fit(calibration)
+    loud = [np.full(50, 9.0)] * 2
+    metrics, _ = cell_metrics(loud, loud, [10, 20], [10, 20], rules, environment="ant")
+    assert math.isnan(metrics["threshold_at_5pct"].value)
+    assert metrics["missed_at_5pct"].value == 1
 
 
 def test_a_ratio_without_denominator_is_undefined():
     empty = Contribution(np.zeros(2), np.zeros(2))
     assert math.isnan(empty.value)
     assert empty.n == 0
-
-
-POOLS = st.lists(
-    st.tuples(st.lists(st.integers(0, 6), min_size=2, max_size=30), st.integers(0, 30)),
-    min_size=1,
-    max_size=5,
-)
-
-
-@given(POOLS)
-def test_pooled_metrics_are_scikit_learns(trajectories):
-    scores = [np.array(values, float) for values, _ in trajectories]
-    onsets = [min(onset, len(values)) for values, onset in trajectories]
-    pool = np.concatenate(scores)
-    labels = np.concatenate([np.arange(len(s)) >= t for s, t in zip(scores, onsets, strict=True)])
-    found = pooled_metrics(scores, onsets)
-    assert list(found) == list(POOLED)
-    if labels.all() or not labels.any():
-        assert all(map(math.isnan, found.values()))
-        return
-    fpr, tpr, _ = roc_curve(labels, pool, drop_intermediate=False)
-    assert found["auc_pooled"] == pytest.approx(roc_auc_score(labels, pool))
-    assert found["average_precision"] == pytest.approx(average_precision_score(labels, pool))
-    assert found["fpr95"] == pytest.approx(fpr[np.argmax(tpr >= 0.95)])
-
-
-def test_pooled_metrics_by_hand():
-    # Positives 3, 1 | 2; negatives 2 | 0: at or above 3, 2, 1 there are 1, 2, 3 positives and
-    # 0, 1, 1 negatives.
-    found = pooled_metrics(arrays([NAN, 2, 3, 1], [0, 2]), [2, 1])
-    assert found["auc_pooled"] == (2 + 1 + 1.5) / 6
-    assert found["average_precision"] == pytest.approx((1 + 2 / 3 + 3 / 4) / 3)
-    assert found["fpr95"] == 1 / 2
-
-
-def test_95_percent_of_the_positives_are_enough_and_fewer_are_not():
-    # Twenty positives, the lowest below all negatives: nineteen are 95 %, eighteen are not.
-    negatives = [5.0, 4.0]
-    assert pooled_metrics(arrays([*negatives, *[9.0] * 19, 1.0]), [2])["fpr95"] == 0
-    assert pooled_metrics(arrays([*negatives, *[9.0] * 18, 4.5, 1.0]), [2])["fpr95"] == 1 / 2
-
-
-def test_pooled_metrics_without_a_class_are_undefined():
-    assert all(map(math.isnan, pooled_metrics(arrays([NAN, 1, 2]), [1]).values()))
-    assert all(map(math.isnan, pooled_metrics(arrays([1, 2, NAN]), [2]).values()))
-    assert all(map(math.isnan, pooled_metrics(arrays([NAN, NAN]), [1]).values()))
-
-
-def test_a_cell_has_the_pooled_metrics_last_without_interval_or_contribution():
-    rng = np.random.default_rng(3)
-    calibration = list(rng.normal(size=(4, 300)))
-    scores, twins = list(rng.normal(size=(3, 80))), list(rng.normal(size=(3, 80)))
-    scores[2][:] = NAN
-    metrics, contributions = cell_metrics(
-        scores, twins, [10, 20, 30], Rules.fit(calibration), environment="hopper"
-    )
-    assert list(metrics)[-3:] == list(POOLED)
-    expected = pooled_metrics(scores, [10, 20, 30])
-    for name in POOLED:
-        assert (metrics[name].value, metrics[name].n) == (expected[name], 2)
-        assert math.isnan(metrics[name].low)
-        assert name not in contributions

@@ -260,8 +260,20 @@ def test_few_trajectories_suffice(n):
 
 def test_another_width_is_refused(chart):
     x = NOMINAL[0]
-    with pytest.raises(TrajectoryError, match=r"fitted on .*\(4, 1\) .* trajectory of \(2, 1\)"):
+    with pytest.raises(TrajectoryError, match=r"fitted on .*\(4, 0\) .* trajectory of \(2, 0\)"):
         chart.score(Trajectory(x.observations[:, :2], x.actions))
+
+
+def test_another_number_of_action_columns_is_refused_where_it_matters(chart, chart_a):
+    x = NOMINAL[0]
+    np.testing.assert_array_equal(chart.score(x.without_actions()), chart.score(x))
+    with pytest.raises(TrajectoryError, match=r"fitted on .*\(4, 1\) .* trajectory of \(4, 0\)"):
+        chart_a.score(x.without_actions())
+
+
+def test_a_fit_without_actions_is_the_fit_of_observations(chart):
+    alone = make_mewma().fit([x.without_actions() for x in NOMINAL])
+    np.testing.assert_array_equal(alone.score(NOMINAL[0]), chart.score(NOMINAL[0]))
 
 
 @pytest.mark.parametrize(
@@ -269,7 +281,7 @@ def test_another_width_is_refused(chart):
     [
         ([], "0 trajectories, of which 0 have at least 3 transitions"),
         ([x[:1] for x in NOMINAL], "12 trajectories, of which 0 have"),
-        ([NOMINAL[0], Trajectory(np.zeros((9, 2)), np.zeros((8, 1)))], r"\[\(2, 1\), \(4, 1\)\]"),
+        ([NOMINAL[0], Trajectory(np.zeros((9, 2)), np.zeros((8, 1)))], r"\[\(2, 0\), \(4, 0\)\]"),
     ],
 )
 def test_unusable_training_data_are_refused(nominal, message):

@@ -103,8 +103,9 @@ def test_each_detector_directory_lifts_out(name, tmp_path):
         source = path.read_text().replace(f"oodd_{name}", package.name)
         # The detectors get names of their own too: two plug-ins may not offer the same name.
         path.write_text(re.sub(r'(\bname=)"', r'\1"lifted-', source))
-    text = readme_pyproject().replace("oodd_range", package.name)
-    text = text.replace("oodd-range", f"oodd-lifted-{name}").replace("range =", f"lifted-{name} =")
+    text = readme_pyproject().replace("oodd_bounds", package.name)
+    text = text.replace("oodd-bounds", f"oodd-lifted-{name}")
+    text = text.replace("bounds =", f"lifted-{name} =")
     (project / "pyproject.toml").write_text(text)
     pip("install", "--no-deps", "--no-build-isolation", "--target", str(target), str(project))
     listed = subprocess.run(
@@ -123,12 +124,12 @@ def test_tutorial_detector_installs_and_runs(tmp_path):
     code = re.search(r"```python\n(.*?)```", (ROOT / "detectors/README.md").read_text(), re.DOTALL)[
         1
     ]
-    (project / "oodd_range.py").write_text(code)
-    text = readme_pyproject() + '\n[tool.hatch.build.targets.wheel]\ninclude = ["oodd_range.py"]\n'
+    (project / "oodd_bounds.py").write_text(code)
+    text = readme_pyproject() + '\n[tool.hatch.build.targets.wheel]\ninclude = ["oodd_bounds.py"]\n'
     (project / "pyproject.toml").write_text(text)
     pip("install", "--no-deps", "--no-build-isolation", "--target", str(target), str(project))
     ran = subprocess.run(
-        [sys.executable, "-m", "oodd_eval", "run", "--detector", "range", "--env", "cartpole"],
+        [sys.executable, "-m", "oodd_eval", "run", "--detector", "bounds", "--env", "cartpole"],
         env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "PYTHONPATH": str(target)},
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import pytest
 from helpers_plugins import install
+from oodd_trivial import Clock
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
-from oodd_eval.plugins.baselines import Clock
 from oodd_eval.plugins.contract import DetectorSpec
 from oodd_eval.plugins.discovery import Offer, discover, offer_of
 from oodd_eval.plugins.parameters import (
@@ -25,7 +25,7 @@ OFFER = """
 def oodd_detectors():
     return offer({name}=Good)
 """
-BUILT_IN = {"random", "persistence", "clock"}
+BUILT_IN = {"random", "persistence", "clock", "comb", "range", "mahalanobis"}
 
 
 def broken(plugins):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution, mean_of
-from oodd_eval.metrics.bootstrap import percentiles, samples
+from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
 
 CELLS = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid")]
@@ -112,8 +112,9 @@ def test_interval_of_a_difference_is_the_paired_one():
     rng = np.random.default_rng(4)
     a, b = drawn(rng, n=12), drawn(rng, n=12)
     ranking = rank({"a": a, "b": b}, resamples=2000)
-    first, second = (samples([(c[0], 0, x[0][c]) for c in CELLS]) for x in (a, b))
-    expected = percentiles(first - second)
+    first, second = (sample_cells([drawn_cell(c[0], 0, x[0][c]) for c in CELLS]) for x in (a, b))
+    value = np.mean([a[0][c].value - b[0][c].value for c in CELLS])
+    expected = bounds(first - second, value, [12, 12])
     one, other = p_of(ranking, "a", "b"), p_of(ranking, "b", "a")
     assert (one.low, one.high) == pytest.approx(expected)
     assert (other.difference, other.low, other.high) == (-one.difference, -one.high, -one.low)
@@ -239,3 +240,48 @@ def test_win_rates_are_over_common_defined_cells():
     assert math.isnan(win_rates(values)["a", "c"])
     values["b"][CELLS[1]] = NAN
     assert win_rates(values)["a", "b"] == 1.0
+
+
+# -- primary rows and variants --------------------------------------------------------------------
+
+
+def ladder(levels, n=30):
+    """Rows that differ by far more than noise, best first."""
+    rng = np.random.default_rng(7)
+    return {name: drawn(rng, 0.9 - 0.1 * i, n) for i, name in enumerate(levels)}
+
+
+def test_variants_push_nobody_down_and_have_the_rank_that_they_would_have():
+    rows = ladder(["a-tuned", "a", "b-tuned", "b", "c"])
+    ranking = rank(rows, primary={"a", "b", "c"})
+    assert ranking.ranks == {"a-tuned": 1, "a": 1, "b-tuned": 2, "b": 2, "c": 3}
+    assert list(rank(rows).ranks.values()) == [1, 2, 3, 4, 5]
+    assert ranking.groups == [("a",), ("b",), ("c",)]
+    assert not any(c.first in ("a-tuned", "b-tuned") and c.second in ("a-tuned", "b-tuned")
+                   for c in ranking.comparisons)  # fmt: skip
+
+
+def test_primary_rows_are_told_apart_as_if_there_were_no_variants():
+    rng = np.random.default_rng(8)
+    rows = {name: drawn(rng, mean) for name, mean in (("a", 0.66), ("b", 0.62), ("c", 0.6))}
+    alone = rank(rows, resamples=4000)
+    variants = {f"v{i}": drawn(rng, 0.6) for i in range(20)}
+    beside = rank(rows | variants, primary=rows, resamples=4000)
+    among = [c for c in beside.comparisons if {c.first, c.second} <= rows.keys()]
+    assert among == alone.comparisons
+    assert beside.groups == alone.groups
+    assert {name: beside.ranks[name] for name in rows} == alone.ranks
+
+
+def test_a_variants_tests_are_corrected_as_those_of_one_more_primary_row():
+    rng = np.random.default_rng(9)
+    rows = {name: drawn(rng, mean) for name, mean in (("a", 0.65), ("b", 0.6), ("v", 0.62))}
+    beside = rank(rows, primary={"a", "b"}, resamples=4000)
+    whole = rank(rows, resamples=4000)
+    for c in beside.comparisons:
+        if "v" in (c.first, c.second):
+            assert c.p_holm == p_of(whole, c.first, c.second).p_holm
+
+
+def test_without_a_primary_row_every_variant_is_first():
+    assert rank(ladder("ab"), primary=()).ranks == {"a": 1, "b": 1}

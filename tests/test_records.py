@@ -70,7 +70,7 @@ def test_fields_are_those_of_the_specification():
         "environment", "anomaly", "group", "horizon", "seed", "split", "split_digest", "status",
         "reason", "metrics", "counts", "seconds_fit", "seconds_score", "peak_rss_mb",
         "provenance", "per_trajectory", "plugin_source", "overrides", "inputs", "strength", "limit",
-        "scores", "steps_scored",
+        "scores", "steps_scored", "alarm", "deterministic", "brief",
     }  # fmt: skip
 
 

@@ -33,7 +33,7 @@ def parts(split, environment):
 
 def test_reduced_differs_from_standard_in_sizes_alone():
     reduced, standard = SPLITS["reduced"], SPLITS["standard"]
-    sizes = {"train": 500, "calibration": 100, "test": 50}
+    sizes = {"train": 500, "calibration": 200, "test": 50}
     assert replace(reduced, name="standard", **sizes) == standard
     assert (reduced.train, reduced.calibration, reduced.test) == (500, 50, 20)
 
@@ -56,6 +56,7 @@ def test_a_smaller_split_holds_the_first_trajectories_of_each_part(built, enviro
             assert np.array_equal(few.rewards(i), many.rewards(i)), (name, i)
         if name.startswith("test/"):
             assert few.onsets.tolist() == many.onsets.tolist()[:n]
+            assert few.effects.tolist() == many.effects.tolist()[:n]
 
 
 def test_sizes_alone_make_another_digest(built):

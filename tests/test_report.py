@@ -11,9 +11,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.cli.terminal import TerminalReporter, summary
-from oodd_eval.metrics.bootstrap import percentiles, samples
-from oodd_eval.metrics.catalogue import UNDEFINED
-from oodd_eval.results.record import Metric
+from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import Board, boards, contribution
 from oodd_eval.results.tables.layout import Table
@@ -47,12 +45,12 @@ def cells(table, row):
 
 
 def test_ranking_is_by_mean_matched_auc_with_failures_last():
-    ranked = layout.by_environment(Board(example()))
+    ranked = layout.separability(Board(example()))
     assert [row[0] for row in ranked.rows] == ["riqn", "persistence", "clock", "rf"]
     # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
     assert cells(ranked, 0) == {
-        "detector": "riqn", "mean": "67.5", "sensor": "70.0", "dynamics": "65.0", "ant": "67.5",
-        "hopper": "67.5",
+        "detector": "riqn", "mean": "67.5", "sensor": "70.0", "dynamics": "65.0",
+        "smoothed": "50.0", "unpaired": "50.0", "ant": "67.5", "hopper": "67.5",
     }  # fmt: skip
     # One environment failed: no mean over the other pretends to be one over all.
     assert cells(ranked, 3)["mean"] == "timeout"
@@ -114,7 +112,7 @@ def test_a_mean_over_fewer_cells_is_marked():
     board = Board([
         make_record("riqn"), make_record("riqn", anomaly="drift"), make_record("rf"),
     ])  # fmt: skip
-    assert {row[0]: row[1] for row in layout.by_environment(board).rows} == {
+    assert {row[0]: row[1] for row in layout.separability(board).rows} == {
         "riqn": "50.0",
         "rf": "50.0*",
     }
@@ -125,7 +123,7 @@ def test_seeds_are_averaged_into_one_row():
         make_record(seed=0, values={"auc_matched": [0.4, 0.4]}),
         make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
     ])  # fmt: skip
-    assert [row[:2] for row in layout.by_environment(board).rows] == [["riqn", "60.0"]]
+    assert [row[:2] for row in layout.separability(board).rows] == [["riqn", "60.0"]]
     # Trajectories agree within each seed, so that the interval is the seeds' alone.
     value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
     assert (value.low, value.high) == (0.4, 0.8)
@@ -139,8 +137,10 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     board = Board(records)
     value = board.mean(board.entries[0], ["hopper"], ["iid", "drift"], "auc_matched",
                        intervals=True)  # fmt: skip
-    expected = percentiles(
-        samples([("hopper", 0, contribution(r, "auc_matched")) for r in records])
+    expected = bounds(
+        sample_cells([drawn_cell("hopper", 0, contribution(r, "auc_matched")) for r in records]),
+        0.45,
+        [2],
     )
     assert (value.low, value.high) == pytest.approx(expected)
     assert value.value == pytest.approx((0.5 + 0.4) / 2)
@@ -177,10 +177,19 @@ def test_persistence_that_wins_is_named_for_both_metrics():
     ]
 
 
-def test_the_clocks_auc_is_no_finding():
+@pytest.mark.parametrize("simple", ["range", "mahalanobis", "rf-ewma", "comb"])
+def test_every_simple_row_is_named(simple):
+    board = Board([make_record(), make_record(simple, values={"auc_matched": [0.7, 0.7]})])
+    assert layout.findings(board) == [
+        f"{simple} beats riqn in mean matched AUC: 70.0 against 50.0 over 1 cell."
+    ]
+
+
+@pytest.mark.parametrize("blind", ["clock", "comb"])
+def test_the_auc_of_what_knows_the_time_alone_is_no_finding(blind):
     board = Board([
         make_record("riqn", values={"auc": [0.5, 0.5]}),
-        make_record("clock", values={"auc": [1.0, 1.0]}),
+        make_record(blind, values={"auc": [1.0, 1.0]}),
     ])  # fmt: skip
     assert layout.findings(board) == []
 
@@ -212,15 +221,53 @@ def test_no_text_breaks_a_markdown_table(text):
     assert "<" not in unescaped.replace("\\<", "")
 
 
-def test_pooled_metrics_are_a_table_of_their_own_and_no_part_of_a_report():
-    one, two = make_record("riqn", anomaly="iid"), make_record("riqn", anomaly="drift")
-    for record, value in ((one, 0.25), (two, 0.5)):
-        record.metrics.update(auc_pooled=Metric(value), fpr95=Metric(float("nan")))
-    table = layout.pooled(Board([one, two]))
-    assert table.header == ["detector", "pooled AUC", "FPR95"]
-    assert table.rows == [["riqn", "37.5", UNDEFINED]]
-    assert layout.pooled(Board(example())) is None
-    assert "pooled" not in report([one, two])
+ALARMS = {
+    "false_episodes_at_5pct": [0, 1], "early_at_5pct": [0, 0], "delay_at_5pct": [4, None],
+    "missed_at_5pct": [0, 1], "found_within_20_at_5pct": [1, 0],
+    "found_within_100_at_5pct": [1, 0], "found_within_100_null_at_5pct": [0, 1],
+}  # fmt: skip
+
+
+def test_guaranteed_alarms_stand_beside_false_episodes_with_their_interval():
+    board = Board([make_record(anomaly=a, values=ALARMS) for a in ("iid", "drift")])
+    table = layout.guaranteed(board)
+    assert "Guaranteed alarms at 5 %" in table.title
+    assert "at most 5 % of nominal episodes" in table.note
+    assert cells(table, 0) == {
+        "detector": "riqn", "delay": "4.0", "missed": "50.0", "found within 20": "50.0",
+        "found within 100": "50.0", "found within 100 null": "50.0",
+        "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
+    }  # fmt: skip
+    nulls = layout.guaranteed(board, nulls=True)
+    assert nulls.header[-2:] == ["found within 100", "found within 100 null"]
+
+
+def test_the_table_of_alarms_is_of_the_strictest_level_where_5_percent_is_not_offered():
+    assert layout.guaranteed(Board([make_record()])) is None
+    few = {"false_episodes_at_10pct": [0, 0], "missed_at_10pct": [0, 1]}
+    assert "at 10 %" in layout.guaranteed(Board([make_record(values=few)])).title
+    both = few | {"missed_at_1pct": [1, 1], "false_episodes_at_1pct": [0, 0]}
+    assert "at 1 %" in layout.guaranteed(Board([make_record(values=both)])).title
+    assert len(layout.all_alarms(Board([make_record(values=both | ALARMS)]))) == 3
+
+
+def test_separability_and_guaranteed_alarms_come_before_the_papers_layout():
+    records = [make_record(values=ALARMS), make_record("rf", values=ALARMS)]
+    one = reporter()
+    one.tables(records)
+    for text in (printed(one), report(records)):
+        places = [text.index(t) for t in ("Separability", "Guaranteed alarms", "AUC (%), delay")]
+        assert places == sorted(places)
+
+
+def test_brief_cells_are_marked_and_named():
+    records = [make_record(anomaly="iid", brief=True), make_record(anomaly="drift")]
+    board = Board(records)
+    (row,) = layout.by_anomaly(board, board.entries[0]).rows
+    assert row == ["Hopper", "50.0\N{DAGGER}", "50.0"]
+    (note,) = [line for line in layout.notes(board) if "Brief" in line]
+    assert "hopper/iid. Half" in note
+    assert not any("Brief" in line for line in layout.notes(Board(records[1:])))
 
 
 def test_a_transposed_table_exchanges_rows_and_columns():

@@ -82,6 +82,13 @@ def test_interval_is_the_bootstrap_written_out():
     assert (estimate.low, estimate.high) == pytest.approx(tuple(expected))
 
 
+def test_an_interval_is_as_wide_as_the_trajectories_that_count_make_it():
+    four = everywhere("riqn", [0.1, 0.2, 0.3, 0.4], environments=["ant"])
+    with_undefined = everywhere("riqn", [0.1, 0.2, 0.3, 0.4, *[None] * 16], environments=["ant"])
+    few, many = (combine(r, [side(RIQN)], ["ant"]) for r in (four, with_undefined))
+    assert many.high - many.low > 0.9 * (few.high - few.low)
+
+
 def test_difference_is_paired_over_test_seeds():
     records = everywhere("riqn", [0.9, 0.3]) + everywhere("rf", [0.8, 0.2])
     estimate = combine(records, [side(RIQN), side(RF, -1.0)], ["ant", "hopper"])
@@ -267,19 +274,19 @@ def test_caption_names_data_seeds_and_a_reduced_tier(tmp_path):
     records = everywhere("riqn", [0.8, 0.6]) + everywhere("riqn", [0.8, 0.6], seed=1)
     records += everywhere("riqn", [0.8, 0.6], horizon=10)
     numbers = compute(table, Estimator(records))
-    whole = header(tier=TIERS["full"], split="standard", train=500, calibration=100, test=50)
+    whole = header(tier=TIERS["full"], split="standard", train=500, calibration=200, test=50)
     text = caption(whole, table, numbers)
     assert "Detector seeds: 2 for Δ = 1; 1 for Δ = 10." in text
     assert "50 test seeds" in text
     assert "reduced" not in text
     reduced = dataclasses.replace(whole, tier=TIERS["reduced"], split="reduced", calibration=50,
                                   test=20)  # fmt: skip
-    less = "the first 50 of 100 calibration trajectories and 20 of 50 test seeds of split standard"
+    less = "the first 50 of 200 calibration trajectories and 20 of 50 test seeds of split standard"
     assert less in caption(reduced, table, numbers)
     assert less in returns_caption(reduced)
     assert less in front_page(reduced, records, [], [])
     mini = caption(header(), table, numbers)
-    assert "(**reduced**: split standard has 500 training trajectories, 100 calibration " in mini
+    assert "(**reduced**: split standard has 500 training trajectories, 200 calibration " in mini
     assert "and 50 test seeds, and episodes end after 300 steps here)" in mini
     own = caption(dataclasses.replace(whole, split="mine", test=10), table, numbers)
     assert "(**reduced**: split standard has 50 test seeds)" in own

@@ -78,7 +78,7 @@ def test_files_of_a_reproduction(finished):
     for name in ("table-2", "figure-horizon", "delays"):
         assert {f"tables/{name}.md", f"tables/{name}.csv"} <= names
     page = (finished / "README.md").read_text()
-    assert "10 of 72 fits and scorings have been run." in page
+    assert "10 of 90 fits and scorings have been run." in page
     # Ensembles share no setup but RIQN's with the delays; N-RIQN was not run at all.
     assert "not run" in (finished / "tables" / "table-3.md").read_text()
     assert "(2 of 7)" in page
@@ -240,7 +240,7 @@ def test_a_budget_that_is_used_up_leaves_units_and_says_so(tiny_split, quick, tm
     # A unit that was begun may end before the budget is looked at.
     assert re.search(r"the budget is used up: \d+ units left", said)
     page = (tmp_path / "out" / "README.md").read_text()
-    assert re.search(r"\b[0-8] of 72 fits and scorings have been run\.", page)
+    assert re.search(r"\b[0-8] of 90 fits and scorings have been run\.", page)
     assert "**Unfinished**" in page
     assert "not run |" in page
 

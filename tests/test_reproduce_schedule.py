@@ -38,8 +38,8 @@ def make_unit(setting=RIQN, fit="a", seed=0, key=""):
 
 def test_every_unit_is_there_once(mini):
     labels = [(u.environment, u.label) for u in mini]
-    assert len(set(labels)) == len(labels) == 252
-    assert len({u.scores_key for u in mini}) == 252
+    assert len(set(labels)) == len(labels) == 315
+    assert len({u.scores_key for u in mini}) == 315
     assert {u.environment for u in mini} == set(ENVIRONMENTS)
     assert all(len(u.anomalies) == 8 for u in mini)
 
@@ -77,12 +77,16 @@ def test_only_what_is_wanted_is_laid_out():
     assert len(units) == 7 * (3 + 1 + 1)
 
 
-def test_horizons_and_sampling_sizes_share_a_fit_that_the_first_of_them_makes(mini):
+def test_sampling_sizes_share_a_fit_that_the_first_of_them_makes(mini):
     ant = [u for u in mini if u.environment == "ant" and u.seed == 0]
     own = [u for u in ant if u.detector == "riqn" and "members" not in u.setting.overrides]
-    assert len({u.fit_key for u in own}) == 1
-    assert own[0].setting == RIQN
-    assert len({u.fit_key for u in ant if u.detector == "npn"}) == 1
+    near = [u for u in own if u.setting.horizon == 1]
+    assert len(near) > 1
+    assert len({u.fit_key for u in near}) == 1
+    assert near[0].setting == RIQN
+    # Networks are trained on their own samples where they are to forecast further than one step.
+    assert len({u.fit_key for u in own}) == len({u.setting.horizon for u in own}) == 3
+    assert len({u.fit_key for u in ant if u.detector == "rf"}) == 1
 
 
 def test_a_shared_fit_is_counted_once_and_a_kept_one_not_at_all():

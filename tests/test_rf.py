@@ -9,9 +9,10 @@ import pytest
 from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
 from oodd_eval.plugins.forecasting import FeatureScale
+from oodd_eval.plugins.parameters import parameters_of
 
 pytest.importorskip("sklearn")
-from oodd_rf import make_rf
+from oodd_rf import make_rf, make_rf_ewma, oodd_detectors
 from oodd_rf.detector import MEMBERS
 from oodd_rf.windows import Rows
 
@@ -180,3 +181,57 @@ def test_offering_and_making_import_no_sklearn():
         "sys.exit('sklearn' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# rf-ewma
+
+
+def smoothed(scores, weight):
+    """The running mean, one step after the other, from the first defined score on."""
+    found, z = [], None
+    for s in scores:
+        if not np.isnan(s):
+            z = s if z is None else z + weight * (s - z)
+        found.append(np.nan if z is None else z)
+    return found
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_ewma_is_the_running_mean_of_rf_from_its_first_score(horizon):
+    raw = fitted(horizon=horizon).score(episode(90))
+    made = make_rf_ewma(**SMALL, horizon=horizon).fit(NOMINAL)
+    found = made.score(episode(90))
+    np.testing.assert_allclose(found, smoothed(raw, 0.03), rtol=1e-12)
+    assert found[horizon] == raw[horizon]
+    alone = make_rf_ewma(**SMALL, horizon=horizon, weight=1.0).fit(NOMINAL)
+    np.testing.assert_array_equal(alone.score(episode(90)), raw)
+
+
+def test_ewma_begins_anew_in_every_episode():
+    made = make_rf_ewma(**SMALL).fit(NOMINAL)
+    x, wild = episode(90), Trajectory(100 * episode(91).observations)
+    together = made.score_many([wild, x])
+    np.testing.assert_array_equal(together[1], made.score(x))
+    for row in wild.observations:
+        made.update(row)
+    made.reset()
+    live = [made.update(row) for row in x.observations]
+    np.testing.assert_allclose(live, made.score(x), rtol=1e-12)
+
+
+def test_ewma_takes_over_a_fit_of_rf(rf, tmp_path):
+    rf.save(tmp_path)
+    made = make_rf_ewma(**SMALL)
+    made.load(tmp_path)
+    x = episode(90)
+    np.testing.assert_allclose(made.score(x), smoothed(rf.score(x), 0.03), rtol=1e-12)
+
+
+def test_ewma_shares_the_fits_of_rf_and_is_its_own_statistic():
+    rf, ewma = oodd_detectors()
+    assert (ewma.name, ewma.alarm, rf.alarm) == ("rf-ewma", "score", "cusum")
+    assert rf.fit_name == ewma.fit_name == "rf"
+    known = parameters_of(ewma.parameters)
+    assert {n for n in known if known[n].decides == "fit"} == set(parameters_of(rf.parameters))
+    with pytest.raises(UsageError, match="parameter 'weight' of rf-ewma is 0, expected more than"):
+        make_rf_ewma(weight=0)

@@ -11,16 +11,15 @@ from types import SimpleNamespace
 import h5py
 import pytest
 from helpers_plugins import install
+from oodd_trivial import Clock
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
 from oodd_eval.names import expression, memory_bytes, seconds, select, whole_numbers
 from oodd_eval.plugins import hookimpl
-from oodd_eval.plugins.baselines import Clock
-from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation import Channel
-from oodd_eval.plugins.isolation.supervisor import Limits, Request, _send
+from oodd_eval.plugins.isolation.supervisor import Limits, _send
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.scoring.executors import RunSettings
@@ -132,7 +131,7 @@ STATES = {
     "unavailable": ("unavailable", r'needs no_such: pip install "oodd-x\[y\]"'),
     "no-detector": ("invalid", "the factory returned int, expected an object with the methods"),
     "prints": ("ok", ""),
-    "leavesthreads": ("ok", ""),
+    "leavesthreads": ("incompatible", "threads or processes run on after fit"),
     "clock": ("ok", ""),
 }
 
@@ -409,7 +408,7 @@ def test_rescoring_with_another_split_is_refused(tiny_split, tmp_path):
 
 def test_a_worker_is_told_no_names(tiny_split, tmp_path):
     data = load_split(tiny_split).environment("cartpole")
-    request = Request("trivial", "clock", {}, 0, 1, len(data.train))
+    request = {"plugin": "trivial", "detector": "clock", "train": len(data.train)}
     anomalous = data.anomalous("iid")
     with (tmp_path / "sent").open("wb") as file:
         chunks = [list(anomalous), list(data.twins)]
@@ -421,33 +420,6 @@ def test_a_worker_is_told_no_names(tiny_split, tmp_path):
     data.close()
 
 
-def test_trajectories_to_score_come_shuffled_together(tiny_split, monkeypatch, tmp_path):
-    seen = tmp_path / "seen"
-    code = f"""
-    class Spy(Good):
-        def score(self, x):
-            with open({str(seen)!r}, "ab") as file: file.write(x.observations[:1].tobytes())
-            return super().score(x)
-
-    @hookimpl
-    def oodd_detectors(): return offer(spy=Spy)
-    """
-    install(monkeypatch, tmp_path / "plugin", "spy", code)
-    run_tiny(tiny_split, ["spy"])
-    with_names = load_split(tiny_split).environment("cartpole")
-    ordered = [*with_names.calibration, *with_names.twins, *with_names.anomalous("iid")]
-    firsts = [x.observations[0].tobytes() for x in ordered]
-    size = len(firsts[0])
-    content = seen.read_bytes()
-    order = [content[i : i + size] for i in range(0, len(content), size)]
-    assert sorted(order[: len(firsts)]) == sorted(firsts)
-    assert order[: len(firsts)] != firsts
-    again = order[len(firsts) :]
-    assert len(set(again)) == len(again) == PROBES
-    assert set(again) <= set(firsts)
-    with_names.close()
-
-
 def test_an_error_of_reading_data_is_kept_for_the_caller():
     def broken():
         yield from ()
@@ -455,7 +427,7 @@ def test_an_error_of_reading_data_is_kept_for_the_caller():
 
     reading, writing = os.pipe()
     with pytest.raises(OSError, match="disk gone"):
-        _send(_child(writing), Request("trivial", "clock", {}, 0, 1, 0), broken(), [])
+        _send(_child(writing), {"train": 0}, broken(), [])
     os.close(reading)
 
 

@@ -70,7 +70,17 @@ def test_sensors_are_a_fifth_of_all_from_the_list_each_in_its_turn(draws):
     for anomaly in ("iid", "shutdown", "calibration", "drift"):
         chosen = [d.parameters["sensors"] for d in found[anomaly]]
         assert {len(set(c)) for c in chosen} == {CHOSEN[environment]}
-        assert {s for c in chosen for s in c} == set(VALUES["varying_sensors"][environment])
+        assert {s for c in chosen for s in c} == set(VALUES["sensors"][environment])
+
+
+def test_contacts_are_never_drawn(draws):
+    environment, _, found = draws
+    contacts = {i for i, s in enumerate(ENVIRONMENTS[environment].sensors) if "contact" in s.name}
+    drawn = {s for a in ("iid", "shutdown", "calibration", "drift")
+             for d in found[a] for s in d.parameters["sensors"]}  # fmt: skip
+    assert len(contacts) == {"lunarlander": 2, "ant": 4, "halfcheetah": 6, "hopper": 1,
+                             "walker2d": 2}.get(environment, 0)  # fmt: skip
+    assert not contacts & drawn
 
 
 def test_drawn_attributes_span_their_range_and_keep_2_percent_off_nominal(draws):

@@ -5,15 +5,19 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers_simulate import SEEDS, Reflex, record
+from hypothesis import given
+from hypothesis import strategies as st
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.simulate import record as recording
 from oodd_eval.data.simulate.anomalies import Draw
 from oodd_eval.data.simulate.record import TwinTooShortError, record_nominal, record_seed
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError, UnknownNameError
 
 CAP = 120
@@ -23,7 +27,9 @@ def digest(episode):
     sha = hashlib.sha256()
     for array in (episode.trajectory.observations, episode.trajectory.actions, episode.rewards):
         sha.update(array.tobytes())
-    sha.update(json.dumps([episode.onset, episode.parameters, episode.redraws]).encode())
+    sha.update(
+        json.dumps([episode.onset, episode.effect, episode.parameters, episode.redraws]).encode()
+    )
     return sha.hexdigest()
 
 
@@ -36,20 +42,22 @@ def episodes(request):
     return environment, found
 
 
-def test_episodes_equal_their_twin_bit_for_bit_before_the_onset_and_differ_after(episodes):
+def test_episodes_equal_their_twin_bit_for_bit_before_the_effect_and_differ_at_it(episodes):
     environment, found = episodes
     twin = found[None].trajectory
+    assert (found[None].onset, found[None].effect) == (None, None)
     assert set(found) == {None, *ANOMALIES}
     for anomaly in ANOMALIES:
-        onset, x = found[anomaly].onset, found[anomaly].trajectory
+        onset, effect = found[anomaly].onset, found[anomaly].effect
+        x = found[anomaly].trajectory
         assert 30 <= onset <= int(0.6 * twin.transitions), anomaly
-        assert x.transitions > onset + 5, anomaly
-        before = x.observations[:onset]
-        assert before.tobytes() == twin.observations[:onset].tobytes(), (environment, anomaly)
-        # The action onto the onset was chosen before anything could be seen.
-        assert x.actions[:onset].tobytes() == twin.actions[:onset].tobytes(), anomaly
-        n = min(len(x), len(twin))
-        assert (x.observations[onset:n] != twin.observations[onset:n]).any() or len(x) != len(twin)
+        assert onset <= effect < min(len(x), len(twin)), anomaly
+        assert x.transitions > onset + 20 or found[anomaly].redraws == 100, anomaly
+        before = x.observations[:effect]
+        assert before.tobytes() == twin.observations[:effect].tobytes(), (environment, anomaly)
+        assert (x.observations[effect] != twin.observations[effect]).any(), (environment, anomaly)
+        # The action onto the effect was chosen before anything could be seen.
+        assert x.actions[:effect].tobytes() == twin.actions[:effect].tobytes(), anomaly
 
 
 def test_sensor_anomalies_touch_their_sensors_alone_at_the_onset(episodes):
@@ -194,9 +202,79 @@ def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeyp
         return Draw("drift", {})
 
     monkeypatch.setattr(recording, "draw", idle)
-    with pytest.raises(SimulationError, match="no acceptable drift episode of cartpole with seed"):
-        record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=50)
+    with pytest.raises(SimulationError, match="no drift episode of cartpole with seed 1 differs"):
+        record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
     assert len(calls) == 101
+
+
+def scripted(monkeypatch, script):
+    """Let attempts have given onsets, lengths and first differing rows; None: equal to the twin."""
+    twin = recording.Episode(
+        Trajectory(np.zeros((101, 4)), np.eye(2)[[0] * 100]), np.zeros(100, "f4"), False, 7
+    )
+    attempts = []
+
+    def run(environment, seed, policy, cap, replayed, anomaly):
+        _, length, effect = script(len(attempts) - 1)
+        rows = np.zeros((length + 1, 4), np.float32)
+        if effect is not None:
+            rows[effect:, 1] = 1
+        actions = np.eye(2, dtype=np.float32)[[0] * length]
+        return rows, actions, np.zeros(length, "f4"), True, {"attempt": len(attempts) - 1}
+
+    def generator(environment, anomaly, seed, attempt):
+        attempts.append(attempt)
+        onset, _, _ = script(attempt)
+        return SimpleNamespace(integers=lambda low, high: onset)
+
+    monkeypatch.setattr(recording, "_run", run)
+    monkeypatch.setattr(recording, "generator", generator)
+    found = recording._record_anomalous("cartpole", "iid", twin, None, None)
+    assert attempts == list(range(len(attempts)))
+    return found, len(attempts)
+
+
+def test_a_tail_of_20_is_redrawn_and_one_of_21_is_kept(monkeypatch):
+    # Attempt k ends 18 + k transitions beyond its onset; T > onset + 20 holds first for k = 3.
+    found, attempts = scripted(monkeypatch, lambda k: (40 + k, 58 + 2 * k, 45 + k))
+    assert (found.trajectory.transitions - found.onset, found.redraws, attempts) == (21, 3, 4)
+    assert (found.onset, found.effect, found.parameters) == (43, 48, {"attempt": 3})
+
+
+def test_where_every_tail_is_short_the_longest_that_differs_from_its_twin_is_kept(monkeypatch):
+    def script(k):
+        # The longest of all, attempt 50, equals its twin; 20 and 70 tie behind it.
+        tail = {50: 60, 20: 15, 70: 15}.get(k, 1 + k % 10)
+        return 35, 35 + tail, None if k == 50 else 36
+
+    found, attempts = scripted(monkeypatch, script)
+    assert (attempts, found.redraws) == (101, 100)
+    assert found.parameters == {"attempt": 20}
+    assert found.trajectory.transitions == 50
+
+
+def test_an_episode_that_only_outlives_its_twin_equals_it(monkeypatch):
+    # Row 101 is the first that the twin does not have.
+    found, _ = scripted(monkeypatch, lambda k: (40, 150, 101 if k < 2 else 100))
+    assert (found.redraws, found.effect) == (2, 100)
+
+
+def brute_force(rows, twin):
+    for t, (x, y) in enumerate(zip(rows, twin, strict=False)):
+        if list(x) != list(y):
+            return t
+    return None
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 1)), min_size=1, max_size=9),
+    st.lists(st.tuples(st.integers(0, 1), st.integers(0, 1)), min_size=1, max_size=9),
+    st.integers(0, 9),
+)
+def test_the_first_difference_is_that_of_a_loop(rows, twin, shared):
+    rows = twin[:shared] + rows
+    arrays = np.array(rows, np.float32), np.array(twin, np.float32)
+    assert recording.first_difference(*arrays) == brute_force(rows, twin)
 
 
 def test_unknown_names_are_refused_before_anything_runs():

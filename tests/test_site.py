@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import helpers_site
@@ -24,9 +23,8 @@ from oodd_eval.leaderboard.site.data import (
     selections,
     site_data,
 )
-from oodd_eval.metrics.catalogue import METRICS, POOLED, RATIOS, metric_info
+from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.results.curve_file import read_curves
-from oodd_eval.results.record import Metric
 
 GOLDEN = Path(__file__).parent / "golden" / "site-index.html"
 COMMITTED = Path(__file__).parents[1] / "leaderboard" / "site" / site.PAGE
@@ -278,7 +276,7 @@ def test_every_metric_of_the_page_is_explained(page):
             assert data["metrics"][metric]["meaning"]
             assert data["metrics"][metric]["title"][0].isupper()
     assert set(data["boards"][0]["intervals"]) <= set(WITH_INTERVALS)
-    assert set(RATIOS) >= {name.partition("_at_")[0] for name in WITH_INTERVALS}
+    assert set(WITH_INTERVALS) <= set(NAMES)
 
 
 def test_the_papers_digits_are_those_of_its_table(page):
@@ -295,25 +293,12 @@ def test_undefined_values_are_null(tmp_path):
     assert data["boards"][0]["rows"][0]["cells"][0]["values"][index] is None
 
 
-def test_pooled_metrics_are_among_those_of_a_board_that_has_them(tmp_path):
-    record = helpers_site.make_record()
-    pooled = {name: Metric(0.25) for name in POOLED}
-    helpers_site.write_entry(tmp_path, "one", [replace(record, metrics=record.metrics | pooled)])
-    data, _ = site_data(sections(read_entries(tmp_path)))
-    (board,) = data["boards"]
-    assert board["metrics"][-3:] == list(POOLED)
-    assert board["rows"][0]["cells"][0]["values"][-3:] == [0.25, 0.25, 0.25]
-    assert data["metrics"]["fpr95"] == {
-        "title": "FPR95", "meaning": METRICS["fpr95"].summary, "kind": "percent", "higher": False,
-    }  # fmt: skip
-
-
 def test_a_board_on_which_everything_failed_has_its_metrics(tmp_path):
     record = helpers_site.make_record(status="oom", reason="needed 9 GB")
     helpers_site.write_entry(tmp_path, "one", [record])
     data, _ = site_data(sections(read_entries(tmp_path)))
-    assert data["boards"][0]["metrics"] == list(RATIOS)
-    assert set(RATIOS) == set(data["metrics"])
+    assert data["boards"][0]["metrics"] == list(METRICS)
+    assert set(METRICS) == set(data["metrics"])
 
 
 def test_an_entry_says_who_ran_it_again_and_on_which_source(tmp_path):

@@ -16,7 +16,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data import layout as splits_format
 from oodd_eval.data import parts
 from oodd_eval.data import split as splits
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.layout import check_layout, content_digest, write_environment
 from oodd_eval.data.parts import TWINS, TrajectorySet
 from oodd_eval.data.split import load_split
@@ -49,6 +49,7 @@ def test_what_was_written_is_read_back(tiny_split):
         found, wrote = data.anomalous(anomaly), make_group("hopper", seeds, 60, anomaly)
         assert found.seeds.tolist() == list(seeds)
         assert found.onsets.tolist() == wrote["onsets"].tolist()
+        assert found.effects.tolist() == wrote["effects"].tolist()
         assert found.parameters[1] == {"anomaly": anomaly, "unit": "µ", "seed": 9_600_001}
         rows = np.concatenate([x.observations for x in found])
         np.testing.assert_array_equal(rows, wrote["observations"].astype("f4"))
@@ -74,6 +75,51 @@ def test_twins_are_identical_before_the_onset_only(tiny_split):
         assert (x.observations[onset] != twin.observations[onset]).any()
 
 
+def brute_force_effect(x, twin):
+    """The first row that both have and that differs."""
+    for t in range(min(len(x), len(twin))):
+        if any(a != b for a, b in zip(x.observations[t], twin.observations[t], strict=True)):
+            return t
+    return None
+
+
+def test_the_effect_is_the_first_row_that_differs_from_the_twin(tiny_split):
+    data = load_split(tiny_split).environment("cartpole")
+    for anomaly in ANOMALIES:
+        part = data.anomalous(anomaly)
+        expected = [brute_force_effect(*pair) for pair in zip(part, data.twins, strict=True)]
+        assert part.effects.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("tails", "brief"), [((19, 19, 90), True), ((5, 20, 90), False), ((19, 20), True)]
+)
+def test_a_part_is_brief_when_its_median_tail_is_under_20(tmp_path, tails, brief):
+    file = tmp_path / "x.h5"
+    with h5py.File(file, "w") as stored:
+        group = stored.create_group("test/iid")
+        group["offsets"] = np.append(0, np.cumsum([30 + tail for tail in tails]))
+        group["onsets"] = group["effects"] = np.full(len(tails), 30)
+        group["seeds"] = group["redraws"] = np.zeros(len(tails), np.int64)
+        part = parts.AnomalousSet(stored, "test/iid")
+        assert part.tails.tolist() == list(tails)
+        assert part.brief is brief
+
+
+def test_names_and_units_are_in_file_and_manifest_alike(tiny_split):
+    split = load_split(tiny_split)
+    for environment in split.environments:
+        data, info = split.environment(environment), ENVIRONMENTS[environment]
+        assert (data.sensors, data.actions) == (info.sensors, info.actions)
+        entry = split.manifest["environments"][environment]
+        named = [(q["name"], q["unit"]) for q in entry["sensors"] + entry["actions"]]
+        assert named == [(q.name, q.unit) for q in data.sensors + data.actions]
+        with h5py.File(tiny_split / f"{environment}.h5") as stored:
+            assert stored["names/sensors"].dtype.kind == "S"
+            first = json.loads(stored["names/sensors"][0])
+        assert first == {"name": data.sensors[0].name, "unit": data.sensors[0].unit}
+
+
 def test_a_trajectory_set_is_a_sequence(tiny_split):
     train = load_split(tiny_split).environment("cartpole").train
     assert len(train[1:3]) == 2
@@ -86,7 +132,9 @@ def test_iteration_holds_one_block_of_trajectories_in_memory(tmp_path, monkeypat
     monkeypatch.setattr(parts, "_ROWS", 800)
     monkeypatch.setattr(parts, "_KEPT", 1000)
     groups = {"train": make_group("ant", range(60), 400)}
-    write_environment(tmp_path / "ant.h5", groups.items(), "")
+    info = ENVIRONMENTS["ant"]
+    write_environment(tmp_path / "ant.h5", groups.items(), "",
+                      sensors=info.sensors, actions=info.actions)  # fmt: skip
     whole = groups["train"]["observations"].astype("f4").nbytes
     with h5py.File(tmp_path / "ant.h5") as file:
         train = TrajectorySet(file, "train")
@@ -156,10 +204,49 @@ def test_verify_lists_every_group_with_what_was_expected_and_found(copy):
     with h5py.File(copy / "hopper.h5", "r+") as file:
         file[TWINS]["rewards"][0] += 1
     checks = list(load_split(copy).verify())
-    assert len(checks) == 2 * 11
+    assert len(checks) == 2 * (11 + 1)
     bad = [c for c in checks if not c.ok]
     assert [(c.file, c.group) for c in bad] == [("hopper.h5", TWINS)]
     assert bad[0].expected != bad[0].found
+
+
+def test_a_changed_name_is_noticed_in_file_and_manifest(copy):
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        names = file["names/sensors"]
+        names[0] = names[0].replace(b"torso", b"other")
+    with pytest.raises(DigestError, match=r"hopper\.h5, group names: .*expected \w{64}, found"):
+        load_split(copy).environment("hopper")
+    digest = json.loads((copy / "manifest.json").read_text())["digest"]
+
+    def rename(manifest):
+        manifest["environments"]["cartpole"]["sensors"][0]["unit"] = "km"
+
+    edit_manifest(copy, rename)
+    with pytest.raises(SplitError, match=f"names the digest {digest}, .*: it was edited"):
+        _ = load_split(copy).digest
+
+
+@pytest.mark.parametrize("kind", ["sensors", "actions"])
+def test_a_file_without_names_or_with_too_few_is_refused(copy, kind):
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        names = file[f"names/{kind}"][:]
+        del file[f"names/{kind}"]
+    with pytest.raises(SplitError, match=rf"hopper\.h5 lacks the names of its {kind}"):
+        load_split(copy).environment("hopper")
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        file[f"names/{kind}"] = names[1:]
+    few = len(names) - 1
+    with pytest.raises(SplitError, match=rf"group train: .* expected {few} columns, since names"):
+        load_split(copy).environment("hopper")
+
+
+def test_writing_refuses_names_that_do_not_fit_the_columns(tmp_path):
+    info = ENVIRONMENTS["cartpole"]
+    groups = {"train": make_group("cartpole", range(2), 60)}
+    with pytest.raises(SplitError, match=r"observations have shape \(123, 4\), expected 3 columns"):
+        write_environment(tmp_path / "x.h5", groups.items(), "",
+                          sensors=info.sensors[1:], actions=info.actions)  # fmt: skip
+    assert not list(tmp_path.iterdir())
 
 
 # Names
@@ -227,7 +314,7 @@ def test_unknown_environment_and_anomaly_are_named(tiny_split):
 def test_an_edited_value_names_file_group_and_both_digests(copy):
     expected = load_split(copy).manifest["environments"]["hopper"]["groups"]["test/iid"]["sha256"]
     with h5py.File(copy / "hopper.h5", "r+") as file:
-        file["test/iid"]["onsets"][0] += 1
+        file["test/iid"]["redraws"][0] += 1
         found = content_digest(file["test/iid"])
     with pytest.raises(DigestError) as error:
         load_split(copy).environment("hopper")
@@ -248,6 +335,20 @@ def test_a_missing_file_is_named(copy):
     (copy / "hopper.h5").unlink()
     with pytest.raises(SplitNotFoundError, match=r"hopper\.h5 is missing"):
         load_split(copy).environment("hopper")
+
+
+def test_a_part_that_the_manifest_does_not_name_is_refused(copy):
+    """Its content has no digest to be compared with."""
+
+    def forget(manifest):
+        del manifest["environments"]["hopper"]["groups"]["test/iid"]
+        digest = splits_format.split_digest(manifest["environments"], manifest["definition"])
+        manifest["digest"] = digest
+
+    edit_manifest(copy, forget)
+    for read in (lambda s: s.environment("hopper"), lambda s: list(s.verify())):
+        with pytest.raises(SplitError, match=r"hopper.h5 holds the groups .*test/iid.*, expected"):
+            read(load_split(copy))
 
 
 def test_a_missing_group_and_a_missing_dataset_are_named(copy):
@@ -282,8 +383,12 @@ def replaced(dataset, change):
          "actions has 120 rows, expected 121 for 2 trajectories"),
         ("train", replaced("offsets", lambda a: a * [1, 0, 1]),
          "rise by at least 1 per trajectory"),
+        ("test/iid", replaced("effects", lambda a: a - 1),
+         r"trajectory 0 has its onset at row (\d+) and its effect at row \d+, expected"),
+        ("test/iid", replaced("effects", lambda a: a + np.array([0, 40])),
+         r"trajectory 1 has its onset .* expected 0 <= onset <= effect <= 61, the last row"),
     ],
-    ids=["objects", "dtype", "rows", "offsets"],
+    ids=["objects", "dtype", "rows", "offsets", "effect-before-onset", "effect-behind-the-end"],
 )  # fmt: skip
 def test_another_layout_is_refused(tmp_path, part, change, message):
     anomaly = part.removeprefix("test/") if part != "train" else None
@@ -309,7 +414,12 @@ def test_an_edited_manifest_is_noticed(copy):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(schema=2), "schema: .* 1, got 2"),
+        (lambda m: m.update(schema="2"), "schema: .*, got '2'"),
+        (lambda m: m["environments"]["hopper"].pop("sensors"), "hopper.sensors: Field required"),
+        (
+            lambda m: m["environments"]["hopper"]["actions"][0].update(unit=1),
+            "hopper.actions.0.unit: .*, got 1",
+        ),
         (lambda m: m.pop("definition"), "definition: Field required"),
         (lambda m: m["environments"]["hopper"].pop("groups"), "hopper.groups: Field required"),
         (lambda m: m.update(environments=[]), r"environments: .*, got \[\]"),
@@ -324,6 +434,12 @@ def test_an_edited_manifest_is_noticed(copy):
 def test_a_damaged_manifest_says_what_is_wrong(copy, change, message):
     edit_manifest(copy, change)
     with pytest.raises(SplitError, match=message):
+        _ = load_split(copy).digest
+
+
+def test_a_split_of_another_layout_says_what_to_do(copy):
+    edit_manifest(copy, lambda m: m.update(schema=1))
+    with pytest.raises(SplitError, match=r"schema 1, expected 2: .*; remove it, then build or"):
         _ = load_split(copy).digest
 
 

@@ -13,7 +13,7 @@ from helpers_plugins import install
 from helpers_processes import environment
 from helpers_split import make_group, make_split
 
-from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.layout import (
     Blocks,
     content_digest,
@@ -60,7 +60,7 @@ def write_large_split(directory):
         }  # fmt: skip
     entry = json.loads((directory / "manifest.json").read_text())["environments"]["hopper"]
     entry["groups"]["train"] = facts
-    entry["digest"] = environment_digest(entry["groups"])
+    entry["digest"] = environment_digest(entry)
     definition = SplitDefinition("large", TRAJECTORIES, 4, 3, None, 9)
     write_manifest(directory, definition, {"hopper": entry}, generator=1, versions={})
     return directory, size
@@ -221,13 +221,15 @@ def test_a_trajectory_file_that_was_cut_short_is_an_error(in_file):
 
 def test_a_dataset_in_blocks_is_the_same_file(tmp_path):
     train = make_group("hopper", range(9), 700)
-    whole = write_environment(tmp_path / "whole.h5", [("train", train)], "")
+    info = ENVIRONMENTS["hopper"]
+    names = {"sensors": info.sensors, "actions": info.actions}
+    whole = write_environment(tmp_path / "whole.h5", [("train", train)], "", **names)
     for parts in (1, 2, 50):
         blocks = {
             name: Blocks(array.shape, lambda a=array, n=parts: np.array_split(a, n))
             for name, array in train.items()
         }
-        found = write_environment(tmp_path / "blocks.h5", [("train", blocks)], "")
+        found = write_environment(tmp_path / "blocks.h5", [("train", blocks)], "", **names)
         assert found == whole | {"file": "blocks.h5"}
         assert (tmp_path / "blocks.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
 

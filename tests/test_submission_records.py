@@ -1,9 +1,16 @@
 """Tampered records: each is refused with a message that names the field."""
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
+from helpers_records import make_record
 from helpers_submission import Draft, assert_refused
+
+from oodd_eval.leaderboard.verify import records
+from oodd_eval.leaderboard.verify.files import Findings
+from oodd_eval.results.record import Metric
 
 FIRST = 0
 """The first record: persistence on cartpole, iid."""
@@ -113,6 +120,74 @@ def delay_beyond_a_miss(d):
     r["delay"][0][0] = r["delay_censored"][0][0] = 7.0
     for name in ("missed", "delay", "delay_censored"):
         d.consistent(OTHER, name)
+
+
+def guaranteed(name, top=None, bottom=None):
+    """Change the terms of the first trajectory."""
+
+    def change(d):
+        sides = d.records[FIRST]["per_trajectory"][f"{name}_at_10pct"]
+        for side, value in zip(sides, (0.0 if top is None else top, bottom), strict=True):
+            if value is not None:
+                side[0] = value
+        d.consistent(FIRST, f"{name}_at_10pct")
+
+    return change
+
+
+def defined(d):
+    """A trajectory without an early alarm."""
+    return d.records[FIRST]["per_trajectory"]["missed_at_10pct"][1].index(1.0)
+
+
+def early_and_counted(d):
+    d.records[FIRST]["per_trajectory"]["early_at_10pct"][0][defined(d)] = 1.0
+    d.consistent(FIRST, "early_at_10pct")
+
+
+def found_otherwise(d):
+    found, i = d.records[FIRST]["per_trajectory"]["found_within_100_at_10pct"][0], defined(d)
+    found[i] = 1 - found[i]
+    d.consistent(FIRST, "found_within_100_at_10pct")
+
+
+def found_sooner(d):
+    """A delay of 2 that counts in the longer span alone as not found."""
+    i = defined(d)
+    for name, value in (("delay", 2.0), ("delay_censored", 2.0), ("missed", 0.0),
+                        ("found_within_20", 1.0), ("found_within_100", 0.0)):  # fmt: skip
+        tops, bottoms = d.records[FIRST]["per_trajectory"][f"{name}_at_10pct"]
+        tops[i], bottoms[i] = value, 1.0
+        d.consistent(FIRST, f"{name}_at_10pct")
+
+
+def counted_in_one_span(d):
+    """A trajectory without matched AUC, whose twin ended, cannot count in one span alone."""
+    i, r = defined(d), d.records[FIRST]["per_trajectory"]
+    for name in ("auc_matched", "auc_smoothed", "auc_placebo", "auc_unpaired",
+                 "found_within_100_at_10pct"):  # fmt: skip
+        r[name][0][i] = r[name][1][i] = 0.0
+        d.consistent(FIRST, name)
+
+
+def other_twins_alarm(d):
+    for i, r in enumerate(d.records[:8]):
+        alarmed = r["per_trajectory"]["false_episodes_at_10pct"][0]
+        alarmed[:] = [1 - k for k in alarmed]
+        d.consistent(i, "false_episodes_at_10pct")
+
+
+def randomness_denied_in_one(d):
+    d.records[FIRST]["deterministic"] = not d.records[FIRST]["deterministic"]
+
+
+def deterministic_seeds_differ(d):
+    for r in d.records[:8]:
+        r["deterministic"] = True
+    for r in json.loads(json.dumps(d.records[:8])):
+        r |= {"seed": 1, "scores": "persistence-cartpole-seed1"}
+        d.records.append(r)
+    top("auc_matched", 0, 0.25, consistent=True)(d)
 
 
 def twins_differ_within_a_fit(d):
@@ -228,19 +303,48 @@ CASES = {
         field("metrics.auc_best", {"value": 1.0, "low": 1.0, "high": 1.0, "n": 3}),
         "metrics.auc_best",
     ),
-    "half-a-calibrated-rule": (drop("metrics.missed_at_1pct"), "metrics.missed_at_1pct"),
+    "half-a-level": (drop("metrics.missed_at_10pct"), "metrics.missed_at_10pct"),
     "negative-threshold": (
-        metric("threshold_at_1pct", value=-0.1), "metrics.threshold_at_1pct.value",
+        metric("threshold_at_10pct", value=-0.1), "metrics.threshold_at_10pct.value",
     ),
     "threshold-with-interval": (
-        metric("threshold_at_1pct", low=0.1), "metrics.threshold_at_1pct.low",
+        metric("threshold_at_10pct", low=0.1), "metrics.threshold_at_10pct.low",
     ),
     "thresholds-of-a-fit-differ": (
-        metric("threshold_at_1pct", value=123.0), "metrics.threshold_at_1pct.value",
+        metric("threshold_at_10pct", value=123.0), "metrics.threshold_at_10pct.value",
     ),
     "twins-of-a-fit-differ": (twins_differ_within_a_fit, "per_trajectory.far_twin"),
-    "pooled-above-one": (metric("fpr95", value=1.5), "metrics.fpr95.value"),
-    "pooled-undefined": (metric("fpr95", value=None), "metrics.fpr95.value"),
+    "early-and-counted": (early_and_counted, "per_trajectory.missed_at_10pct"),
+    "late-and-uncounted": (
+        guaranteed("found_within_20", bottom=0.0), "per_trajectory.found_within_20_at_10pct",
+    ),
+    "found-sooner-and-not-later": (found_sooner, "per_trajectory.found_within_100_at_10pct"),
+    "counted-in-one-span": (counted_in_one_span, "per_trajectory.found_within_100_at_10pct"),
+    "found-without-an-alarm": (found_otherwise, "per_trajectory.found_within_100_at_10pct"),
+    "twin-alarms-and-is-missed": (other_twins_alarm, "per_trajectory.false_episodes_at_10pct"),
+    "share-of-a-share": (
+        guaranteed("false_episodes", 0.5), "per_trajectory.false_episodes_at_10pct",
+    ),
+    "early-undefined": (guaranteed("early", bottom=0.0), "per_trajectory.early_at_10pct"),
+    "exact-interval": (
+        metric("false_episodes_at_10pct", high=0.99), "metrics.false_episodes_at_10pct.high",
+    ),
+    "a-level-too-many": (
+        lambda d: d.records[FIRST]["metrics"].update(
+            missed_at_5pct=d.records[FIRST]["metrics"]["missed_at_10pct"]
+        ),
+        "metrics.missed_at_5pct",
+    ),
+    "smoothed-unlike-matched": (
+        lambda d: [s.__setitem__(0, 0.0) for s in d.records[0]["per_trajectory"]["auc_smoothed"]],
+        "per_trajectory.auc_smoothed",
+    ),
+    "two-statistics": (field("alarm", "score"), "alarm"),
+    "unknown-statistic": (field("alarm", "blind"), "alarm"),
+    "randomness-denied-in-one": (randomness_denied_in_one, "deterministic"),
+    "deterministic-seeds-differ": (deterministic_seeds_differ, "per_trajectory"),
+    "brief-in-one": (field("brief", True), "brief"),
+    "number-as-brief": (field("brief", 1), "brief"),
     "text-as-number": (metric("auc", value="0.9"), "metrics.auc.value"),
     "truth-as-number": (metric("auc", value=True), "metrics.auc.value"),
     "truth-as-n": (metric("auc", n=True), "metrics.auc.n"),
@@ -259,7 +363,7 @@ CASES = {
     "formula-as-inputs": (field("inputs", "=HYPERLINK(1)"), "inputs"),
     "text-as-steps": (field("steps_scored", "many"), "steps_scored"),
     "more-tests-than-can-be-drawn": (field("counts.test", 10**6), "counts.test"),
-    "other-schema": (field("schema", 3), "schema"),
+    "other-schema": (field("schema", 2), "schema"),
     "old-protocol": (field("protocol", 0), "protocol"),
     "html-in-detector": (every("detector", "<b>best</b>"), "detector"),
     "html-in-plugin": (every("plugin", "<script>:x"), "plugin"),
@@ -310,23 +414,39 @@ def test_a_tampered_record_is_refused_by_its_field(submissions, tmp_path, case):
     assert_refused(draft.verdict(), field_name)
 
 
+@pytest.mark.parametrize(
+    ("larger", "smaller", "sound"),
+    [
+        (1.0, 2.0, True),
+        (2.0, 1.0, False),
+        (1.0, None, True),
+        (None, None, True),
+        (None, 1.0, False),
+    ],
+)
+def test_a_smaller_level_has_no_lower_threshold_and_null_is_infinite(larger, smaller, sound):
+    thresholds = {"threshold_at_10pct": larger, "threshold_at_5pct": smaller}
+    metrics = {n: Metric(math.nan if v is None else v) for n, v in thresholds.items()}
+    findings = Findings()
+    record = replace(make_record(), metrics=metrics)
+    records._check_threshold("here", "threshold_at_5pct", record, findings)
+    assert [p.field for p in findings.problems] == (
+        [] if sound else ["metrics.threshold_at_5pct.value"]
+    )
+
+
 def counts_of_another_split(d):
     for r in d.records:
         r["counts"]["train"] = 60
 
 
 def invented_remainder(d):
-    """Miss, in both detectors, a trajectory that every rule had an alarm in."""
-    suffixes = ("", "_at_1pct")
+    """Miss, in both detectors, a trajectory that the rule had an alarm in."""
     cell, i = next(
         (cell, i)
         for cell in range(OTHER)
         for i in range(3)
-        if not any(
-            d.records[at]["per_trajectory"][f"missed{s}"][0][i]
-            for at in (cell, cell + OTHER)
-            for s in suffixes
-        )
+        if not any(d.records[at]["per_trajectory"]["missed"][0][i] for at in (cell, cell + OTHER))
     )
     for at in (cell, cell + OTHER):
         r = d.records[at]["per_trajectory"]
@@ -339,16 +459,23 @@ def invented_remainder(d):
 def invented_steps(name):
     def change(d):
         for r in d.records:
-            for suffix in ("", "_at_1pct"):
-                r["per_trajectory"][name + suffix][1][0] = 500.0
+            r["per_trajectory"][name][1][0] = 500.0
         for i in range(len(d.records)):
-            for suffix in ("", "_at_1pct"):
-                d.consistent(i, name + suffix)
+            d.consistent(i, name)
 
     return change
 
 
+def not_found_at_once(d):
+    """An alarm at the effect that is said to be in rows that the twin lacks."""
+    i, r = defined(d), d.records[FIRST]["per_trajectory"]
+    for name in ("delay", "delay_censored", "missed", "found_within_20", "found_within_100"):
+        r[f"{name}_at_10pct"][0][i], r[f"{name}_at_10pct"][1][i] = 0.0, 1.0
+        d.consistent(FIRST, f"{name}_at_10pct")
+
+
 AGAINST_SPLIT = {
+    "found-in-shared-rows": (not_found_at_once, "per_trajectory.found_within_20_at_10pct"),
     "counts": (counts_of_another_split, "counts.train"),
     "remainder": (invented_remainder, "per_trajectory.delay_censored"),
     "steps-before-onset": (invented_steps("far"), "per_trajectory.far"),

@@ -152,6 +152,12 @@ SCORES = {
     "missing-part": (inside(lambda f: f.__delitem__("test/drift")), "test/drift"),
     "attribute-of-a-file": (inside(lambda f: f.attrs.update(code="import os")), "attribute code"),
     "negative-cost": (inside(lambda f: f.attrs.update(seconds_fit=-1.0)), "attribute seconds_fit"),
+    "negative-order": (
+        inside(lambda f: f["calibration"].attrs.update(order=-1.0)), "attribute order",
+    ),
+    "cost-of-a-part": (
+        inside(lambda f: f["calibration"].attrs.update(seconds_fit=1.0)), "attribute seconds_fit",
+    ),
     "attribute-of-data": (
         inside(lambda f: f["calibration/scores"].attrs.update(x=1)), "calibration/scores",
     ),
@@ -235,7 +241,7 @@ def test_scores_confirm_every_metric(submissions):
     assert any("qualifies for 're-scored'" in note for note in verdict.findings.notes)
 
 
-@pytest.mark.parametrize("name", ["auc_matched", "far", "missed_at_1pct", "delay_null"])
+@pytest.mark.parametrize("name", ["auc_matched", "far", "missed_at_10pct", "delay_null"])
 def test_scores_catch_a_consistent_lie(submissions, tmp_path, name):
     draft = Draft(submissions.full, tmp_path)
     record = draft.records[0]
@@ -246,20 +252,14 @@ def test_scores_catch_a_consistent_lie(submissions, tmp_path, name):
     assert_refused(verdict, f"metrics.{name}.value", "but the scores give")
 
 
-def test_a_pooled_metric_is_caught_too(submissions, tmp_path):
-    draft = Draft(submissions.full, tmp_path)
-    draft.records[0]["metrics"]["fpr95"]["value"] *= 0.5
-    assert_refused(draft.verdict(submissions.split), "metrics.fpr95.value", "the scores give")
-
-
-def test_a_calibrated_rule_that_the_scores_do_not_support_is_refused(submissions, tmp_path):
+def test_a_level_may_not_be_left_out(submissions, tmp_path):
     draft = Draft(submissions.full, tmp_path)
     for record in draft.records:
         for part in ("metrics", "per_trajectory"):
             for name in list(record[part]):
-                if name.endswith("_at_1pct"):
+                if name.endswith("_at_10pct"):
                     del record[part][name]
-    assert_refused(draft.verdict(submissions.split), "metrics.far_at_1pct", "is missing")
+    assert_refused(draft.verdict(submissions.split), "metrics.missed_at_10pct", "is missing")
 
 
 def test_without_the_split_nothing_is_recomputed_and_this_is_said(submissions, tmp_path):

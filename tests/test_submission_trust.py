@@ -1,5 +1,6 @@
 """Levels of trust: how each is reached with a command, and what does not reach it."""
 
+import dataclasses
 import json
 import shutil
 
@@ -9,7 +10,11 @@ from helpers_submission import Draft, assert_refused
 
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
+from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.leaderboard.entry import read_entry
 from oodd_eval.leaderboard.verify import verify_entry
+from oodd_eval.leaderboard.verify.files import Findings
+from oodd_eval.leaderboard.verify.trust import compare_rerun
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
 
@@ -124,6 +129,21 @@ def test_a_run_again_with_the_same_numbers_is_granted(submissions, tmp_path, aga
     assert "nothing here confirms it without a run of yours" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("field", "other"), [("deterministic", False), ("alarm", "score"), ("inputs", "")]
+)
+def test_a_run_again_has_the_same_statements_on_the_detector(submissions, tmp_path, field, other):
+    draft = only_persistence(submissions, tmp_path)
+    records = read_entry(draft.path).records
+    assert all(getattr(r, field) != other for r in records)
+    findings = Findings()
+    places = {str(i): r for i, r in enumerate(records)}
+    assert compare_rerun(places, records, findings).confirmed
+    again = [dataclasses.replace(r, **{field: other}) for r in records]
+    assert not compare_rerun(places, again, findings).confirmed
+    assert {p.field for p in findings.problems} == {field}
+
+
 def test_fresh_seeds_confirm_within_intervals(submissions, tmp_path, fresh, capsys):
     draft = only_persistence(submissions, tmp_path)
     code = verify(submissions, draft.path, "--rerun", fresh)
@@ -190,7 +210,7 @@ OTHERWISE = {
     "distribution": ({"plugin": "oodd-x:trivial"}, "plugin", "oodd-x:trivial"),
     "failure": ({"status": "timeout", "reason": "slow"}, "status", "timeout"),
     "limited": ({"limit": 3}, "split", "is none without --limit"),
-    "protocol": ({"protocol": 2}, "split", "is none without --limit"),
+    "protocol": ({"protocol": PROTOCOL + 1}, "split", "is none without --limit"),
     "another-row": ({"horizon": 5}, "persistence", "run it again in one at least"),
     "sizes": ({"counts": {"train": 1, "calibration": 20, "test": 3}}, "counts", "of the entry"),
 }  # fmt: skip

@@ -216,7 +216,7 @@ def test_a_check_is_called_with_a_factory_alone():
             check(Good, horizon=2, parameters={"power": 2.0})
         except CheckSkipped:
             skipped.add(check.name)
-    assert skipped == {"declared-parameters", "shared-fit"}
+    assert skipped == {"declared-parameters", "shared-fit", "inputs", "deterministic"}
 
 
 def test_what_needs_more_than_there_is_names_the_check_to_look_at():

@@ -1,12 +1,16 @@
 """`Trajectory`: what a detector is handed."""
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.data.trajectory import Trajectory, pad
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError
+from oodd_eval.plugins.isolation import Channel
+from oodd_eval.plugins.isolation.worker import TrajectoryFile
 
 
 def episode(rows=5, sensors=2, actions=1):
@@ -21,6 +25,38 @@ def test_has_one_more_observation_than_transitions():
 def test_a_single_observation_is_a_trajectory():
     alone = episode(1)
     assert (len(alone), alone.transitions, alone.action_dim) == (1, 0, 1)
+
+
+def test_without_actions_their_width_is_zero():
+    rows = np.arange(6.0).reshape(3, 2)
+    for alone in (Trajectory(rows), Trajectory(rows, None), Trajectory(rows, np.zeros((2, 0)))):
+        assert alone.actions.shape == (2, 0)
+        assert (alone.transitions, alone.action_dim) == (2, 0)
+        assert alone[:2].actions.shape == (1, 0)
+    assert Trajectory(rows[:1]).actions.shape == (0, 0)
+
+
+def test_actions_can_be_taken_away():
+    known = Trajectory(np.arange(6.0).reshape(3, 2), np.ones((2, 4)))
+    alone = known.without_actions()
+    assert alone.actions.shape == (2, 0)
+    assert np.array_equal(alone.observations, known.observations)
+    assert known.action_dim == 4
+    assert alone.without_actions() is alone
+
+
+def test_a_trajectory_without_actions_passes_pipe_and_file():
+    reading, writing = os.pipe()
+    alone = Trajectory(np.arange(6.0).reshape(3, 2))
+    Channel(-1, writing).send_trajectory(alone)
+    received = Channel(reading, -1).receive_trajectory()
+    os.close(reading)
+    os.close(writing)
+    kept = TrajectoryFile([alone, episode(4), alone])
+    found = [received, *kept]
+    kept.close()
+    assert [x.actions.shape for x in found] == [(2, 0), (2, 0), (3, 1), (2, 0)]
+    assert all(np.array_equal(x.observations, alone.observations) for x in found[:2])
 
 
 def test_is_a_read_only_copy():
@@ -62,8 +98,11 @@ def test_only_non_empty_prefixes_are_trajectories(rows):
     [
         (np.zeros((3, 2)), np.zeros((3, 1)), "got 3 observations and 3 actions, expected 4"),
         (np.zeros(3), np.zeros((2, 1)), r"observations have shape \(3,\)"),
-        (np.zeros((3, 0)), np.zeros((2, 1)), "at least one column"),
-        (np.zeros((0, 2)), np.zeros((0, 1)), "and one row"),
+        (np.zeros((3, 0)), np.zeros((2, 1)), "at least one row and one column"),
+        (np.zeros((0, 2)), np.zeros((0, 1)), "at least one row and one column"),
+        (np.zeros((0, 2)), None, "at least one row and one column"),
+        (np.zeros((3, 2)), np.zeros(2), r"actions have shape \(2,\), expected \(rows, columns\)"),
+        (np.zeros((3, 2)), np.zeros((3, 0)), "got 3 observations and 3 actions, expected 4"),
         ([[1.0, 2.0], [3.0]], [[0.0]], "cannot be read as a float32 matrix"),
         ([[0.0], [np.nan], [0.0]], np.zeros((2, 1)), "row 1, column 0: nan"),
         (np.zeros((3, 2)), [[0.0], [np.inf]], "actions hold 1 values that are not finite"),
@@ -72,19 +111,6 @@ def test_only_non_empty_prefixes_are_trajectories(rows):
 def test_bad_arrays_are_named(observations, actions, message):
     with pytest.raises(TrajectoryError, match=message):
         Trajectory(observations, actions)
-
-
-def test_pad_fills_with_zeros_behind_the_end():
-    batch, lengths = pad([np.ones((1, 2), np.float32), np.full((3, 2), 2, np.float32)])
-    assert lengths.tolist() == [1, 3]
-    assert batch.sum(axis=2).tolist() == [[2, 0, 0], [4, 4, 4]]
-
-
-def test_pad_refuses_nothing_and_unequal_widths():
-    with pytest.raises(TrajectoryError, match="at least one"):
-        pad([])
-    with pytest.raises(TrajectoryError, match=r"different widths .*\[1, 2\]"):
-        pad([np.ones((1, 1), np.float32), np.ones((1, 2), np.float32)])
 
 
 def test_a_trajectory_prints_its_sizes():

@@ -23,6 +23,7 @@ from helpers_split import make_split
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data import export as minari
+from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.layout import split_digest
 from oodd_eval.data.split import SHIPPED, split_directories
@@ -543,6 +544,7 @@ for name in minari.list_local_datasets():
                  for e in episodes],
         "ends": [[int(e.terminations.sum()), int(e.truncations.sum()),
                   bool(e.terminations[-1] | e.truncations[-1])] for e in episodes],
+        "named": [dataset.storage.metadata[k] for k in ("sensors", "actions")],
         "metadata": [{k: v if isinstance(v, str) else int(v) for k, v in m.items()}
                      for m in metadata],
     }
@@ -580,6 +582,15 @@ def test_minari_knows_the_spaces(opened):
     ]  # fmt: skip
 
 
+def test_minari_knows_names_and_units(opened):
+    for environment in ("cartpole", "hopper"):
+        info = ENVIRONMENTS[environment]
+        expected = [[{"name": q.name, "unit": q.unit} for q in columns]
+                    for columns in (info.sensors, info.actions)]  # fmt: skip
+        for part in ("train", "test-gravity"):
+            assert opened[f"oodd/tiny/{environment}/{part}-v0"]["named"] == expected
+
+
 @pytest.mark.parametrize("environment", ["cartpole", "hopper"])
 @pytest.mark.parametrize("part", ["train", "calibration", "nominal", "gravity"])
 def test_minari_reads_the_numbers_of_the_split(opened, tiny_split, environment, part):
@@ -599,6 +610,7 @@ def test_minari_reads_the_numbers_of_the_split(opened, tiny_split, environment, 
     assert [m["seed"] for m in found["metadata"]] == expected.seeds.tolist()
     if part == "gravity":
         assert [m["onset"] for m in found["metadata"]] == expected.onsets.tolist()
+        assert [m["effect"] for m in found["metadata"]] == expected.effects.tolist()
         assert [m["anomaly"] for m in found["metadata"]] == ["gravity"] * len(expected)
         assert [json.loads(m["parameters"]) for m in found["metadata"]] == expected.parameters
     else:
@@ -614,7 +626,7 @@ def test_an_ended_episode_is_terminated_and_a_capped_one_truncated(tmp_path):
 
     data = load_split(split).environment("cartpole")
     part = Ended(data._file, "train")
-    minari._write(tmp_path / "d", "x-v0", "cartpole", part, load_split(split))
+    minari._write(tmp_path / "d", "x-v0", data, part, load_split(split))
     with h5py.File(tmp_path / "d" / "x-v0" / "data" / "main_data.hdf5") as file:
         for i in range(len(part)):
             episode, last = file[f"episode_{i}"], int(part.lengths[i]) - 1

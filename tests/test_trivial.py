@@ -2,13 +2,23 @@
 
 import numpy as np
 import pytest
+from oodd_trivial import (
+    Clock,
+    Comb,
+    Mahalanobis,
+    Persistence,
+    Random,
+    Range,
+    oodd_detectors,
+)
 from scipy.stats import binom, kstest
 
 from oodd_eval.data.split import load_split
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import FittedStateError
 from oodd_eval.metrics.auc import auc_contributions, auc_onset, auc_same_times
-from oodd_eval.metrics.bootstrap import cell_samples, percentiles, samples
-from oodd_eval.plugins.baselines import Clock, Persistence, Random, oodd_detectors
+from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
+from oodd_eval.metrics.cusum import Standardization
 
 
 def episode(rows):
@@ -37,6 +47,9 @@ def test_random_is_uniform():
     assert kstest(scores, "uniform").pvalue > 0.001
 
 
+PLAIN = Standardization(0.0, 1.0)
+
+
 @pytest.mark.slow
 def test_on_mini_clock_and_random_give_what_theory_says():
     split = load_split("mini")
@@ -47,18 +60,22 @@ def test_on_mini_clock_and_random_give_what_theory_says():
         clocks = [Clock().score(x) for x in data.twins]
         for anomaly in data.anomalies:
             part = data.anomalous(anomaly)
-            clock = auc_contributions([Clock().score(x) for x in part], clocks, part.onsets)
+            clock = auc_contributions(
+                [Clock().score(x) for x in part], clocks, part.onsets, part.effects, PLAIN
+            )
             assert clock["auc"].value == 1
             assert clock["auc_matched"].value == clock["auc_placebo"].value == 0.5
-            found = auc_contributions([Random(seed=0).score(x) for x in part], twins, part.onsets)
+            found = auc_contributions(
+                [Random(seed=0).score(x) for x in part], twins, part.onsets, part.effects, PLAIN
+            )
             cells.append((environment, found))
     for metric in ("auc", "auc_matched", "auc_placebo"):
-        low, high = percentiles(samples([(e, 0, c[metric]) for e, c in cells]))
+        drawn = [drawn_cell(e, 0, c[metric]) for e, c in cells]
+        low, high = mean_interval(drawn, kind="share")
         assert low <= 0.5 <= high
-        # With ten seeds a percentile interval of 95 % covers about 90 %.
-        ends = (percentiles(cell_samples(e, c[metric])) for e, c in cells)
+        ends = (mean_interval([one], kind="share") for one in drawn)
         outside = sum(not x <= 0.5 <= y for x, y in ends)
-        assert outside <= binom.ppf(0.999, len(cells), 0.1)
+        assert outside <= binom.ppf(0.999, len(cells), 0.08)
 
 
 def test_persistence_is_the_mean_change_in_training_deviations():
@@ -83,5 +100,108 @@ def test_persistence_on_an_episode_shorter_than_the_horizon_is_undefined():
     assert np.isnan(detector.score(WALK[:4])).all()
 
 
-def test_the_three_are_offered():
-    assert [spec.name for spec in oodd_detectors()] == ["random", "persistence", "clock"]
+def test_comb_spikes_once_in_every_hundred_rows():
+    scores = Comb().score(episode(np.zeros((301, 1))))
+    assert np.flatnonzero(scores).tolist() == [99, 199, 299]
+    assert scores.max() == 1
+    assert auc_same_times(scores, scores, 40, 301) == 0.5
+
+
+# Sensor 0 has the 17 values -8 .. 8 and never stands still; sensor 1 has the two values 0 and 1 and
+# stands still for two rows at most; sensor 2 is constant.
+SEEN = np.stack([np.arange(-8, 9), np.array([0, 0, 1] * 5 + [0, 0]), np.full(17, 3.0)], axis=1)
+SPREAD = np.sqrt(24)  # (17^2 - 1) / 12
+
+
+def fitted_range():
+    return Range().fit([episode(SEEN), episode(SEEN[::-1])])
+
+
+def scores_of(detector, *rows):
+    return detector.score(episode(rows)).tolist()
+
+
+def test_range_knows_what_it_was_shown():
+    assert not fitted_range().score(episode(SEEN)).any()
+
+
+def test_range_adds_excess_in_spreads_and_values_never_seen():
+    detector = fitted_range()
+    found = scores_of(detector, [8.5, 0, 3], [-10, 1, 3], [7.5, 0, 3])
+    assert found == pytest.approx([0.5 / SPREAD, 2 / SPREAD, 0])  # 7.5 was never seen, and may be
+    std = SEEN[:, 1].std()
+    # A discrete sensor inside its range, outside of it, and a constant one that moves by 1.
+    assert scores_of(detector, [0, 0.5, 3]) == [1]
+    assert scores_of(detector, [0, 2, 3]) == pytest.approx([1 + 1 / std])
+    assert scores_of(detector, [0, 1, 4]) == [2]
+
+
+def test_a_sensor_of_nine_values_is_not_discrete():
+    eight, nine = (np.arange(n, dtype=float)[:, None] for n in (8, 9))
+    assert scores_of(Range().fit([episode(eight)]), [2.5]) == [1]
+    assert scores_of(Range().fit([episode(nine)]), [2.5]) == [0]
+
+
+def test_range_tells_what_stands_still_for_longer_than_in_training():
+    detector = fitted_range()
+    rows = [[k % 8, 0, 3] for k in range(5)]
+    # Two rows of 0 in a row in training, and the constant sensor may stand still.
+    assert scores_of(detector, *rows) == [0, 0, 1, 1, 1]
+    # Two sensors at once; a change begins anew.
+    rows = [[5, 0, 3], [5, 0, 3], [5, 0, 3], [6, 1, 3], [6, 1, 3]]
+    assert scores_of(detector, *rows) == [0, 1, 2, 0, 1]
+
+
+def test_mahalanobis_is_the_length_of_the_whitened_row():
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(400, 3)) @ rng.normal(size=(3, 3)) * [1, 10, 0.1] + [0, 5, -2]
+    train = [episode(rows[:150]), episode(rows[150:])]
+    stored = np.concatenate([x.observations for x in train]).astype(np.float64)
+    inverse = np.linalg.inv(np.cov(stored.T, bias=True))
+    far = WALK.observations - stored.mean(axis=0)
+    expected = [np.sqrt(d @ inverse @ d) for d in far]
+    detector = Mahalanobis().fit(train)
+    np.testing.assert_allclose(detector.score(WALK), expected, rtol=1e-6)
+    squares = np.concatenate([detector.score(x) for x in train]) ** 2
+    assert squares.mean() == pytest.approx(3)  # the number of directions that vary
+
+
+def test_mahalanobis_leaves_out_what_did_not_vary():
+    rng = np.random.default_rng(6)
+    one = rng.normal(size=200)
+    rows = np.stack([one, 3 * one, np.full(200, 7.0)], axis=1)
+    detector = Mahalanobis().fit([episode(rows)])
+    # One direction: the copy adds nothing, a constant sensor that moves is not seen.
+    mean, std = np.float32(one).mean(dtype=np.float64), np.float32(one).std(dtype=np.float64)
+    found = scores_of(detector, [2, 6, 7], [2, 6, 9])
+    assert found == pytest.approx(2 * [abs(2 - mean) / std], rel=1e-5)
+    still = Mahalanobis().fit([episode(np.ones((9, 2)))])
+    assert scores_of(still, [1, 1], [5, 5]) == [0, 0]
+
+
+@pytest.mark.parametrize("made", [Range, Mahalanobis])
+def test_prefixes_have_the_same_bits_live_and_loaded(made, tmp_path):
+    detector = made().fit([WALK, episode(-WALK.observations)])
+    moved = episode(np.repeat(WALK.observations[::5] * 1.5, 3, axis=0))
+    whole = detector.score(moved)
+    assert whole.any()
+    for n in (1, 2, 17):
+        assert np.array_equal(detector.score(moved[:n]), whole[:n])
+    detector.reset()
+    assert [detector.update(row) for row in moved.observations] == whole.tolist()
+    detector.save(tmp_path)
+    loaded = made()
+    loaded.load(tmp_path)
+    assert np.array_equal(loaded.score(moved), whole)
+
+
+def test_a_baseline_does_not_load_the_fit_of_another(tmp_path):
+    Range().fit([WALK]).save(tmp_path)
+    with pytest.raises(FittedStateError, match="'range/1'"):
+        Mahalanobis().load(tmp_path)
+
+
+def test_the_rows_are_offered_and_all_but_random_are_deterministic():
+    offered = {spec.name: spec.deterministic for spec in oodd_detectors()}
+    deterministic = ("persistence", "clock", "comb", "range", "mahalanobis")
+    assert offered == {"random": False} | dict.fromkeys(deterministic, True)

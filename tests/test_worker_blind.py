@@ -7,7 +7,7 @@ import hashlib
 import os
 import subprocess
 import sys
-from itertools import pairwise
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +15,15 @@ import pytest
 from helpers_plugins import HEADER, install
 from helpers_split import make_split
 from helpers_spy import SPY, Findings, vectors
+from hypothesis import given
+from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.facts import ANOMALIES
-from oodd_eval.data.parts import lengths_of, parts_of
-from oodd_eval.metrics.auc import auc
-from oodd_eval.plugins.contract import PROBES, probes
+from oodd_eval.data.parts import parts_of
+from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.isolation import supervisor as isolation
-from oodd_eval.scoring.unit import shuffled
+from oodd_eval.scoring.unit import groups
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
 
@@ -128,10 +129,11 @@ def test_nothing_of_the_harness_or_of_pytest_is_in_the_environment(findings):
 
 def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
     """The same search, where the harness tells too much in every way there is."""
-    asdict, popen = isolation.asdict, subprocess.Popen
+    send, popen = isolation._send, subprocess.Popen
 
-    def told(request):
-        return asdict(request) | {"environment": "cartpole", "onsets": secrets.onsets}
+    def told(child, request, *trajectories):
+        leak = {"environment": "cartpole", "onsets": secrets.onsets}
+        send(child, request | leak, *trajectories)
 
     with (secrets.path / "cartpole.h5").open("rb") as split:
 
@@ -143,7 +145,7 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
                 settings["cwd"] = secrets.path
             return popen(command, **settings)
 
-        monkeypatch.setattr(isolation, "asdict", told)
+        monkeypatch.setattr(isolation, "_send", told)
         monkeypatch.setattr(isolation.subprocess, "Popen", start)
         records = evaluate("spy", split=secrets.path, environments="cartpole", anomalies="wind-l2r")
     assert [record.status for record in records] == ["ok"], records[0].reason
@@ -172,105 +174,96 @@ def test_the_spy_finds_arrays_of_secrets_in_memory(secrets, monkeypatch, tmp_pat
 
 # In which order, and of what length
 
-NOMINAL = {"calibration", "test/nominal"}
-
-
-def arrived_from(findings, split, environment):
-    """Return part and number of what arrived to be scored, in order."""
-    parts = parts_of(split.environment(environment), tuple(ANOMALIES))
-    known = {digest(x): (part, i) for part, xs in parts.items() for i, x in enumerate(xs)}
-    assert len(known) == sum(len(xs) for xs in parts.values())
-    return [known[found] for found, *_ in whole(findings)]
-
-
-def whole(findings):
-    """Return what arrived to be scored first: all but the prefixes that come at the end."""
-    return findings.arrived("score")[:-PROBES]
-
 
 def digest(x):
+    x = x.without_actions()
     return hashlib.sha256(x.observations.tobytes() + x.actions.tobytes()).hexdigest()
-
-
-def betrayal(order):
-    """Say in which ways an order of parts and numbers tells which are anomalous; empty if not.
-
-    Bounds are five standard deviations of a random order.
-    """
-    labels = np.array([part not in NOMINAL for part, _ in order])
-    where = np.arange(len(order), dtype=float)
-    n, m = labels.sum(), (~labels).sum()
-    found = []
-    if abs(auc(where[labels], where[~labels]) - 0.5) > 5 * np.sqrt((n + m + 1) / (12 * n * m)):
-        found.append("by position")
-    alike = np.mean([a[0] == b[0] for a, b in pairwise(order)])
-    if alike > 0.5:
-        found.append("by neighbours of the same part")
-    related = np.mean([a[1] == b[1] for a, b in pairwise(order)])
-    if related > 0.5:
-        found.append("by neighbours of the same seed")
-    return found
 
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    """What arrived of the split `mini`, where anomalies end episodes early."""
-    with pytest.MonkeyPatch.context() as patch:
-        seen = spy_in(tmp_path_factory.mktemp("mini"), patch)
-        evaluate("spy", environments="cartpole")
-    return Findings(seen)
+    """What arrived of the split `mini` in three runs, each with an order of its own."""
+    found = []
+    for i in range(3):
+        with pytest.MonkeyPatch.context() as patch:
+            seen = spy_in(tmp_path_factory.mktemp(f"mini{i}"), patch)
+            evaluate("spy", environments="cartpole")
+        found.append(Findings(seen))
+    return found
 
 
-def test_trajectories_arrive_in_an_order_that_tells_nothing(mini):
-    order = arrived_from(mini, load_split("mini"), "cartpole")
-    assert len(order) == len(set(order)) == 20 + 10 + 8 * 10
-    assert betrayal(order) == []
-    by_part = sorted(order, key=lambda one: (one[0] not in NOMINAL, one))
-    assert betrayal(by_part) == ["by position", "by neighbours of the same part"]
-    by_seed = sorted(order, key=lambda one: (one[1], hash(one[0]) % 7))
-    assert "by neighbours of the same seed" in betrayal(by_seed)
+@pytest.fixture(scope="module")
+def sets():
+    return parts_of(load_split("mini").environment("cartpole"), tuple(ANOMALIES))
 
 
-def test_trajectories_arrive_whole_and_in_one_form(mini):
-    """No end is cut at an onset or where the twin ends, and nothing is padded."""
-    split = load_split("mini")
-    order = arrived_from(mini, split, "cartpole")
-    sets = parts_of(split.environment("cartpole"), tuple(ANOMALIES))
-    lengths = [length for _, length, _ in whole(mini)]
-    assert lengths == [int(sets[part].lengths[i]) + 1 for part, i in order]
-    assert len(set(lengths)) > 10
-    forms = {str(form) for when in ("fit", "score") for *_, form in mini.arrived(when)}
+def arrived(findings, sets):
+    """Return groups in the order in which they arrived: the part of each, or None for prefixes."""
+    size, order = len(sets["test/nominal"]), []
+    known = {digest(x): (part, i) for part, xs in sets.items() for i, x in enumerate(xs)}
+    rest = [known.get(found) for found, *_ in findings.arrived("score")]
+    while rest:
+        n = size if rest[0] else PROBES
+        group, rest = rest[:n], rest[n:]
+        assert all(one is None for one in group) or len({part for part, _ in group}) == 1
+        order.append(group[0] and group[0][0])
+        if group[0]:
+            assert [i for _, i in group] == list(range(group[0][1], group[0][1] + size))
+    return order
+
+
+def test_groups_arrive_in_an_order_that_no_two_runs_share(mini, sets):
+    orders = [arrived(findings, sets) for findings in mini]
+    calibration = len(sets["calibration"]) // len(sets["test/nominal"])
+    every = Counter({None: 1, "test/nominal": 1, "calibration": calibration})
+    every += Counter(f"test/{a}" for a in ANOMALIES)
+    assert all(Counter(order) == every for order in orders)
+    assert len(set(map(tuple, orders))) == 3
+
+
+def test_trajectories_arrive_whole_and_in_one_form(mini, sets):
+    """No end is cut at an onset or where the twin ends, nothing is padded, no action is shown."""
+    seen = mini[0].arrived("score")
+    lengths = Counter(length for _, length, _ in seen)
+    assert len(lengths) > 10
+    lengths -= Counter(int(n) + 1 for part in sets.values() for n in part.lengths)
+    assert lengths.total() == PROBES
+    forms = {str(form) for when in ("fit", "score") for *_, form in mini[0].arrived(when)}
     assert len(forms) == 1, forms
 
 
-def test_at_the_end_come_prefixes_of_some_of_them(mini):
-    split = load_split("mini")
-    sets = parts_of(split.environment("cartpole"), tuple(ANOMALIES))
-    chosen = probes(lengths_of(sets, None), f"{split.digest}|cartpole|0")
-    expected = [digest(sets[p.part][p.index][: p.rows]) for p in chosen]
-    assert [found for found, *_ in mini.arrived("score")[-PROBES:]] == expected
+def test_one_group_has_prefixes_of_different_seeds_and_no_run_those_of_another(mini, sets):
+    split = {digest(x) for part in sets.values() for x in part}
+    drawn = []
+    for findings in mini:
+        seen = [(found, length) for found, length, _ in findings.arrived("score")]
+        prefixes = [one for one in seen if one[0] not in split]
+        place = seen.index(prefixes[0])
+        assert seen[place : place + PROBES] == prefixes
+        owners = [
+            {(part == "calibration", i) for part, own in sets.items() for i, x in enumerate(own)
+             if len(x) > length and digest(x[:length]) == found}
+            for found, length in prefixes
+        ]  # fmt: skip
+        # A prefix that ends before the onset is that of every episode of one seed.
+        assert all(len(own) == 1 for own in owners)
+        assert len(set.union(*owners)) == PROBES
+        drawn.append(tuple(prefixes))
+    assert len(set(drawn)) == len(mini)
 
 
 def test_training_trajectories_arrive_in_the_order_of_the_split(mini):
     train = load_split("mini").environment("cartpole").train
-    assert [found for found, *_ in mini.arrived("fit")] == [digest(x) for x in train]
+    assert [found for found, *_ in mini[0].arrived("fit")] == [digest(x) for x in train]
 
 
-def test_every_part_is_equally_likely_at_every_position():
-    counts = {"calibration": 20, "test/nominal": 10, "test/iid": 10, "test/gravity": 10}
-    places = {part: [] for part in counts}
-    for key in range(400):
-        for place, (part, _) in enumerate(shuffled(counts, str(key))):
-            places[part].append(place)
-    # The mean of 4000 places among 50 has a standard deviation of 14.4 / 63 = 0.23.
-    for part, found in places.items():
-        assert abs(np.mean(found) - 24.5) < 5 * 0.23, part
-
-
-@pytest.mark.parametrize("other", ["digest|hopper|0", "digest|cartpole|1", "other|cartpole|0"])
-def test_the_order_of_one_unit_tells_nothing_of_another(other):
-    counts = {"calibration": 20, "test/nominal": 10, "test/iid": 10}
-    one, two = shuffled(counts, "digest|cartpole|0"), shuffled(counts, other)
-    assert sorted(one) == sorted(two)
-    # Of 40 places, one is the same on average.
-    assert sum(a == b for a, b in zip(one, two, strict=True)) < 8
+@given(st.dictionaries(st.text(), st.lists(st.integers(1, 90), max_size=50)), st.integers(1, 20))
+def test_groups_have_one_part_and_one_size_and_miss_nothing(lengths, twins):
+    lengths["test/nominal"] = [7] * twins
+    found = groups(lengths)
+    assert Counter((p.part, p.index, p.rows) for g in found for p in g) == Counter(
+        (part, i, n) for part, own in lengths.items() for i, n in enumerate(own)
+    )
+    assert all(len({p.part for p in g}) == 1 for g in found)
+    assert all(0 < len(g) <= twins for g in found)
+    assert sum(len(g) < twins for g in found) <= len(lengths)

@@ -1,0 +1,140 @@
+"""Coverage of the 95 % intervals, by simulation: ``python benchmarks/coverage.py``.
+
+Each problem draws the terms of a metric for a number of test seeds per environment and asks whether
+its interval contains the true value. The table stands in docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.bootstrap import DrawnCell, drawn_cell, mean_interval
+from oodd_eval.metrics.catalogue import IntervalKind
+
+SEEDS: Final = (10, 20, 50)
+"""Test seeds per environment: those of mini, reduced and standard."""
+
+PROBLEMS: Final = 500
+LARGE: Final = 400_000
+"""Trajectories that the true values are computed from."""
+
+Terms = tuple[NDArray[np.float64], NDArray[np.float64]]
+Draw = Callable[[np.random.Generator, int], Terms]
+
+
+def _means(values: NDArray[np.float64]) -> Terms:
+    return values, np.ones_like(values)
+
+
+def _aucs(rng: np.random.Generator, n: int) -> Terms:
+    return _means(rng.beta(4, 1.2, size=n))
+
+
+def _delays(rng: np.random.Generator, n: int) -> Terms:
+    """Geometric delays with a mean of some 30 steps, without a miss."""
+    return _means(rng.geometric(1 / 30, size=n) - 1.0)
+
+
+def _delays_with_misses(rng: np.random.Generator, n: int) -> Terms:
+    """Geometric delays of 15 steps; one in twenty is a miss, which counts 100 to 270 steps."""
+    delays = rng.geometric(1 / 15, size=n) - 1.0
+    return _means(np.where(rng.random(n) < 0.05, rng.integers(100, 270, size=n), delays))
+
+
+def _normal_aucs(rng: np.random.Generator, n: int) -> Terms:
+    return _means(rng.normal(0.75, 0.1, size=n))
+
+
+def _share(p: float, rng: np.random.Generator, n: int) -> Terms:
+    return _means((rng.random(n) < p).astype(np.float64))
+
+
+def _rates(rng: np.random.Generator, n: int) -> Terms:
+    """False alarms over 10 to 300 steps, at a rate that differs from episode to episode."""
+    steps = rng.integers(10, 300, size=n)
+    alarms = rng.binomial(steps, np.minimum(rng.gamma(1.0, 0.08, size=n), 1))
+    return alarms.astype(np.float64), steps.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Terms of a metric, drawn alike in a number of environments.
+
+    Several detector seeds are shifted by independent numbers of standard deviation `between`, in
+    each environment, and have the same test seeds.
+    """
+
+    title: str
+    draw: Draw
+    kind: IntervalKind
+    environments: int = 1
+    seeds: int = 1
+    between: float = 0.0
+
+    def coverage(self, n: int, problems: int = PROBLEMS) -> float:
+        """Return the share of problems whose interval contains the true value."""
+        rng = np.random.default_rng(0)
+        top, bottom = self.draw(rng, LARGE)
+        truth = top.sum() / bottom.sum()
+        inside = 0
+        for _ in range(problems):
+            low, high = mean_interval(self._cells(rng, n), kind=self.kind)
+            inside += low <= truth <= high
+        return inside / problems
+
+    def _cells(self, rng: np.random.Generator, n: int) -> list[DrawnCell]:
+        cells = []
+        for i in range(self.environments):
+            top, bottom = self.draw(rng, n)
+            shifts = rng.normal(0, self.between, size=self.seeds) if self.between else [0.0]
+            cells += [
+                drawn_cell(f"e{i}", seed, Contribution(top + shift * bottom, bottom))
+                for seed, shift in enumerate(shifts)
+            ]
+        return cells
+
+
+FALLS_SHORT: Final = "delays with 5 % misses"
+"""The scenario whose intervals contain the true value too seldom: a resample holds no miss that the
+sample lacks."""
+
+SCENARIOS: Final = (
+    Scenario("AUCs, skewed towards 1", _aucs, "share"),
+    Scenario("AUCs, mean over 7 environments", _aucs, "share", 7),
+    Scenario("delays, skewed", _delays, "mean"),
+    Scenario("delays, mean over 7 environments", _delays, "mean", 7),
+    Scenario(FALLS_SHORT, _delays_with_misses, "mean"),
+    Scenario("delays with 5 % misses, mean over 7 environments", _delays_with_misses, "mean", 7),
+    Scenario("AUCs, three detector seeds", _normal_aucs, "share", seeds=3, between=0.02),
+    *(
+        Scenario(f"share of {100 * p:g} %", functools.partial(_share, p), "share")
+        for p in (0.02, 0.1, 0.2, 0.9, 0.98)
+    ),
+    Scenario("share of 2 %, mean over 7 environments", functools.partial(_share, 0.02), "share", 7),
+    Scenario("share of 5 %, exact", functools.partial(_share, 0.05), "exact"),
+    Scenario("pooled rate", _rates, "share"),
+    Scenario("pooled rates, mean over 7 environments", _rates, "share", 7),
+)
+
+
+def table(problems: int = PROBLEMS) -> str:
+    """Return the coverage in percent of all scenarios as Markdown."""
+    lines = [
+        "| " + " | ".join(["figure", *(f"{n} seeds" for n in SEEDS)]) + " |",
+        "|---|" + "---|" * len(SEEDS),
+    ]
+    for scenario in SCENARIOS:
+        shares = [f"{100 * scenario.coverage(n, problems):.1f}" for n in SEEDS]
+        lines.append("| " + " | ".join([scenario.title, *shares]) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(table())

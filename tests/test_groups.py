@@ -1,0 +1,381 @@
+"""Groups of trajectories are scored apart: nothing that a detector remembers leads to a partner."""
+
+import hashlib
+import tempfile
+from unittest.mock import patch
+
+import h5py
+import numpy as np
+import pytest
+from adversaries import Tree
+from helpers_plugins import install
+
+from oodd_eval import evaluate, load_split
+from oodd_eval.data.parts import lengths_of, parts_of
+from oodd_eval.plugins.conformance.trial import Trial
+from oodd_eval.plugins.contract import probes
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.isolation import Channel
+from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.scoring import unit
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.runner import run
+
+PLUGIN = '''
+import hashlib, os, signal, subprocess, sys, threading, time
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+import psutil
+from adversaries import Tree
+from oodd_eval import DetectorSpec, hookimpl
+
+
+class Plain:
+    def __init__(self, *, seed, horizon): pass
+    def fit(self, nominal): self.scale = float(abs(nominal[0].observations).mean())
+    def score(self, x): return abs(x.observations).sum(axis=1).astype(float) / self.scale
+
+
+class Remembers(Plain):
+    """Counts the trajectories that it has scored; never the same score twice."""
+    seen = 0
+    def score(self, x):
+        Remembers.seen += 1
+        return np.full(len(x), float(Remembers.seen))
+
+
+class Threads(Plain):
+    def fit(self, nominal):
+        super().fit(nominal)
+        threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+
+
+class ThreadsSaved(Threads):
+    def save(self, directory): (directory / "scale").write_text(repr(self.scale))
+    def load(self, directory): self.scale = float((directory / "scale").read_text())
+
+
+class Pool(Plain):
+    """Joins its threads, whose last moments the system takes its time for."""
+    def fit(self, nominal):
+        super().fit(nominal)
+        with ThreadPoolExecutor(16) as pool: list(pool.map(time.sleep, [0.001] * 64))
+
+
+class Helped(Plain):
+    """Leaves a process of its fit, and one of every group."""
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.helper = subprocess.Popen(["sleep", "600"])
+    def score(self, x):
+        if not hasattr(self, "alone"):
+            ours = [p for p in psutil.process_iter() if os.getpgid(p.pid) == os.getpgid(0)]
+            states = [p.status() for p in ours if p.name() == "sleep"]
+            self.alone = set(states) <= {psutil.STATUS_ZOMBIE}
+            self.own = subprocess.Popen(["sleep", "600"])
+        return np.full(len(x), 0.0) if self.alone else super().score(x)
+
+
+class HelpedSaved(Helped):
+    def save(self, directory): (directory / "scale").write_text(repr(self.scale))
+    def load(self, directory): self.scale = float((directory / "scale").read_text())
+
+
+class Notes(Plain):
+    def score(self, x):
+        with open(os.environ["ARRIVALS"], "a") as file:
+            print(hashlib.sha256(x.observations.tobytes()).hexdigest(), file=file)
+        return super().score(x)
+
+
+class Talks(Plain):
+    def fit(self, nominal):
+        super().fit(nominal)
+        print("fitted once", end="")
+    def score(self, x): return np.full(len(x), np.inf)
+
+
+class Closes(Plain):
+    def score(self, x):
+        sys.stdout.close()
+        sys.stderr.close()
+        if len(x) > 0: raise ValueError("no more")
+
+
+class Dies(Plain):
+    def score(self, x): os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Grows(Plain):
+    def score(self, x):
+        self.much = np.ones(60_000_000)
+        time.sleep(5)
+
+
+class SavedDies(ThreadsSaved):
+    def score(self, x): raise ValueError("no")
+
+
+class SavedGrows(ThreadsSaved):
+    """As large in the process that fits as in each that scores, and neither too large alone."""
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.much = np.ones(25_000_000)
+    def score(self, x):
+        self.much = np.ones(25_000_000)
+        time.sleep(5)
+
+
+class Acts(Plain):
+    def fit(self, nominal): self.widths = {x.action_dim for x in nominal}
+    def score(self, x): return np.full(len(x), float(max(self.widths | {x.action_dim})))
+
+
+@hookimpl
+def oodd_detectors():
+    made = {"plain": Plain, "remembers": Remembers, "company": Tree, "threads": Threads,
+            "threads-saved": ThreadsSaved, "dies": Dies, "grows": Grows, "acts": Acts,
+            "pool": Pool, "helped": Helped, "helped-saved": HelpedSaved, "talks": Talks,
+            "notes": Notes,
+            "closes": Closes, "saved-dies": SavedDies, "saved-grows": SavedGrows}
+    both = DetectorSpec("acts-both", Acts, "", inputs="observations+actions")
+    return [*(DetectorSpec(name, one, "") for name, one in made.items()), both]
+'''
+
+
+@pytest.fixture
+def plugin(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "plugin", "groups", PLUGIN, header="")
+
+
+def first(detector, split, **settings):
+    records = evaluate(detector, split, environments="hopper", anomalies="iid,drift", **settings)
+    return records[0]
+
+
+def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_split):
+    class Shared(Tree):
+        def __deepcopy__(self, memo):
+            return self
+
+    settings = {"environments": "hopper", "anomalies": "iid,drift,shutdown,gravity"}
+    records = evaluate("company", tiny_split, **settings)
+    assert [record.value("auc_matched") for record in records] == [0.5] * 4
+    # With one memory for all groups, it knows who leaves the others.
+    with patch.object(unit, "probes", lambda *_: []):
+        records = evaluate(Shared, tiny_split, **settings)
+    assert max(record.value("auc_matched") for record in records) > 0.6
+
+
+def test_state_that_outlives_an_episode_is_found(plugin, tiny_split):
+    record = first("remembers", tiny_split)
+    assert record.status == "invalid"
+    assert "when they are all it gets" in record.reason
+
+
+def test_a_fit_with_running_threads_is_loaded_anew_for_every_group(plugin, tiny_split, tmp_path):
+    plain = first("plain", tiny_split)
+    assert repr(first("threads-saved", tiny_split).metrics) == repr(plain.metrics)
+    for _ in range(2):  # fitted and saved, then loaded
+        kept = first("threads-saved", tiny_split, output=tmp_path / "out")
+        assert repr(kept.metrics) == repr(plain.metrics)
+        for file in (tmp_path / "out" / "scores").iterdir():
+            file.unlink()
+
+
+def test_threads_and_no_saved_fit_are_incompatible(plugin, tiny_split):
+    record = first("threads", tiny_split)
+    assert record.status == "incompatible"
+    assert "cannot be forked" in record.reason
+
+
+def test_threads_that_were_joined_are_waited_for(plugin, tiny_split):
+    for _ in range(5):
+        record = first("pool", tiny_split)
+        assert record.ok, record.reason
+
+
+def test_processes_of_a_fit_or_a_group_are_shared_by_no_groups(plugin, tiny_split):
+    record = first("helped", tiny_split)
+    assert record.status == "incompatible"
+    assert "threads or processes run on after fit" in record.reason
+    # None of those that were started before is found by any group.
+    assert first("helped-saved", tiny_split).value("auc_matched") == 0.5
+
+
+def test_a_fit_that_was_saved_to_be_loaded_leaves_no_file(
+    plugin, tiny_split, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    for detector, status in (("saved-dies", "error"), ("threads-saved", "ok"), ("plain", "ok")):
+        assert first(detector, tiny_split).status == status
+        assert not list(tmp_path.glob("oodd-eval-*"))
+
+
+def test_what_a_fit_prints_is_printed_once(plugin, tiny_split, tmp_path):
+    assert first("talks", tiny_split, output=tmp_path / "out").status == "invalid"
+    (log,) = (tmp_path / "out" / "logs").iterdir()
+    assert log.read_text().count("fitted once") == 1
+
+
+def test_an_error_is_told_although_the_detector_closed_its_streams(plugin, tiny_split):
+    record = first("closes", tiny_split)
+    assert (record.status, record.reason[:19]) == ("error", "ValueError: no more")
+
+
+@pytest.mark.parametrize(
+    ("tampered", "status", "reason"),
+    [
+        ({"pid": "me"}, "error", "wrote into the pipe"),
+        ({"pid": -5}, "error", "wrote into the pipe"),
+        ({"seconds_score": "long"}, "error", "wrote into the pipe"),
+        ({"type": "array", "shape": "missing"}, "invalid", "score arrays came back, expected"),
+    ],
+)
+def test_a_worker_that_lies_ends_its_own_cells_only(
+    plugin, tiny_split, monkeypatch, tampered, status, reason
+):
+    receive, dropped = Channel.receive, []
+
+    def told(channel):
+        message = receive(channel)
+        if "shape" in tampered and message.get("type") == "array" and not dropped:
+            dropped.append(channel.receive_array())
+            return told(channel)
+        return message | {k: v for k, v in tampered.items() if k in message and k != "type"}
+
+    monkeypatch.setattr(Channel, "receive", told)
+    record = first("plain", tiny_split)
+    assert (record.status, reason in record.reason) == (status, True), record.reason
+
+
+def limited(detector, split, memory):
+    opened = load_split(split)
+    plan = make_plan(discover(), split=opened.name, split_digest=opened.digest,
+                     detectors=[detector], environments=["hopper"], anomalies=["iid"])  # fmt: skip
+    settings = RunSettings(jobs=1, limits=Limits(60, memory))
+    return run(plan, opened, discover(), settings, None).records[0]
+
+
+@pytest.mark.parametrize(
+    ("detector", "status", "reason"),
+    [
+        ("dies", "error", "killed by SIGSEGV"),
+        ("grows", "oom", "is over the limit of 400 MB"),
+        ("saved-grows", "oom", "is over the limit of 400 MB"),
+    ],
+)
+def test_what_happens_to_the_process_of_a_group_is_told(
+    plugin, tiny_split, detector, status, reason
+):
+    record = limited(detector, tiny_split, 400_000_000)
+    assert (record.status, reason in record.reason) == (status, True), record.reason
+
+
+def test_actions_are_withheld_from_whoever_does_not_declare_them(plugin, tiny_split):
+    split = load_split(tiny_split)
+    shown = {}
+    for name in ("acts", "acts-both"):
+        results = tiny_split.parent / f"out-{name}"
+        evaluate(name, split, environments="hopper", anomalies="iid", output=results)
+        (file,) = (results / "scores").iterdir()
+        with h5py.File(file) as scores:
+            shown[name] = float(np.max(scores["test/iid/scores"][:]))
+    width = split.environment("hopper").train[0].action_dim
+    assert shown == {"acts": 0.0, "acts-both": float(width)}
+
+
+def test_a_bare_factory_is_shown_actions_in_a_run_and_in_checks(tiny_split):
+    class Acts:
+        def __init__(self, *, seed, horizon):
+            pass
+
+        def fit(self, nominal):
+            widths.update(x.action_dim for x in nominal)
+
+        def score(self, x):
+            widths.add(x.action_dim)
+            return np.zeros(len(x))
+
+    for run_it in (
+        lambda: evaluate(Acts, tiny_split, environments="hopper", anomalies="iid"),
+        lambda: Trial(Acts).fitted(),
+    ):
+        widths = set()
+        run_it()
+        assert 0 not in widths
+        assert widths
+
+
+PARTS_SCORED = ("calibration", "test/nominal", "test/iid", "test/drift")
+
+
+def note(x):
+    return hashlib.sha256(x.observations.tobytes()).hexdigest()
+
+
+def test_the_order_is_drawn_anew_and_stored(plugin, tiny_split, tmp_path, monkeypatch):
+    """A spy writes down what arrives: the groups, in the order that the stored number gives."""
+    arrivals, orders = [], []
+    for name in ("one", "two"):
+        monkeypatch.setenv("ARRIVALS", str(tmp_path / f"{name}.txt"))
+        first("notes", tiny_split, output=tmp_path / name)
+        (file,) = (tmp_path / name / "scores").iterdir()
+        with h5py.File(file) as scores:
+            (order,) = {scores[part].attrs["order"] for part in PARTS_SCORED}
+        orders.append(int(order))
+        arrivals.append((tmp_path / f"{name}.txt").read_text().splitlines())
+    assert orders[0] != orders[1]
+    data = load_split(tiny_split).environment("hopper")
+    sets = parts_of(data, ["iid", "drift"])
+    for order, arrived in zip(orders, arrivals, strict=True):
+        lengths = lengths_of(sets, None)
+        every = [*unit.groups(lengths), probes(lengths, order)]
+        members = [[sets[p.part][p.index][: p.rows] for p in group] for group in every]
+        drawn = np.random.default_rng(order).permutation(len(members))
+        assert arrived == [note(x) for k in drawn for x in members[k]]
+
+
+def test_parts_of_several_runs_keep_their_orders(plugin, tiny_split, tmp_path):
+    """Also where the earlier file has one order for all, as files of old versions do."""
+    for anomaly in ("iid", "drift"):
+        evaluate("plain", tiny_split, environments="hopper", anomalies=anomaly,
+                 output=tmp_path / "out")  # fmt: skip
+        (file,) = (tmp_path / "out" / "scores").iterdir()
+        with h5py.File(file, "r+") as scores:
+            if anomaly == "iid":
+                for part in ("calibration", "test/nominal", "test/iid"):
+                    del scores[part].attrs["order"]
+                scores.attrs["order"] = 7.0
+                continue
+            orders = {part: scores[part].attrs["order"] for part in PARTS_SCORED}
+    assert orders.pop("test/iid") == 7.0
+    assert len(set(orders.values())) == 1
+    assert 7.0 not in orders.values()
+
+
+def test_an_object_in_this_process_is_copied_for_every_group(tiny_split):
+    class Company:
+        def __init__(self, *, seed, horizon):
+            self.beginnings = []
+
+        def fit(self, nominal):
+            pass
+
+        def score(self, trajectory):
+            self.beginnings.append(trajectory.observations[0].tobytes())
+            return np.arange(len(trajectory)) - 1000.0 * len(set(self.beginnings))
+
+    class Shared(Company):
+        def __deepcopy__(self, memo):
+            return self
+
+    def value(detector):
+        scored = evaluate(detector, tiny_split, environments="hopper", anomalies="iid")
+        return scored[0].value("auc_matched")
+
+    with patch.object(unit, "probes", lambda *_: []):
+        assert value(Company) == 0.5
+        assert value(Shared) != 0.5
