@@ -112,7 +112,7 @@ def test_costs_grow_with_what_is_scored_and_not_with_the_fit():
         return estimated_cost(Setting.parse(text), "ant", rows)
 
     (near_fit, near), (far_fit, far) = cost("riqn"), cost("riqn[h=20]")
-    assert near_fit == far_fit > 0
+    assert far_fit >= near_fit > 0  # scheduled sampling costs more
     assert far > 10 * near > 0
     assert cost("riqn[samples=128]")[1] > cost("riqn[samples=32]")[1]
     assert cost("riqn[members=1]")[0] < near_fit

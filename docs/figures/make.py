@@ -6,7 +6,7 @@ episode of Hopper goes through all of them; nothing in them is made up.
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
@@ -16,16 +16,16 @@ from matplotlib.figure import Figure
 
 from oodd_eval import load_split
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData
-from oodd_eval.metrics.alarms import calibrate
+from oodd_eval.metrics.alarms import GuaranteedAlarm, offered_levels
 from oodd_eval.metrics.auc import AlarmRule, auc_onset, auc_same_times, first_delay
-from oodd_eval.metrics.curves import Sweep, delay_far, thresholds
+from oodd_eval.metrics.catalogue import HEADLINE
 from oodd_eval.metrics.cusum import UNIT, Standardization, cusum
 from oodd_eval.plugins.contract import Detector, Scores
 from oodd_eval.plugins.discovery import discover
 
 ENVIRONMENT = "hopper"
 DYNAMICS, SENSOR = "components", "shutdown"
-EPISODE = 1
+EPISODE = 2
 """Which test seed: one in which the anomaly is found neither at once nor with difficulty."""
 
 NOMINAL, ANOMALOUS, ONSET, ALARM = "#555555", "#D55E00", "#000000", "#0072B2"
@@ -56,9 +56,11 @@ class Scored:
     anomalous: list[Scores]
     rule: AlarmRule
 
-    def calibrated(self) -> AlarmRule:
-        """Return the rule whose false-alarm rate is 1 % on the calibration part."""
-        return replace(self.rule, threshold=calibrate(self.calibration, self.rule, 0.01))
+    def guaranteed(self) -> tuple[float, GuaranteedAlarm]:
+        """Return the headline level, or the one that there are episodes for, and its alarms."""
+        levels = offered_levels(len(self.calibration), "cusum")
+        level = levels.get(HEADLINE, max(levels.values()))
+        return level, GuaranteedAlarm.fit(self.calibration, level)
 
 
 def scored(name: str, data: EnvironmentData) -> Scored:
@@ -74,11 +76,11 @@ def scored(name: str, data: EnvironmentData) -> Scored:
     )
 
 
-def mark_onset(axes: Axes, onset: int) -> None:
+def mark_onset(axes: Axes, onset: int, name: str = "onset") -> None:
     """Draw the line that separates nominal from anomalous."""
     axes.axvline(onset, color=ONSET, linewidth=1, linestyle="--")
     axes.annotate(
-        "onset", (onset, 1), xycoords=("data", "axes fraction"), xytext=(4, 1),
+        name, (onset, 1), xycoords=("data", "axes fraction"), xytext=(4, 1),
         textcoords="offset points", fontsize=8,
     )  # fmt: skip
 
@@ -198,40 +200,33 @@ def draw_clock(data: EnvironmentData, mewma: Scored) -> Figure:
     return figure
 
 
-def draw_calibrated(data: EnvironmentData, mewma: Scored) -> Figure:
-    """Delay against the false-alarm rate over all thresholds."""
-    figure = Figure(figsize=(7.6, 4.2), layout="constrained")
-    axes = figure.subplots()
-    onsets = data.anomalous(DYNAMICS).onsets.tolist()
-    rows = {
-        "random": (scored("random", data), "#999999"),
-        "persistence": (scored("persistence", data), "#009E73"),
-        "mewma": (mewma, ANOMALOUS),
-    }
-    for name, (scores, colour) in rows.items():
-        at = thresholds(scores.twins, scores.rule)
-        marks = [rule.threshold for rule in (scores.rule, scores.calibrated())]
-        at = np.unique([*at, *(at[1:] + at[:-1]) / 2, *marks])
-        sweep = Sweep.over(scores.twins, scores.rule, at)
-        curve = delay_far(sweep, scores.anomalous, onsets)
-        heard = np.array(curve["far"]) > 0
-        delays = np.array(curve["delay_censored"])
-        axes.plot(np.array(curve["far"])[heard], delays[heard], color=colour, lw=1.6, label=name)
-        for mark, marker in zip(marks, "os", strict=True):
-            i = at.tolist().index(mark)
-            axes.plot(
-                curve["far"][i], curve["delay_censored"][i], marker, color=colour, ms=7, mec="white"
-            )
-    axes.plot([], [], "o", color="#333333", label="paper's threshold")
-    axes.plot([], [], "s", color="#333333", label="calibrated to 1 %")
-    axes.axvline(0.01, color="#888888", lw=0.8, ls=":")
-    axes.set_xscale("log")
-    axes.set_xticks([0.001, 0.01, 0.1, 1], ["0.1 %", "1 %", "10 %", "100 %"])
-    axes.set_xlim(left=0.001)
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel("false-alarm rate on nominal twins, per step")
-    axes.set_ylabel("delay (steps), a miss counts\nas the rest of the episode")
-    axes.legend(ncols=2)
+def draw_guaranteed(data: EnvironmentData, mewma: Scored) -> Figure:
+    """Draw the threshold among the calibration episodes, and the first alarm of an episode."""
+    figure = Figure(figsize=(7.6, 3.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 2), sharey=True)
+    level, rule = mewma.guaranteed()
+    largest = np.sort([rule.largest(scores) for scores in mewma.calibration[1::2]])
+    left.plot(np.arange(1, len(largest) + 1), largest / UNIT, "o", color=NOMINAL, ms=4)
+    left.set_xlabel("calibration episodes, in order")
+    left.set_ylabel("largest CUSUM (standard deviations)")
+    effect = int(data.anomalous(DYNAMICS).effects[EPISODE])
+    for scores, colour, label in (
+        (mewma.twins[EPISODE], NOMINAL, "nominal twin"),
+        (mewma.anomalous[EPISODE], ANOMALOUS, "anomalous trajectory"),
+    ):
+        statistic = rule.statistic(scores) / UNIT
+        right.plot(statistic, color=colour, lw=1.2, label=label)
+        if (first := rule.first(scores)) is not None:
+            right.plot(first, statistic[first], "v", color=ALARM, ms=8, label="first alarm")
+    mark_onset(right, effect, "effect")
+    for axes in (left, right):
+        axes.axhline(rule.threshold / UNIT, color=ALARM, lw=1, ls=":")
+    right.set_ylim(0, 3 * rule.threshold / UNIT)
+    right.set_xlabel("time t (steps)")
+    right.set_title(
+        f"threshold for at most {100 * level:g} % of nominal episodes", fontsize=9, pad=14
+    )
+    right.legend(loc="upper left")
     return figure
 
 
@@ -243,7 +238,7 @@ def draw_all(directory: Path) -> None:
         "twins": lambda: draw_twins(data),
         "alarms": lambda: draw_alarms(data, mewma),
         "clock": lambda: draw_clock(data, mewma),
-        "calibrated": lambda: draw_calibrated(data, mewma),
+        "guaranteed": lambda: draw_guaranteed(data, mewma),
     }
     with mpl.rc_context(STYLE):
         for name, draw in figures.items():
