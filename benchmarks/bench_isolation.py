@@ -17,26 +17,12 @@ MOST = 1.10
 ROUNDS = 2
 
 
-class Everything:
-    """One group of all parts."""
-
-    part, indices = "everything", range(0)
-
-
 def together(work):
-    """Make a unit's work as it would be without any guard."""
-    places = [(part, i) for part, n in work._lengths.items() for i in range(len(n))]
-    work._groups, work._probes = [Everything], []
-    work._members = lambda _: (work._sets[part][i] for part, i in places)
-    work._size = lambda _: len(places)
-
-    def placed(returned, warm_up):
-        parts = {part: [None] * len(n) for part, n in work._lengths.items()}
-        for (part, i), scores in zip(places, returned[0], strict=True):
-            parts[part][i] = work._check(scores, warm_up, part, i)
-        return parts
-
-    work._placed = placed
+    """Make a unit's work as it would be without any guard: one group of all, no prefixes."""
+    everything = [probe for group in unit.groups(work._lengths) for probe in group]
+    work._ordered = work._groups = [everything]
+    work._probes, work._drawn = [], [0]
+    work._shown = lambda trajectory: trajectory
 
 
 def timed(detector, *, guarded):
