@@ -162,10 +162,11 @@ def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_spl
     settings = {"environments": "hopper", "anomalies": "iid,drift,shutdown,gravity"}
     records = evaluate("company", tiny_split, **settings)
     assert [record.value("auc_matched") for record in records] == [0.5] * 4
-    # With one memory for all groups, it knows who leaves the others.
+    # With one memory for all groups, it knows who leaves the others. Which of two twins comes
+    # first is drawn, so it may rank either of them higher.
     with patch.object(unit, "probes", lambda *_: []):
         records = evaluate(Shared, tiny_split, **settings)
-    assert max(record.value("auc_matched") for record in records) > 0.6
+    assert max(abs(record.value("auc_matched") - 0.5) for record in records) > 0.1
 
 
 def test_state_that_outlives_an_episode_is_found(plugin, tiny_split):

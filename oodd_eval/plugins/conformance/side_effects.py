@@ -76,7 +76,7 @@ class Effects(Events):
 
 
 DAEMON: Final = "daemon thread"
-"""How a thread that does not keep the process alive is called in `Effects.running`."""
+"""Prefix of the daemon threads in `Effects.running`."""
 
 _install: Final = functools.cache(sys.addaudithook)
 _recording: Final[list[Events]] = []  # the audit hook writes to the last one
