@@ -1,7 +1,5 @@
 """`evaluate`: the whole harness in one call, for scripts and notebooks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

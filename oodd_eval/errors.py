@@ -3,8 +3,6 @@
 A message says what went wrong, in which object, what was expected, what was found and what to do.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Read what users write: lists of names, numbers, times, parameters, expressions of ``-k``."""
 
-from __future__ import annotations
-
 import ast
 import fnmatch
 import json

@@ -1,7 +1,5 @@
 """The tests that the pytest plug-in adds: one per cell, which share one run of the harness."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

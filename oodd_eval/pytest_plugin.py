@@ -8,8 +8,6 @@ adds one test per cell. Without ``--oodd-detector`` nothing happens: pytest load
 every environment in which oodd-eval is installed, so the harness is imported only when asked for.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import pytest

@@ -12,8 +12,6 @@ In a script, all at once: ``check_detector(make_mine)``. On the command line, in
 own, so that a crash is reported too: ``oodd-eval check mine``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

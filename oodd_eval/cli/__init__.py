@@ -1,7 +1,5 @@
 """The command line: a module per command, and here the parser and the options that they share."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import re
@@ -27,7 +25,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **settings)
         self.choices: dict[str, Parser] = {}
 
-    def nested(self, kind: str) -> Callable[[str, str], Parser]:
+    def nested(self, kind: str) -> Callable[[str, str], "Parser"]:
         """Return a function that adds a command or an action: its name and summary."""
         nested = self.add_subparsers(dest=kind, metavar=kind.upper(), required=True)
         self.choices = nested.choices

@@ -1,7 +1,5 @@
 """``oodd-eval check``: the conformance checks of one detector, each reported when it is done."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Final
 

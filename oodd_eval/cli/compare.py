@@ -1,7 +1,5 @@
 """``oodd-eval compare``: results against a reference, and writing references."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``oodd-eval data``: build, verify, fetch and export splits, and describe them."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``oodd-eval leaderboard``: build the board, verify entries and submit one."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``oodd-eval list``: one line each, the name first."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable
 from dataclasses import asdict

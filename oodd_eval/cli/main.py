@@ -1,7 +1,5 @@
 """The entry point: read the command line, carry it out, and return its exit code."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

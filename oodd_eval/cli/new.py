@@ -1,7 +1,5 @@
 """``oodd-eval new``: a plug-in project that works before anything in it is edited."""
 
-from __future__ import annotations
-
 import argparse
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``oodd-eval policies``: train and evaluate nominal policies."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

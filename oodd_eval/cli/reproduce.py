@@ -1,7 +1,5 @@
 """``oodd-eval reproduce``: the paper from one command."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

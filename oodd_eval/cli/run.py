@@ -1,7 +1,5 @@
 """``oodd-eval run``: fit and score every selected cell, print tables and write them."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
-from __future__ import annotations
-
 import argparse
 
 from oodd_eval.cli import Parser, say

@@ -1,7 +1,5 @@
 """The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -4,8 +4,6 @@ One dataset per environment and part, in the layout of Minari's dataset standard
 https://minari.farama.org/content/dataset_standards. Minari itself is not needed to write them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -3,8 +3,6 @@
 The module needs neither simulators nor data. Values of the paper are from Danesh & Fern (2021).
 """
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ are compared with the manifest, and the manifest with the digest that the caller
 Names inside an archive are only compared, never used as paths.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Files that are whole or absent: atomic replacement, a lock per directory, gzip within bounds."""
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import os

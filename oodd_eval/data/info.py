@@ -1,7 +1,5 @@
 """A description of a split: sizes, sensors, lengths, onsets, returns, and the paper's Table 2."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import closing

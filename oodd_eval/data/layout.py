@@ -8,8 +8,6 @@ The digest of a group covers names, dtypes, shapes and little-endian bytes of it
 nothing of chunks or compression.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

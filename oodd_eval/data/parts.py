@@ -3,8 +3,6 @@
 Names, onsets and parameters stay with the harness; a detector is handed `Trajectory` objects only.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Iterable, Iterator, Mapping

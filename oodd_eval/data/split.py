@@ -1,7 +1,5 @@
 """Frozen splits: find one by its name or path, verify it, open an environment."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json
@@ -40,7 +38,7 @@ def split_directories() -> dict[str, Path]:
     return found
 
 
-def load_split(name: str | Path) -> Split:
+def load_split(name: str | Path) -> "Split":
     """Open a split by its directory or its name; only its manifest is read.
 
     Parameters

@@ -4,8 +4,6 @@ Time runs as in the protocol: observations ``o_0 .. o_T`` (T + 1 rows) and the c
 ``a_0 .. a_{T-1}`` between them; ``a_t`` was chosen after ``o_t`` was seen.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -67,7 +65,7 @@ class Trajectory:
         """Return the number of observations, T + 1: the length of a score sequence."""
         return len(self.observations)
 
-    def __getitem__(self, rows: slice) -> Trajectory:
+    def __getitem__(self, rows: slice) -> "Trajectory":
         """Return the first n observations as an episode: only ``[:n]`` with n >= 1 is allowed."""
         n = len(range(len(self))[rows]) if isinstance(rows, slice) else 0
         if n < 1 or rows.step not in (None, 1) or rows.start not in (None, 0):
@@ -77,7 +75,7 @@ class Trajectory:
             )
         return Trajectory(self.observations[:n], self.actions[: n - 1])
 
-    def without_actions(self) -> Trajectory:
+    def without_actions(self) -> "Trajectory":
         """Return the same observations with actions of width 0."""
         return Trajectory(self.observations) if self.action_dim else self
 

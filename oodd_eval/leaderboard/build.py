@@ -1,7 +1,5 @@
 """The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Collection, Sequence

@@ -13,8 +13,6 @@ Entries are read here after they were verified (`oodd_eval.leaderboard.verify`):
 ``entry.json`` and of each record is checked, their truth is not.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """Entries sorted into the boards of the leaderboard."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Write an entry of the leaderboard from a results directory."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -6,8 +6,6 @@ the k-th smallest of n with probability at most ``1 - k / (n + 1)``, whatever th
 scores and however they depend on one another within an episode.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -55,7 +53,7 @@ class GuaranteedAlarm:
     @classmethod
     def fit(
         cls, calibration: Sequence[Floats], level: float, kind: AlarmKind = "cusum"
-    ) -> GuaranteedAlarm:
+    ) -> "GuaranteedAlarm":
         """Find the threshold on the scores of nominal episodes, kept apart from the fit.
 
         Parameters
@@ -74,7 +72,7 @@ class GuaranteedAlarm:
     @classmethod
     def fits(
         cls, calibration: Sequence[Floats], levels: Sequence[float], kind: AlarmKind = "cusum"
-    ) -> list[GuaranteedAlarm]:
+    ) -> "list[GuaranteedAlarm]":
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
         unbounded, episodes = cls(None, math.inf), calibration
         if kind == "cusum":

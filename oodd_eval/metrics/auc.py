@@ -8,8 +8,6 @@ Time runs over observation rows. The ``onset`` is the row from which on an anoma
 ``effect`` is the first row that differs from the nominal twin's, at the onset or after it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

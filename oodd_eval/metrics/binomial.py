@@ -4,8 +4,6 @@ Both are from the regularized incomplete beta function, by its continued fractio
 Press et al., Numerical Recipes, section 6.4), inverted by bisection.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

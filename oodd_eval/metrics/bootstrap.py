@@ -10,8 +10,6 @@ Shares that no trajectory contradicts (all 0 or all 1), for which resamples say 
 share of nominal episodes with an alarm have exact binomial intervals (`metrics.binomial`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import zlib

@@ -4,8 +4,6 @@ The metrics of guaranteed alarms have a name for each level, with a suffix: ``de
 delay where at most 5 % of nominal episodes raise an alarm.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 They are drawn on the leaderboard's site and decide nothing; numbers are rounded for drawing.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -100,7 +98,7 @@ class Sweep:
     quiet: list[list[Alarms]]
 
     @classmethod
-    def over(cls, twins: Sequence[Floats], rule: AlarmRule, at: Floats) -> Sweep:
+    def over(cls, twins: Sequence[Floats], rule: AlarmRule, at: Floats) -> "Sweep":
         """Find the alarms of the twins at every threshold."""
         rules = [replace(rule, threshold=threshold) for threshold in at.tolist()]
         return cls(rules, twins, [[r.alarms(b) for b in twins] for r in rules])

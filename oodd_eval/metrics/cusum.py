@@ -1,7 +1,5 @@
 """From scores to alarms: standardization and the one CUSUM rule that every detector shares."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class Standardization:
     std: float
 
     @classmethod
-    def fit(cls, scores: Iterable[Floats]) -> Standardization:
+    def fit(cls, scores: Iterable[Floats]) -> "Standardization":
         """Pool all defined scores of the calibration trajectories.
 
         Scores whose sum or whose distance from their mean is no number raise `OverflowError`.

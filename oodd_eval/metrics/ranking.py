@@ -8,8 +8,6 @@ Rows are given as the numerators and denominators of a metric, per detector seed
 is better.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -6,8 +6,6 @@ then *confirmed* where all of it lies in the region, *refuted* where all of it l
 that are settled by definition or by construction say so instead. ``claims.toml`` has them.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -80,7 +78,7 @@ class Claim:
 
     @classmethod
     def of(cls, *, metric: str, plus: Mapping[str, Any], minus: Mapping[str, Any] | None = None,
-           **others: Any) -> Claim:  # fmt: skip
+           **others: Any) -> "Claim":  # fmt: skip
         """Make a claim from a table of ``claims.toml``."""
         ends = {k: others.pop(k) for k in ("above", "below", "negligible") if k in others}
         sides = (Side.of(1.0, **plus), *([Side.of(-1.0, **minus)] if minus else []))

@@ -5,8 +5,6 @@ trajectories, the same for all cells of an environment, and detector seeds, the 
 of a difference. Numbers are computed as arrays of the value and then its resamples.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -35,7 +33,7 @@ class Side:
     anomalies: tuple[str, ...]
 
     @classmethod
-    def of(cls, weight: float, anomalies: str | list[str], settings: Sequence[str] = ()) -> Side:
+    def of(cls, weight: float, anomalies: str | list[str], settings: Sequence[str] = ()) -> "Side":
         """Make a side from texts: ids of anomalies or groups, and settings as they are printed."""
         names = [anomalies] if isinstance(anomalies, str) else anomalies
         over = tuple(a for name in names for a in scope(name).anomalies)

@@ -1,12 +1,10 @@
 """The paper's tables and figures, its numbers, and tiers, all from ``experiments.toml``."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -89,7 +87,7 @@ class Experiment:
         return own if self.rows == "environments" else own | {MEAN: "Mean"}
 
     @classmethod
-    def of(cls, *, series: Mapping[str, list[str]], scopes: list[str], **others: Any) -> Experiment:
+    def of(cls, *, series: Mapping[str, list[str]], scopes: list[str], **others: Any) -> Self:
         """Make an experiment from a table of ``experiments.toml``."""
         grid = others.pop("picture", {})
         plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in others.items()}

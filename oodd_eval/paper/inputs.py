@@ -3,8 +3,6 @@
 ``returns.json`` is kept so that Table 2 can be made again without the split.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -51,7 +49,7 @@ class Reproduction:
         return [r for r in whole if r.seed in seeds.get(r.setting, ())]
 
     @classmethod
-    def load(cls, directory: Path) -> Reproduction:
+    def load(cls, directory: Path) -> "Reproduction":
         """Read the header of a directory, fields of other versions left out."""
         from pydantic import TypeAdapter  # noqa: PLC0415  only where a header is read
 

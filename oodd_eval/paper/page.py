@@ -10,8 +10,6 @@
 The same records give the same bytes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

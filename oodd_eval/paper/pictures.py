@@ -3,8 +3,6 @@
 Files are the same bytes for the same numbers: no date, no random ids, no machine's fonts.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import itertools

@@ -4,8 +4,6 @@
 the split (the number of updates is fixed), and of scoring 1000 observations.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

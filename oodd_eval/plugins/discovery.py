@@ -5,8 +5,6 @@ and the exit code, and nothing of it is used. (pluggy's own loader stops at the 
 and silently drops the second of two that share a name.)
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 from collections.abc import Callable, Collection, Iterator

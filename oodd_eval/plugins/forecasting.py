@@ -8,8 +8,6 @@ M samples from each of e members, is compared with what came:
 with sensors standardized by training statistics. Scores are undefined for t < h.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -33,7 +31,7 @@ class FeatureScale:
     std: NDArray[np.float64]
 
     @classmethod
-    def fit(cls, nominal: Sequence[Trajectory]) -> FeatureScale:
+    def fit(cls, nominal: Sequence[Trajectory]) -> "FeatureScale":
         """Pool all rows of all trajectories; a sensor with std < 1e-6 gets the scale 1.
 
         Raises `TrajectoryError` without a transition, or for unequal numbers of sensors.
@@ -49,7 +47,7 @@ class FeatureScale:
         return cls(rows.mean(axis=0), np.where(std < CONSTANT, 1.0, std))
 
     @classmethod
-    def of(cls, arrays: Arrays) -> FeatureScale:
+    def of(cls, arrays: Arrays) -> "FeatureScale":
         """Return the scale among saved arrays; `FittedStateError` where there is none."""
         mean = take(arrays, "mean", (None,))
         return cls(mean, take(arrays, "std", mean.shape))

@@ -3,8 +3,6 @@
 The same class serves the detector's spec, its factory, ``--param`` and the conformance checks.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

@@ -6,8 +6,6 @@ For a detector's ``save`` and ``load`` (`oodd_eval.plugins.contract.StorableDete
     arrays.npz    its arrays
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 `_layout` has its fields; `oodd_eval.metrics.curves` computes them and says what they mean.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import json

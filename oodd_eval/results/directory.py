@@ -11,8 +11,6 @@
 Every file is whole or absent, see `oodd_eval.data.files`.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence

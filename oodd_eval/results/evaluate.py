@@ -1,7 +1,5 @@
 """From the scores of a cell to its metrics with intervals, and to its record."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +35,7 @@ class Rules:
     guaranteed: dict[str, GuaranteedAlarm]
 
     @classmethod
-    def fit(cls, calibration: Sequence[Scores], alarm: AlarmKind = "cusum") -> Rules:
+    def fit(cls, calibration: Sequence[Scores], alarm: AlarmKind = "cusum") -> "Rules":
         """Standardize and find thresholds on the scores of nominal trajectories."""
         levels = offered_levels(len(calibration), alarm)
         rules = GuaranteedAlarm.fits(calibration, list(levels.values()), alarm)

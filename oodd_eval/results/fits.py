@@ -9,8 +9,6 @@ A directory is filled elsewhere and then moved to its place, so that it is whole
 files are compared with their digests before a detector is asked to load them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

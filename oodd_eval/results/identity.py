@@ -5,8 +5,6 @@ x seed. Both are written and read as text here and nowhere else. The device that
 is no part of its identity.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
@@ -48,7 +46,7 @@ class Setting:
     @classmethod
     def of(
         cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
-    ) -> Setting:
+    ) -> "Setting":
         """Make a setting from a mapping of the parameters that are not at their default."""
         given = overrides or {}
         texts = ((k, json.dumps(given[k], sort_keys=True, default=str)) for k in sorted(given))
@@ -70,7 +68,7 @@ class Setting:
         return _bracketed(self.detector, horizon | self.overrides)
 
     @classmethod
-    def parse(cls, text: str) -> Setting:
+    def parse(cls, text: str) -> "Setting":
         """Read what `str` writes; a text of another form raises `UsageError`.
 
         >>> Setting.parse("riqn[h=5,updates=2400]") == Setting.of("riqn", 5, {"updates": 2400})
@@ -130,7 +128,7 @@ class Cell:
         return self.setting.label(self.seed)
 
     @classmethod
-    def parse(cls, text: str) -> Cell:
+    def parse(cls, text: str) -> "Cell":
         """Read what `str` writes; a text of another form raises `UsageError`."""
         match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+)(?:@([^/:]+))?::([^\[]+)\[(.*)\]", text)
         settings = _read_settings(match[6]) if match else None

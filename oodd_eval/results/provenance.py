@@ -1,7 +1,5 @@
 """The origin of results: versions, machine, commit and time. Nothing of it decides identity."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 from contextlib import suppress

@@ -4,8 +4,6 @@ A record is plain data. `Record.to_json` and `Record.from_json` are inverse to e
 written as null, so that results can be stored, compared and published as lines of JSON.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -175,7 +173,7 @@ class Record:
         return json.dumps(_without_nan(plain), allow_nan=False)
 
     @classmethod
-    def from_json(cls, line: str, where: str = "record") -> Record:
+    def from_json(cls, line: str, where: str = "record") -> "Record":
         """Read a record back.
 
         Parameters

@@ -4,8 +4,6 @@ A key covers the plug-in's code and version, the contract's version, the detecto
 data and the protocol. Moving a file of the harness changes no key.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.util

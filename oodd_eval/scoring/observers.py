@@ -4,8 +4,6 @@ A plug-in is asked to observe when it has an entry point in the group ``oodd_eva
 when it was loaded for its detectors. No observer may change a result.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable
 from importlib.metadata import EntryPoint

@@ -1,7 +1,5 @@
 """A plan: the units of a run (one fit each) and their cells (one anomaly each). Data only."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -79,7 +77,7 @@ class Plan:
         """Return one cell of a unit."""
         return Cell(self.split, unit.environment, anomaly, unit.setting, unit.seed)
 
-    def matching(self, wanted: Predicate) -> Plan:
+    def matching(self, wanted: Predicate) -> "Plan":
         """Return the plan with those cells only whose text passes, without empty units."""
         units = (
             replace(u, anomalies=tuple(a for a in u.anomalies if wanted(str(self.cell(u, a)))))

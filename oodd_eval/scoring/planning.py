@@ -1,7 +1,5 @@
 """From names to a plan: settings are resolved and keys are made here, once."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 

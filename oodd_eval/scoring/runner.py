@@ -4,8 +4,6 @@ The runner prints nothing. Observers (`oodd_eval.scoring.observers`) hear of eve
 are the same bytes for any number of jobs.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait

@@ -1,7 +1,5 @@
 """Score one unit: take kept scores, or fit and score in a worker, and check all that comes back."""
 
-from __future__ import annotations
-
 import copy
 import secrets
 import tempfile

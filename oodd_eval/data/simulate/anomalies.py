@@ -4,8 +4,6 @@ An anomaly is drawn once per trajectory, then acts from the onset on: a sensor a
 observation row, a dynamics anomaly on each transition.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -5,8 +5,6 @@ work folder, named by everything its content depends on: a killed build loses th
 progress. The chunks of an environment are joined into its HDF5 file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

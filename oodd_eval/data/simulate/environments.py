@@ -4,8 +4,6 @@ A simulator is used for one episode: PyBullet's client and Box2D's world keep hi
 makes later episodes differ from first ones with the same seed.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import inspect

@@ -4,8 +4,6 @@ A policy is deterministic: its forward pass runs in float64, and is rounded to a
 that the last bits of a matrix product cannot reach the simulator.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from pathlib import Path

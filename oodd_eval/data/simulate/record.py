@@ -5,8 +5,6 @@ would choose anyway, since the observations are the same. An episode that equals
 soon after its onset, is drawn again: onset and parameters.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ here its curves are made small: lists that are shared stand in the page once, an
 grid as fine as the screen's.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import itertools

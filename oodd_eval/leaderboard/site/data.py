@@ -5,8 +5,6 @@ sorts and draws. It has the intervals of a mean for every selection of cells tha
 make.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import product

@@ -5,8 +5,6 @@ sound: files, ``entry.json``, digests, the fields of each record, the metrics of
 records among each other, scores, and last the trajectories of the split, where it is at hand.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator, Sequence

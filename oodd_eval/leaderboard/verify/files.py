@@ -3,8 +3,6 @@
 Nothing is followed, opened or decoded before it is known to be a plain file of bounded size.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

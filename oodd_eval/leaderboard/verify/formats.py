@@ -4,8 +4,6 @@ Names are held to a safe alphabet, since they become file names, links and table
 line that can be printed, without ``<`` and ``>``: whatever shows it, it cannot become markup.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

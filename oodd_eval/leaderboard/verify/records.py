@@ -5,8 +5,6 @@ terms of both sums. So value, interval and number of trajectories are recomputed
 themselves obey rules of their own (`terms`), which no scores can break.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import defaultdict

@@ -8,8 +8,6 @@ Curves illustrate; nobody may choose the cells or the seed that look best, so th
 cells of a row, and of its first seed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import islice

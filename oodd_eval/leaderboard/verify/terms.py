@@ -1,7 +1,5 @@
 """Rules that the terms of a record's metrics obey, whatever the scores: no scores break them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 

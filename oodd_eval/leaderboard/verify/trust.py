@@ -5,8 +5,6 @@ the processor. On a split of fresh seeds it gives other numbers of the same kind
 may differ by what their intervals allow. Either way the code must be the same, by its digest.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

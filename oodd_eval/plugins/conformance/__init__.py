@@ -1,7 +1,5 @@
 """Checks that a detector honours the contract. `oodd_eval.testing` is their public face."""
 
-from __future__ import annotations
-
 import textwrap
 import time
 import traceback

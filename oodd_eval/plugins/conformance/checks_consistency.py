@@ -1,7 +1,5 @@
 """Checks that scores hold when asked for otherwise: again, cut short, at the edges, from a file."""
 
-from __future__ import annotations
-
 import contextlib
 import tempfile
 import zipfile

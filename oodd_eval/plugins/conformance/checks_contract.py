@@ -1,7 +1,5 @@
 """Checks of how a detector is made, the errors it owes its users, and the form of its scores."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -3,8 +3,6 @@
 All of them judge one fit with scores, whose side effects are recorded.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable
 from pathlib import Path

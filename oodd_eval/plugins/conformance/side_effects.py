@@ -4,8 +4,6 @@ An audit hook sees every file that Python opens and every address that it connec
 library. It cannot be removed again: one is installed at the first use and is idle in between.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import locale

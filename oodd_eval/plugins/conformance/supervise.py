@@ -5,8 +5,6 @@ failed, and a new process goes on with the next one. Such a process runs this mo
 ``python -m oodd_eval.plugins.conformance.supervise READ_FD WRITE_FD LIFELINE_FD``.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import time

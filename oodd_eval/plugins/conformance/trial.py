@@ -5,8 +5,6 @@ what another one is about (a factory that works, a fit, the shape of scores) is 
 and names the other one, so that one fault is told once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import unittest
@@ -65,7 +63,7 @@ class Trial:
         self.events = Events()  # of all checks so far
         self._settings_before = settings()
 
-    def carry_out(self, check: Callable[[Trial], None]) -> None:
+    def carry_out(self, check: "Callable[[Trial], None]") -> None:
         """Carry out a check; warnings are the matter of the check of that name alone."""
         with warnings.catch_warnings(), auditing(self.events), doing("the detector"):
             warnings.simplefilter("ignore")

@@ -5,8 +5,6 @@ Harness and workers exchange JSON and arrays over pipes, nothing executable. A f
 with pickling refused. The messages before say which of the two comes next.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

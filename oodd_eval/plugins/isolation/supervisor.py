@@ -6,8 +6,6 @@ and those that left both, which a mark in the environment that they inherited gi
 only.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import secrets

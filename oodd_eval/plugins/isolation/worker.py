@@ -12,8 +12,6 @@ by a fresh process for each group. Files and shared memory are not watched.
 Messages have descriptors of their own, so that nothing that a detector prints gets between them.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import json
 import math

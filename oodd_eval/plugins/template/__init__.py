@@ -4,8 +4,6 @@ Templates lie beside this module, each ending in ``.in`` so that nothing takes t
 this package. ``@NAME@`` and the like stand for the names of the project, in paths and in contents.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from importlib.resources import files

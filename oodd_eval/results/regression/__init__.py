@@ -5,8 +5,6 @@ fails where the AUC fell by more than 0.01, ``delay:+10%`` where the delay rose 
 the reference. Without a sign the metric's own worse side is meant; both for one that has none.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ A reference is a file of records, such as ``records.jsonl``, without what no com
 intervals, values of single trajectories and costs. So it is small, and a change of it can be read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,7 +39,7 @@ class RecordSet:
     boards: dict[Conditions, dict[Cell, Record]]
 
     @classmethod
-    def of(cls, records: Iterable[Record], where: str = "records") -> RecordSet:
+    def of(cls, records: Iterable[Record], where: str = "records") -> "RecordSet":
         """Arrange records for comparison; of several of one cell, the last one counts."""
         boards: dict[Conditions, dict[Cell, Record]] = {}
         for r in records:
@@ -54,7 +52,7 @@ class RecordSet:
         """All records."""
         return [record for cells in self.boards.values() for record in cells.values()]
 
-    def selected(self, wanted: Predicate | None) -> RecordSet:
+    def selected(self, wanted: Predicate | None) -> "RecordSet":
         """Return the records of those cells only whose text passes."""
         chosen = (r for r in self.records if wanted is None or wanted(str(r.cell)))
         return RecordSet.of(chosen, self.where)

@@ -3,8 +3,6 @@
 The layout of the XML is that of the schema of Jenkins' xUnit plug-in, ``junit-10.xsd``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

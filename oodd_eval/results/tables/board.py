@@ -1,7 +1,5 @@
 """Records arranged for comparison: rows of detectors with means over cells, and their rankings."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

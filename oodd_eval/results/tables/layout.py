@@ -1,7 +1,5 @@
 """The tables of a board, as texts in cells; renderers set them for a terminal or as Markdown."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -62,12 +60,12 @@ class Table:
         """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
         return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
 
-    def columns(self, indices: Sequence[int]) -> Table:
+    def columns(self, indices: Sequence[int]) -> "Table":
         """Return the table with these columns only."""
         rows = [[row[i] for i in indices] for row in self.rows]
         return replace(self, header=[self.header[i] for i in indices], rows=rows)
 
-    def transposed(self) -> Table:
+    def transposed(self) -> "Table":
         """Return the table with rows and columns exchanged."""
         whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
         return replace(self, header=whole[0], rows=whole[1:], labels=1)

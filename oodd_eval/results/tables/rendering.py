@@ -1,7 +1,5 @@
 """Boards as Markdown, for people, and as CSV, for spreadsheets and scripts."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """Executors: where units run. In workers of this machine, or on an existing Dask cluster."""
 
-from __future__ import annotations
-
 import os
 import threading
 from dataclasses import dataclass, field

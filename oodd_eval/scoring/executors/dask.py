@@ -10,8 +10,6 @@ can still say so. Everything that must be the same on both sides (plug-in, its c
 named in the order by digest and compared before any work.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import threading
