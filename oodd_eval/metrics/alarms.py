@@ -203,12 +203,8 @@ class Monitor:
 
     The statistic and the alarms are those of the whole episode, bit for bit: with an `AlarmRule`
     those of `cusum.cusum`, whose sum starts again after an alarm, with a `GuaranteedAlarm` its own,
-    whose alarm lasts as long as the statistic is above the threshold.
-
-    Attributes
-    ----------
-    statistic : float
-        After the last score, before the new start that an alarm of an `AlarmRule` brings.
+    whose alarm lasts as long as the statistic is above the threshold. `statistic` is that after the
+    last score, before the new start that an alarm of an `AlarmRule` brings.
 
     Examples
     --------

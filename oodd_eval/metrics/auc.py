@@ -142,19 +142,10 @@ def auc_contributions(
     anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
     effects: Sequence[int], standardization: Standardization,
 ) -> dict[str, Contribution]:  # fmt: skip
-    """Return the AUCs of one cell.
+    """Return the AUCs of one cell, from scores of the anomalous trajectories and of their twins.
 
-    Parameters
-    ----------
-    anomalous, twins
-        Scores of the n anomalous trajectories and of their nominal twins.
-    onsets, effects
-        Rows from which on each anomaly is in force, and from which on it differs from its twin.
-    standardization
-        That of the calibration scores, for ``auc_smoothed``.
+    The standardization, of the calibration scores, is for ``auc_smoothed``.
 
-    Notes
-    -----
     ``auc`` and ``auc_null`` compare rows from the onset on with rows before it. The others compare
     two trajectories at the same times, from the effect to the end of the shortest of those that
     are involved: with more times of one than of the other, their phase would be compared.

@@ -81,19 +81,12 @@ def drawn_cell(environment: str, seed: int, contribution: Contribution) -> Drawn
 
 
 def mean_interval(cells: Sequence[DrawnCell], *, kind: IntervalKind) -> tuple[float, float]:
-    """Return the 95 % interval of a mean over the cells where the metric is defined.
+    """Return the 95 % interval of a mean over those of one detector's cells that define the metric.
 
-    Parameters
-    ----------
-    cells
-        One detector's, of one or more detector seeds.
-    kind
-        ``"mean"``: see `bounds`. ``"share"``: the same, but where all trajectories are at one end
-        of [0, 1], the exact interval for that many trajectories. ``"exact"``: a share of nominal
-        twins, which are the same for all anomalies of an environment, with its exact interval.
+    Kind ``"mean"``: see `bounds`. ``"share"``: the same, but where all trajectories are at one end
+    of [0, 1], the exact interval for that many trajectories. ``"exact"``: a share of nominal
+    twins, which are the same for all anomalies of an environment, with its exact interval.
 
-    Notes
-    -----
     The exact interval of a share that is 0 everywhere holds for any independent trajectories of
     several environments with values in [0, 1]: with means p_i the chance of none is at most the
     product of 1 - p_i, which is at most (1 - p) ** n with p their mean.
@@ -117,22 +110,14 @@ def mean_interval(cells: Sequence[DrawnCell], *, kind: IntervalKind) -> tuple[fl
 
 
 def bounds(values: Samples, value: float, sizes: Sequence[int]) -> tuple[float, float]:
-    """Return the 95 % interval of a number from its value and its resamples, NaN left out.
+    """Return the 95 % interval of a number from its resamples, NaN left out, and its value.
 
     The percentiles are those of the bias-corrected accelerated bootstrap (BCa; Efron, J. Am. Stat.
     Assoc. 82, 1987), with two changes. Its acceleration is a sixth of the skewness of the
     resamples, which for means is what the jackknife gives and needs nothing but resamples. And
     its normal quantile is widened as Student's interval of a mean is: resamples spread as if the
-    variance were divided by n, not n - 1 (Hesterberg, Am. Stat. 69, 2015).
-
-    Parameters
-    ----------
-    values
-        Resamples.
-    value
-        The number itself.
-    sizes
-        Number of trajectories in each of the environments that it is a mean over.
+    variance were divided by n, not n - 1 (Hesterberg, Am. Stat. 69, 2015). `sizes` are the numbers
+    of trajectories in the environments that it is a mean over.
     """
     defined = values[~np.isnan(values)]
     if not defined.size:

@@ -42,17 +42,10 @@ UNDEFINED: Final = "\N{EN DASH}"
 class MetricInfo:
     """Facts about one metric.
 
-    Attributes
-    ----------
-    unit
-        ``"percent"``: a share that is printed in percent; ``"steps"``: observation rows;
-        ``"rate"``: a plain number, such as alarms per step.
-    better
-        ``"higher"`` or ``"lower"``; empty where a metric describes a benchmark or a setting.
-    null
-        Metric that says what chance or false alarms alone give; possibly empty.
-    level
-        Level of its guaranteed alarms, such as ``"5 %"``; otherwise empty.
+    Its unit is ``"percent"`` for a share that is printed in percent, ``"steps"`` for observation
+    rows, ``"rate"`` for a plain number, such as alarms per step. `better` is empty where a metric
+    describes a benchmark or a setting, `null` is the metric that says what chance or false alarms
+    alone give, and `level` is the level of guaranteed alarms, such as ``"5 %"``.
     """
 
     name: str

@@ -314,17 +314,12 @@ def check_prefix(found: Scores, whole: Scores, *, detector: str, where: str) -> 
 
 
 def difference(found: Scores, whole: Scores, tolerance: float = 0.0) -> str:
-    """Return where scores differ first from those of a whole episode; empty when they do not.
+    """Return where scores of first rows differ from the `whole` episode's; empty if nowhere.
 
-    Parameters
-    ----------
-    found, whole
-        Scores of the first rows of an episode, or of all, and of the whole episode.
-    tolerance
-        Relative to how far scores vary around the score: to its distance from the k-th nearest
-        other score of the episode, k being a tenth of all. So neither a constant that is added to
-        scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
-        scores are equal, they have to be equal in `found`, too.
+    The tolerance is relative to how far scores vary around the score: to its distance from the
+    k-th nearest other score of the episode, k being a tenth of all. So neither a constant that is
+    added to scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
+    scores are equal, they have to be equal in `found`, too.
     """
     import numpy as np  # noqa: PLC0415  see above
 

@@ -232,15 +232,10 @@ class Plugins:
 
 
 def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = None) -> Plugins:
-    """Find the installed plug-ins, without loading any.
+    """Find the installed plug-ins, without loading any; those `disabled` are left out.
 
-    Parameters
-    ----------
-    disabled
-        Names of plug-ins to leave out.
-    only
-        Names of those to take, beside the built-in rows. None means all, or those that the
-        environment variable ``OODD_EVAL_PLUGINS`` names.
+    `only` names those to take, beside the built-in rows. None means all, or those that the
+    environment variable ``OODD_EVAL_PLUGINS`` names.
     """
     every = entry_points()
     points, observers = (

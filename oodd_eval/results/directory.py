@@ -54,13 +54,7 @@ class ScoreFile:
 
 
 class ResultsDirectory:
-    """Access to one results directory.
-
-    Parameters
-    ----------
-    path
-        The directory; it need not exist for reading to be attempted or writing to begin.
-    """
+    """Access to one results directory, which need not exist yet."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -69,14 +63,8 @@ class ResultsDirectory:
     def prepare(self) -> None:
         """Make the directory, and find out before any work is done whether it can be used.
 
-        What a killed run left half written is removed.
-
-        Raises
-        ------
-        OutputError
-            When it cannot be written to.
-        ResultsError
-            When it has records already that cannot be read, and so not be added to.
+        What a killed run left half written is removed. `OutputError`: it cannot be written to.
+        `ResultsError`: it has records that cannot be read, and so not be added to.
         """
         try:
             for part in ("scores", "logs"):
@@ -95,12 +83,9 @@ class ResultsDirectory:
         self.fits.remove_abandoned()
 
     def records(self) -> list[Record]:
-        """Read all records; those of a large entry of the leaderboard are compressed, in ``.gz``.
+        """Read all records; `ResultsError` when there are none, or one cannot be read.
 
-        Raises
-        ------
-        ResultsError
-            When there are none, or one cannot be read.
+        Those of a large entry of the leaderboard are compressed, in ``.gz``.
         """
         file = files.find_file(self.path / RECORDS) or self.path / RECORDS
         if not file.exists():
@@ -111,15 +96,11 @@ class ResultsDirectory:
         return read_records(file)
 
     def merge_records(self, records: Iterable[Record]) -> list[Record]:
-        """Write records into the directory; newer ones replace those of the same cell.
+        """Write records into the directory, and return all that it has then.
 
-        A failed one is also replaced by one of the same cell with other parameters, or of a
-        version of the detector that has other parameters.
-
-        Returns
-        -------
-        All records of the directory: earlier ones in their places, new cells behind them. Places
-        of cells that are replaced are filled in the order of `records`, so that the end is the same
+        Newer records replace those of the same cell. A failed one is also replaced by one of the
+        same cell with other parameters. Earlier records keep their places and new cells follow.
+        Places of replaced cells are filled in the order of `records`, so that the end is the same
         whether records come at once or one by one.
         """
         with files.lock(self.path):
@@ -159,18 +140,9 @@ class ResultsDirectory:
                 )
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
-        """Read the scores of a unit.
+        """Read those parts of a unit's scores that `lengths` names, with observations by trajectory.
 
-        Parameters
-        ----------
-        key
-            Of the unit.
-        lengths
-            For each part that is needed, the number of observations of its trajectories.
-
-        Returns
-        -------
-        The parts asked for; None when the file is absent, damaged, lacks a part, or does not fit.
+        None when the file is absent, damaged, lacks a part, or does not fit.
         """
         try:
             with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:

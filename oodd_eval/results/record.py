@@ -174,19 +174,9 @@ class Record:
 
     @classmethod
     def from_json(cls, line: str, where: str = "record") -> "Record":
-        """Read a record back.
+        """Read a record back; `ResultsError` when the line is not a record of this schema.
 
-        Parameters
-        ----------
-        line
-            One JSON object.
-        where
-            Where it stands, for messages: ``"out/records.jsonl:3"``.
-
-        Raises
-        ------
-        ResultsError
-            When it is not a record of this schema.
+        `where` says in messages where it stands, such as ``"out/records.jsonl:3"``.
         """
         from pydantic import ValidationError  # noqa: PLC0415  only where records are read
 

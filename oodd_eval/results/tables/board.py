@@ -214,18 +214,9 @@ def primary_settings(records: Iterable[Record]) -> set[Setting]:
 def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None) -> RankedBoard:
     """Rank the rows of one board that have a value in every cell, with all their detector seeds.
 
-    Parameters
-    ----------
-    records
-        Of one board.
-    primary
-        The rows that push others down, one a detector; by default `primary_settings`. They need
-        three detector seeds, unless the seed changes nothing.
-
-    Raises
-    ------
-    ResultsError
-        When such rows differ in their numbers of test trajectories, or two rows have one name.
+    Primary rows, one a detector, push others down; by default `primary_settings`. They need three
+    detector seeds, unless the seed changes nothing. `ResultsError`: ranked rows differ in their
+    numbers of test trajectories, or two rows have one name.
     """
     by_row: dict[Setting, list[Record]] = {}
     for r in sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly)):

@@ -139,18 +139,9 @@ def guaranteed(
 ) -> Table | None:  # fmt: skip
     """Return guaranteed alarms at a level, mean over cells; None when no record has them.
 
-    Parameters
-    ----------
-    board
-        The records.
-    suffix
-        Of the level; by default ``at_5pct``, or the strictest that the records have.
-    intervals
-        Whether all figures have intervals; false episodes always have.
-    nulls
-        Whether each figure stands beside what false alarms alone give.
-    standings
-        Where given, rows are in their order and have their places.
+    The level is by default ``at_5pct``, or the strictest that the records have. False episodes
+    always have `intervals`. With `nulls` each figure stands beside what false alarms alone give.
+    Where `standings` are given, rows are in their order and have their places.
     """
     suffix = suffix or _strictest(board)
     bases = _ALARMS if not nulls else GUARANTEED
