@@ -34,12 +34,9 @@ NAMESPACE: Final = "oodd"
 
 
 def export(
-    split: Split,
-    directory: Path,
-    *,
-    environments: Sequence[str],
+    split: Split, directory: Path, *, environments: Sequence[str],
     progress: Callable[[str], None] = lambda _identity: None,
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Write all parts of some environments below Minari's root; return the ids of the datasets.
 
     Ids are such as ``oodd/mini/hopper/test-iid-v0``; `progress` is called with each when written.

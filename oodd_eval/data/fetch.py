@@ -52,12 +52,9 @@ class Fetched:
 
 
 def fetch(
-    place: str,
-    *,
-    output: Path | None = None,
-    digest: str | None = None,
+    place: str, *, output: Path | None = None, digest: str | None = None,
     progress: Progress = lambda _file: None,
-) -> Fetched:
+) -> Fetched:  # fmt: skip
     """Fetch a split and install it in `output`, by default its name below `data_home`.
 
     One with another digest than a given one is refused. `progress` is called with the name of each

@@ -252,18 +252,16 @@ def _manifest_schema() -> Any:
 
 
 def write_manifest(
-    directory: Path,
-    definition: SplitDefinition,
-    environments: Mapping[str, Any],
-    generator: int,
-    versions: Mapping[str, str],
-) -> None:
+    directory: Path, definition: SplitDefinition, environments: Mapping[str, Any],
+    generator: int, versions: Mapping[str, str],
+) -> None:  # fmt: skip
     """Write ``manifest.json`` in one step from the entries of environments, in their order."""
     recipe = dataclasses.asdict(definition)
-    digest = split_digest(environments, recipe)
-    manifest = {"schema": SCHEMA, "name": definition.name, "definition": recipe}
-    manifest |= {"generator": generator, "environments": environments, "digest": digest}
-    manifest["versions"] = versions
+    manifest = {
+        "schema": SCHEMA, "name": definition.name, "definition": recipe, "generator": generator,
+        "environments": environments, "digest": split_digest(environments, recipe),
+        "versions": versions,
+    }  # fmt: skip
     write_text(directory / MANIFEST, json.dumps(manifest, indent=1) + "\n")
 
 

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -133,6 +133,14 @@ class Split:
             stack.pop_all()
         digest = layout.environment_digest(self.manifest["environments"][name])
         return EnvironmentData(name, file, digest)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
+        """Give what opens environments, each once; all are closed when the block is left."""
+        with contextlib.ExitStack() as stack:
+            yield functools.cache(
+                lambda name: stack.enter_context(contextlib.closing(self.environment(name)))
+            )
 
     def verify(self) -> Iterator[GroupCheck]:
         """Compare every group with the manifest; `SplitError` when a file cannot be read."""

@@ -213,25 +213,18 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     packages = {r.plugin.partition(":")[0]: r.detector_version for r in records}
     packages |= recorded_versions(records)
     platforms = sorted({r.provenance.get("platform", "") for r in records})
-    environment = {
-        "python": packages.pop("python"),
-        "platform": "+".join(platforms)[:200],
-        "packages": dict(sorted(packages.items())),
-    }
+    environment = {"python": packages.pop("python"), "platform": "+".join(platforms)[:200],
+                   "packages": dict(sorted(packages.items()))}  # fmt: skip
     stated = asdict(statement) | {
         "id": name,
         "title": statement.title or f"{shown} on {first.split}",
         "primary": [str(Setting.parse(row)) for row in statement.primary],
     }
     return EntryInfo(
-        **stated,
-        detectors=detectors,
-        **{name: getattr(first, name) for name in ("split", "split_digest", "protocol")},
-        plugins=plugins,
-        environment=environment,
-        created=datetime.now(UTC).date().isoformat(),
-        command=command_of(records),
-    )
+        **stated, detectors=detectors, split=first.split, split_digest=first.split_digest,
+        protocol=first.protocol, plugins=plugins, environment=environment,
+        created=datetime.now(UTC).date().isoformat(), command=command_of(records),
+    )  # fmt: skip
 
 
 def command_of(records: Sequence[Record]) -> str:

@@ -52,11 +52,9 @@ def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
 
 
 def mean_matched_roc(
-    anomalous: Sequence[Floats],
-    twins: Sequence[Floats],
-    effects: Sequence[int],
+    anomalous: Sequence[Floats], twins: Sequence[Floats], effects: Sequence[int],
     fpr: Floats | Sequence[float] = FPR,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Return the matched ROC curve of a cell: averaged over trajectories at equal rates.
 
     Scores are compared at the times of ``auc_matched``, so the area under the average is the

@@ -7,20 +7,19 @@ import functools
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from oodd_eval.data import files
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData
+from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import AlarmRule
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.evaluate import stored_scores
+from oodd_eval.results.evaluate import must_be_of, stored_scores
 from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1
@@ -41,30 +40,19 @@ def make_curves(
     ResultsError: the split is not the one that the records are of, or scores are missing.
     """
     units = []
-    data: dict[str, EnvironmentData] = {}
     fitted: dict[str, tuple[Sweep, AlarmRule]] = {}
-    with ExitStack() as stack:
-        for record in records:
-            if not record.ok:
-                continue
-            if record.split_digest != split.digest:
-                raise ResultsError(
-                    f"{record.cell} is of a split with digest {record.split_digest[:12]}, but "
-                    f"split {split.name!r} here has {split.digest[:12]}: curves need the split "
-                    "that the scores are of"
-                )
-            if record.environment not in data:
-                data[record.environment] = split.environment(record.environment)
-                stack.callback(data[record.environment].close)
-            environment = data[record.environment]
-            scores = stored_scores([record], results, environment).parts
+    with split.opened() as environment:
+        for record in (r for r in records if r.ok):
+            must_be_of(split, record)
+            data = environment(record.environment)
+            scores = stored_scores([record], results, data).parts
             if record.scores not in fitted:
                 rule = AlarmRule(Standardization.fit(scores[CALIBRATION]))
                 at = thresholds(scores[TWINS], rule)
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
             anomalous = scores[f"test/{record.anomaly}"]
-            known = environment.anomalous(record.anomaly)
+            known = data.anomalous(record.anomaly)
             onsets, effects = (part[: len(anomalous)].tolist()
                                for part in (known.onsets, known.effects))  # fmt: skip
             curves = cell_curves(sweep, rule, anomalous, onsets, effects)

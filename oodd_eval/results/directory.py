@@ -140,9 +140,9 @@ class ResultsDirectory:
                 )
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
-        """Read those parts of a unit's scores that `lengths` names, with observations by trajectory.
+        """Read a unit's scores; None when the file is absent, damaged, lacks a part or misfits.
 
-        None when the file is absent, damaged, lacks a part, or does not fit.
+        `lengths` names the parts to read, with the observations of each of their trajectories.
         """
         try:
             with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:

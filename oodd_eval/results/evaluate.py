@@ -85,15 +85,10 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
 
 
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
-    anomalous = scores.parts[f"test/{record.anomaly}"]
-    known = data.anomalous(record.anomaly)
+    anomalous, known = scores.parts[f"test/{record.anomaly}"], data.anomalous(record.anomaly)
+    starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
     metrics, contributions = cell_metrics(
-        anomalous,
-        scores.parts[TWINS],
-        known.onsets[: len(anomalous)].tolist(),
-        known.effects[: len(anomalous)].tolist(),
-        rules,
-        environment=record.environment,
+        anomalous, scores.parts[TWINS], starts, effects, rules, environment=record.environment
     )
     per_trajectory = {
         name: (c.numerator.tolist(), c.denominator.tolist()) for name, c in contributions.items()
@@ -105,25 +100,25 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
     """Recompute the metrics of records from the stored scores, without any detector."""
     units: dict[tuple[str, str], list[Record]] = {}
     for record in records:
-        if record.split_digest != split.digest:
-            raise ResultsError(
-                f"{record.cell} is of a split with digest {record.split_digest[:12]}, but split "
-                f"{split.name!r} here has {split.digest[:12]}: name the right one with --split"
-            )
+        must_be_of(split, record)
         if record.ok:
             units.setdefault((record.environment, record.scores), []).append(record)
     fresh: dict[tuple[str, ...], Record] = {}
-    data: dict[str, EnvironmentData] = {}
-    try:
-        for (environment, _), own in units.items():
-            if environment not in data:
-                data[environment] = split.environment(environment)
-            scores = stored_scores(own, results, data[environment])
-            fresh |= {r.identity: r for r in evaluated(own, scores, data[environment])}
-    finally:
-        for opened in data.values():
-            opened.close()
+    with split.opened() as environment:
+        for (name, _), own in units.items():
+            data = environment(name)
+            found = evaluated(own, stored_scores(own, results, data), data)
+            fresh |= {record.identity: record for record in found}
     return [fresh.get(record.identity, record) for record in records]
+
+
+def must_be_of(split: Split, record: Record) -> None:
+    """Raise `ResultsError` for a record of another split."""
+    if record.split_digest != split.digest:
+        raise ResultsError(
+            f"{record.cell} is of a split with digest {record.split_digest[:12]}, but split "
+            f"{split.name!r} here has {split.digest[:12]}: name the right one with --split"
+        )
 
 
 def stored_scores(

@@ -45,15 +45,11 @@ def _commit() -> dict[str, Any]:
 
 
 def _git(*arguments: str) -> str:
-    done = subprocess.run(  # noqa: S603  fixed arguments
-        ["git", *arguments],  # noqa: S607  whichever git is on the path
-        cwd=_HOME,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=10,
+    command = ["git", *arguments]  # whichever git is on the path
+    text = subprocess.check_output(  # noqa: S603  fixed arguments
+        command, cwd=_HOME, stderr=subprocess.DEVNULL, text=True, timeout=10
     )
-    return done.stdout.strip()
+    return text.strip()
 
 
 def _cpu() -> str:

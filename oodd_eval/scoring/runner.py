@@ -7,11 +7,12 @@ are the same bytes for any number of jobs.
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
+from typing import Any
 
-from oodd_eval.data.parts import EnvironmentData, limited
+from oodd_eval.data.parts import limited
 from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
@@ -54,13 +55,12 @@ def run(
     executor = open_executor(settings, split, results)
     writer = RecordWriter(results)
     hearing = Observers(plugins, observers)
-    data: dict[str, EnvironmentData] = {}
     interrupted, done = False, 0
+    opened = ExitStack()
     try:
-        for environment in dict.fromkeys(unit.environment for unit in plan.units):
-            data[environment] = split.environment(environment)
+        data = opened.enter_context(split.opened())
         jobs = [
-            UnitJob(plan, unit, data[unit.environment], plugins.offer(unit.detector))
+            UnitJob(plan, unit, data(unit.environment), plugins.offer(unit.detector))
             for unit in plan.units
         ]
         hearing.notify("oodd_run_started", plan=plan)
@@ -78,8 +78,7 @@ def run(
         interrupted = True
     finally:
         executor.close()
-        for opened in data.values():
-            opened.close()
+        opened.close()
         writer.write()
     records = writer.records
     hearing.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
@@ -87,11 +86,9 @@ def run(
 
 
 def _as_they_finish(
-    jobs: Sequence[UnitJob],
-    executor: Executor,
-    settings: RunSettings,
+    jobs: Sequence[UnitJob], executor: Executor, settings: RunSettings,
     results: ResultsDirectory | None,
-) -> Generator[tuple[int, Scored], None, None]:
+) -> Generator[tuple[int, Scored], None, None]:  # fmt: skip
     """Yield places of jobs and their scores as they finish.
 
     A unit whose fit another unit is about to make waits for that one. Only a few more units are
@@ -143,22 +140,18 @@ def _as_they_finish(
 
 
 def _in_dependence(
-    jobs: Sequence[UnitJob],
-    executor: Executor,
-    settings: RunSettings,
+    jobs: Sequence[UnitJob], executor: Executor, settings: RunSettings,
     results: ResultsDirectory | None,
-) -> TopologicalSorter[int]:
+) -> TopologicalSorter[int]:  # fmt: skip
     """Return the places of all jobs, those that share a fit behind the first, which makes it."""
     graph: TopologicalSorter[int] = TopologicalSorter()
     makers: dict[str, int] = {}
     for index, job in enumerate(jobs):
         graph.add(index)
-        key = job.unit.fit_key
-        if not (executor.keeps_fits and results and key) or results.fits.has(
-            key, fresh=settings.fresh
-        ):
+        if not (executor.keeps_fits and results and (key := job.unit.fit_key)):
             continue
-        if (maker := makers.setdefault(key, index)) != index:
+        kept = results.fits.has(key, fresh=settings.fresh)
+        if not kept and (maker := makers.setdefault(key, index)) != index:
             graph.add(index, maker)
     return graph
 
@@ -170,17 +163,10 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
     # A whole number, also when it was read back from a file of floats.
     steps = int(cost["steps_scored"]) if "steps_scored" in cost else None
     device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
-    records = [
-        plan.blank(
-            unit,
-            anomaly,
-            status=scored.status,
-            reason=scored.reason,
-            counts={part: limited(len(known), plan.limit) for part, known in counts.items()},
-            steps_scored=steps,
-            provenance={**origin, **device},
-            **{name: cost[name] for name in COSTS if name in cost},
-        )
-        for anomaly in unit.anomalies
-    ]
+    outcome: dict[str, Any] = {
+        "status": scored.status, "reason": scored.reason, "steps_scored": steps,
+        "counts": {part: limited(len(known), plan.limit) for part, known in counts.items()},
+        "provenance": {**origin, **device}, **{name: cost[name] for name in COSTS if name in cost},
+    }  # fmt: skip
+    records = [plan.blank(unit, anomaly, **outcome) for anomaly in unit.anomalies]
     return evaluated(records, scored.file, job.data) if scored.status == "ok" else records

@@ -43,12 +43,9 @@ Seen = dict[object, tuple[str, str]]
 
 
 def verify_entry(
-    directory: Path,
-    *,
-    name: str = "",
-    split: str | Path | None = None,
+    directory: Path, *, name: str = "", split: str | Path | None = None,
     rerun: Sequence[Record] = (),
-) -> EntryVerdict:
+) -> EntryVerdict:  # fmt: skip
     """Check one entry, which is going to have another name if one is given.
 
     `split` is the name or path of its split, where that is not at its usual place; `rerun` are the

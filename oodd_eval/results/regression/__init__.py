@@ -213,12 +213,9 @@ def compare(
             new += [Difference(*_parts(cell), t, NAN, own[cell].value(t.metric), "new")
                     for t in used]  # fmt: skip
     new.sort(key=lambda d: (d.split, d.detector, d.place))
-    notes += [
-        f"Not compared: {c}, which is only in {one.where}."
-        for one, other in ((reference, now), (now, reference))
-        for c in one.boards
-        if c not in other.boards
-    ]
+    for one, other in ((reference, now), (now, reference)):
+        alone = (c for c in one.boards if c not in other.boards)
+        notes += [f"Not compared: {c}, which is only in {one.where}." for c in alone]
     return Comparison([*differences, *new], by, common, notes)
 
 
@@ -243,9 +240,8 @@ def _outside(cells: Iterable[Cell], own: Iterable[Cell]) -> set[Cell]:
     """Return the cells of environments, or of settings and seeds, of which nothing is there now."""
     environments = {cell.environment for cell in own}
     rows = {(cell.setting, cell.seed) for cell in own}
-    return {
-        c for c in cells if c.environment not in environments or (c.setting, c.seed) not in rows
-    }
+    there = (c for c in cells if c.environment in environments and (c.setting, c.seed) in rows)
+    return set(cells) - set(there)
 
 
 def _parts(cell: Cell) -> _Place:
@@ -264,12 +260,9 @@ def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Place, list[Cell]]:
 
 
 def _compare_unit(
-    place: _Place,
-    pairs: Sequence[tuple[Record, Record | None]],
-    tolerances: Sequence[Tolerance],
-    *,
-    two_sided: bool,
-) -> list[Difference]:
+    place: _Place, pairs: Sequence[tuple[Record, Record | None]], tolerances: Sequence[Tolerance],
+    *, two_sided: bool,
+) -> list[Difference]:  # fmt: skip
     """Compare one cell, or the mean over several, in every metric."""
     present = [(r, n) for r, n in pairs if n is not None]
     failed = [n for r, n in present if r.ok and not n.ok]
@@ -288,11 +281,8 @@ def _compare_unit(
         verdict, reason, fails = "recovered", f"was {recovered[0]}", two_sided
     else:
         reason, fails = f"fails in both: {present[0][1].status}", False
-    means = [nan_mean(r.value(t.metric) for r, _ in pairs) for t in tolerances]
-    return [
-        Difference(*place, t, mean, NAN, verdict, fails, reason)
-        for t, mean in zip(tolerances, means, strict=True)
-    ]
+    means = {t: nan_mean(r.value(t.metric) for r, _ in pairs) for t in tolerances}
+    return [Difference(*place, t, means[t], NAN, verdict, fails, reason) for t in tolerances]
 
 
 def _compare_metric(

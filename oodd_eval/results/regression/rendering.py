@@ -18,6 +18,7 @@ from rich.text import Text
 
 from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results.regression import MEANINGS, By, Comparison, Difference
+from oodd_eval.results.tables.board import grouped
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import escape
 from oodd_eval.results.tables.rendering import markdown as set_table
@@ -46,7 +47,7 @@ def tables(differences: Iterable[Difference], by: By = "cell") -> Iterator[tuple
     A verdict on a whole cell takes one row.
     """
     header = [by, "metric", "reference", "now", "difference", "tolerance", "verdict"]
-    for (split, detector), own in _by_detector(differences).items():
+    for (split, detector), own in grouped(differences, _suite).items():
         several = Counter((d.place, d.verdict) for d in own)
         rows: dict[tuple[str, str], list[str]] = {}
         colours = []
@@ -125,11 +126,8 @@ def _markdown_tables(differences: Iterable[Difference], by: By) -> list[str]:
     return [set_table(replace(t, title=escape(t.title))) for t, _ in tables(differences, by)]
 
 
-def _by_detector(differences: Iterable[Difference]) -> dict[tuple[str, str], list[Difference]]:
-    found: dict[tuple[str, str], list[Difference]] = {}
-    for d in differences:
-        found.setdefault((d.split, d.detector), []).append(d)
-    return found
+def _suite(d: Difference) -> tuple[str, str]:
+    return d.split, d.detector
 
 
 def _number(value: float, metric: str) -> str:
@@ -158,7 +156,7 @@ def junit(comparison: Comparison) -> str:
     """
     whole = {"name": "oodd-eval compare", **_counts(comparison.differences)}
     root = ET.Element("testsuites", whole)
-    for (split, detector), differences in _by_detector(comparison.differences).items():
+    for (split, detector), differences in grouped(comparison.differences, _suite).items():
         name = _clean(f"{split}::{detector}")
         suite = ET.SubElement(root, "testsuite", {"name": name, **_counts(differences)})
         suite.set("skipped", str(sum(d.verdict == "new" for d in differences)))

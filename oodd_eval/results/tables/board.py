@@ -3,9 +3,9 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, metric_info
 from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
+
+Item = TypeVar("Item")
+Key = TypeVar("Key")
 
 SEEDS: Final = 3
 """Detector seeds that a primary row of a detector with randomness needs to be ranked."""
@@ -47,12 +50,10 @@ class Board:
         first = self.records[0]
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
-        self._cells: dict[tuple[Setting, str, str], list[Record]] = {}
+        self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         self._plugins: dict[Setting, str] = {}
-        for r in self.records:
-            setting = r.setting
-            self._cells.setdefault((setting, r.environment, r.anomaly), []).append(r)
-            self._plugins.setdefault(setting, r.plugin)
+        for (setting, _, _), own in self._cells.items():
+            self._plugins.setdefault(setting, own[0].plugin)
         self.entries = list(self._plugins)
         self.environments = [e for e in ENVIRONMENTS if any(e == own for _, own, _ in self._cells)]
         self.anomalies = [a for a in ANOMALIES if any(a == own for _, _, own in self._cells)]
@@ -115,11 +116,16 @@ class Board:
 
 def boards(records: Sequence[Record]) -> list[Board]:
     """Sort records into boards: no table mixes split digests, protocols or limits."""
-    groups: dict[tuple[str, int, object], list[Record]] = {}
-    for record in records:
-        key = record.split_digest, record.protocol, record.limit
-        groups.setdefault(key, []).append(record)
+    groups = grouped(records, lambda r: (r.split_digest, r.protocol, r.limit))
     return [Board(group) for group in groups.values()]
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Return records or the like by key, keys in the order in which they occur."""
+    found: dict[Key, list[Item]] = {}
+    for item in items:
+        found.setdefault(key(item), []).append(item)
+    return found
 
 
 def contribution(record: Record, metric: str) -> Contribution:
@@ -197,9 +203,7 @@ def primary_settings(records: Iterable[Record]) -> set[Setting]:
     That is the row with the fewest other than default parameters, and then the least horizon. Cells
     and seeds come first, so that part of a row does not stand for a detector that has a whole one.
     """
-    by_row: dict[Setting, list[Record]] = {}
-    for r in records:
-        by_row.setdefault(r.setting, []).append(r)
+    by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
         cells = {(r.environment, r.anomaly) for r in by_row[row]}
@@ -218,9 +222,8 @@ def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None
     detector seeds, unless the seed changes nothing. `ResultsError`: ranked rows differ in their
     numbers of test trajectories, or two rows have one name.
     """
-    by_row: dict[Setting, list[Record]] = {}
-    for r in sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly)):
-        by_row.setdefault(r.setting, []).append(r)
+    own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly))
+    by_row = grouped(own, lambda r: r.setting)
     labels = Counter(map(str, by_row))
     if twice := [label for label, n in labels.items() if n > 1]:
         raise ResultsError(
@@ -243,21 +246,16 @@ def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None
     board = Board([record for entry in order for record in by_row[entry]])
     standings = [
         Standing(
-            entry=entry,
-            records=by_row[entry],
-            trivial=board.is_trivial(entry),
-            primary=entry in first,
-            rank=ranking.ranks.get(str(entry)),
-            alarm_rank=alarms.ranks.get(str(entry)),
-            ties=ranking.letters(str(entry)),
-            state=states[entry],
-            alarm_state=by_alarms[entry],
+            entry=entry, records=by_row[entry], trivial=board.is_trivial(entry),
+            primary=entry in first, rank=ranking.ranks.get(str(entry)),
+            alarm_rank=alarms.ranks.get(str(entry)), ties=ranking.letters(str(entry)),
+            state=states[entry], alarm_state=by_alarms[entry],
             wins=nan_mean(rate for (one, _), rate in rates.items() if one == str(entry)),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
         )
         for entry in order
-    ]
+    ]  # fmt: skip
     return RankedBoard(board, standings, ranking, alarms, rates)
 
 

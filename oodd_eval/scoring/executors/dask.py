@@ -14,7 +14,6 @@ import contextlib
 import functools
 import threading
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -179,14 +178,9 @@ def _scored(order: Message, stop: Stop) -> Message:
         order["split"]["path"], order["split"]["name"], plan.split_digest, unit.environment
     )
     scored = UnitJob(plan, unit, data, offer)(Limits(**order["limits"]), stop, None, fresh=True)
-    return {
-        "status": scored.status,
-        "reason": scored.reason,
-        "log": scored.log,
-        "parts": scored.file.parts,
-        "cost": scored.file.cost,
-        "order": scored.file.order,
-    }
+    outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
+    file = scored.file
+    return {**outcome, "parts": file.parts, "cost": file.cost, "order": file.order}
 
 
 def _unit(plain: Message) -> Unit:
@@ -200,14 +194,10 @@ def _unit(plain: Message) -> Unit:
 @functools.lru_cache(maxsize=16)
 def _environment(path: str, name: str, digest: str, environment: str) -> EnvironmentData:
     """Open one environment of the split with a digest; it stays open for the units to come."""
-    places: tuple[Callable[[], Split], ...] = (
-        lambda: load_split(Path(path)),
-        lambda: load_split(name),
-    )
     looked = []
-    for place in places:
+    for place in (Path(path), name):
         try:
-            split = place()
+            split = load_split(place)
         except OoddError as error:
             looked.append(str(error))
             continue
