@@ -18,13 +18,11 @@ from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
 from oodd_eval.results.directory import ResultsDirectory
 
-RESULTS: Final = "leaderboard/results"
-"""Directory of the entries, from the root of a checkout."""
+RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
 
 SPLIT: Final = "where the split is, if not at its usual place"
 
-MOST_SHOWN: Final = 30
-"""Problems of an entry that are printed without -v."""
+MOST_SHOWN: Final = 30  # problems of an entry that are printed without -v
 
 
 def define(parser: Parser) -> None:

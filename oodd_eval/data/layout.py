@@ -39,8 +39,7 @@ ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {
 }
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
-_BLOCK: Final = 1 << 21
-"""Bytes that are held at once while content is digested or written."""
+_BLOCK: Final = 1 << 21  # bytes that are held at once while content is digested or written
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

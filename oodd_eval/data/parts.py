@@ -30,8 +30,7 @@ NAMES: Final = "names"
 _ROWS: Final = 1 << 14
 """Transitions that are read at once from a large part, unless a single trajectory has more."""
 
-_KEPT: Final = 1 << 24
-"""Bytes up to which a part is decompressed once and kept."""
+_KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 
 
 class TrajectorySet(TrajectorySequence):

@@ -36,11 +36,8 @@ beat them has found nothing. AUC is the paper's, for which the trivial row *cloc
 construction. Brackets hold 95 % intervals.
 """
 
-MANY: Final = 6
-"""Findings beyond which they are folded away."""
-
-WIDEST: Final = 12
-"""Rows beyond which the matrix of win rates is left to ``comparisons.csv``."""
+MANY: Final = 6  # findings beyond which they are folded away
+WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
 def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:

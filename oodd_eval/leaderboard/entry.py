@@ -25,16 +25,14 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import Record
 
-SCHEMA: Final = 1
-"""Version of the layout of an entry; a reader refuses others."""
+SCHEMA: Final = 1  # version of the layout of an entry; a reader refuses others
 
 ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
 SCORES: Final = "scores"
 
 Trust = Literal["reported", "re-scored", "re-run"]
-TRUST: Final[tuple[Trust, ...]] = get_args(Trust)
-"""Levels of trust, the lowest first."""
+TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest first
 
 
 @dataclass(frozen=True, slots=True)

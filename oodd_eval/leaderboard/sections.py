@@ -11,8 +11,7 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.board import RankedBoard, boards, primary_settings, ranked
 
-TABLES: Final = "tables"
-"""Directory of the CSV files."""
+TABLES: Final = "tables"  # directory of the CSV files
 
 _SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
 """Order of the boards: the leaderboard's own split, then from the most data to the least."""

@@ -19,11 +19,8 @@ from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, Standardization, cusum
 
 Floats = NDArray[np.float64]
 
-SMOOTHING: Final = 0.03
-"""Weight of the newest score in the moving average of ``auc_smoothed``."""
-
-FAR_START: Final = 20
-"""First row that ``far`` counts: horizons and warm-ups end here at the latest."""
+SMOOTHING: Final = 0.03  # weight of the newest score in the moving average of ``auc_smoothed``
+FAR_START: Final = 20  # first row that ``far`` counts: horizons and warm-ups end here at the latest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

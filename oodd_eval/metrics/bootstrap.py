@@ -29,13 +29,11 @@ RESAMPLES: Final = 2000
 LEVEL: Final = 0.95
 
 Weights = NDArray[np.float64]
-Samples = NDArray[np.float64]
-"""A number in every resample: shape (R,), NaN where it is undefined."""
+Samples = NDArray[np.float64]  # A number in every resample: shape (R,), NaN where it is undefined
 
 _NORMAL: Final = NormalDist()
 
-_NOISE: Final = 1e-12
-"""Relative difference that is taken for rounding."""
+_NOISE: Final = 1e-12  # relative difference that is taken for rounding
 
 
 def bootstrap_weights(

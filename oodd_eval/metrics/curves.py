@@ -17,15 +17,11 @@ from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Alarms, cusum
 FPR: Final = tuple((i / 24) ** 2 for i in range(25))
 """False-positive rates at which ROC curves are given, denser towards 0."""
 
-THRESHOLDS: Final = 25
-"""Number of CUSUM thresholds at which delay and false-alarm rate are given."""
+THRESHOLDS: Final = 25  # number of CUSUM thresholds at which delay and false-alarm rate are given
 
-BEFORE: Final = 40
-AFTER: Final = 60
-"""Rows of an example before its onset, and from it on."""
-
-LARGEST: Final = 1e12
-"""Scores and statistics beyond this many units are drawn as this many."""
+BEFORE: Final = 40  # rows of an example before its onset
+AFTER: Final = 60  # and from it on
+LARGEST: Final = 1e12  # scores and statistics beyond this many units are drawn as this many
 
 
 def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:

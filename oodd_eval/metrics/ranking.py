@@ -24,22 +24,19 @@ from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, bounds
 ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
 
-MIN_RESAMPLES: Final = 10_000
-"""Least number of bootstrap resamples."""
+MIN_RESAMPLES: Final = 10_000  # least number of bootstrap resamples
 
 RESAMPLES_PER_PAIR: Final = 50
 """Resamples per ordered pair: no p-value is below 1 / (R + 1), so R has to grow with the number of
 pairs for anything to stay significant after Holm's correction."""
 
-OWN_SEEDS: Final = "detector seeds"
-"""Source of noise that a row's own detector seeds are."""
+OWN_SEEDS: Final = "detector seeds"  # source of noise that a row's own detector seeds are
 
 NOISE: Final = 1e-12
 """Largest difference that is taken for rounding, so that equal rows are equal on every machine."""
 
 Floats = NDArray[np.float64]
-Place = tuple[str, str]
-"""Environment and anomaly; cells of one environment share their resamples."""
+Place = tuple[str, str]  # environment and anomaly; cells of one environment share their resamples
 Row = Mapping[int, Mapping[Place, Contribution]]
 """One row's contributions by detector seed and cell."""
 Influences = dict[str, Floats]

@@ -18,8 +18,7 @@ _T = TypeVar("_T")
 FILE: Final = Path(__file__).with_name("experiments.toml")
 
 MEAN: Final = "mean"
-TABLE_2: Final = "table-2"
-"""Returns of the policies, which need no detectors."""
+TABLE_2: Final = "table-2"  # returns of the policies, which need no detectors
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,7 @@ MAX_WARM_UP: Final = 20
 PROBES: Final = 4
 """Episodes of a unit that are scored a second time, cut short: a few percent of its cost."""
 
-MIN_ROWS: Final = 8
-"""Observations of the shortest episode that is cut."""
+MIN_ROWS: Final = 8  # observations of the shortest episode that is cut
 
 TOLERANCE: Final = 1e-5
 """Difference that stands for the same score where matrices differ in shape: see `difference`.

@@ -22,14 +22,12 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import must_be_of, stored_scores
 from oodd_eval.results.record import Record
 
-SCHEMA: Final = 1
-"""Version of the layout; a reader refuses others."""
+SCHEMA: Final = 1  # version of the layout; a reader refuses others
 
 LONGEST: Final = 1000
 """Most numbers in any list: a file has to stay small enough to be embedded in a page."""
 
-LARGEST: Final = 1e15
-"""No number is larger."""
+LARGEST: Final = 1e15  # no number is larger
 
 
 def make_curves(

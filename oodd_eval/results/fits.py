@@ -25,8 +25,7 @@ from oodd_eval.data.files import process_exists
 
 INDEX: Final = "fitted.json"
 
-MAX_BYTES: Final = 512 * 10**6
-"""A fitted detector larger than this is not kept."""
+MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
 
 _FILLING: Final = re.compile(r"\.(\d+)-")
 

@@ -22,8 +22,7 @@ from oodd_eval.errors import SimulationError, UnknownNameError
 
 _Rows = NDArray[np.float32]
 
-GENERATOR_VERSION: Final = 2
-"""Raised by every change that gives other bytes for the same seed."""
+GENERATOR_VERSION: Final = 2  # raised by every change that gives other bytes for the same seed
 
 FIRST_ONSET: Final = 30
 LAST_ONSET_SHARE: Final = 0.6

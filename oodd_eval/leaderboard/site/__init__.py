@@ -33,8 +33,7 @@ SCRIPTS: Final = (
 LEVELS: Final = 250
 """Least number of steps between zero and the largest value of a drawing, about one a pixel."""
 
-HEAVY: Final = 30
-"""A largest value this many times the typical one asks for a logarithmic scale."""
+HEAVY: Final = 30  # A largest value this many times the typical one asks for a logarithmic scale
 
 _STATIC = Path(__file__).with_name("static")
 

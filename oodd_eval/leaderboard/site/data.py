@@ -41,11 +41,9 @@ ENTRY_FIELDS: Final = (
 _ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
 
 Json = dict[str, Any]
-Units = Mapping[str, list[Json]]
-"""Curves of single cells by the id of their entry."""
+Units = Mapping[str, list[Json]]  # curves of single cells by the id of their entry
 
-SelectedCell = tuple[str, str]
-"""Environment and anomaly."""
+SelectedCell = tuple[str, str]  # environment and anomaly
 
 
 def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]:

@@ -35,8 +35,7 @@ from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
-ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})
-"""Files that may lie beside the entries."""
+ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
 
 Seen = dict[object, tuple[str, str]]
 """By cell or detector: the entry that has it, and the distribution that a detector is from."""

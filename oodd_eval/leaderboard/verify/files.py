@@ -33,8 +33,7 @@ MOST_SCORE_BYTES: Final = 64 * MB
 MOST_TOTAL_BYTES: Final = 128 * MB
 MOST_FILES: Final = 2000
 
-MOST_PROBLEMS: Final = 200
-"""Problems of one entry that are kept; more are counted."""
+MOST_PROBLEMS: Final = 200  # problems of one entry that are kept; more are counted
 
 _SCORE_FILE: Final = re.compile(rf"{SCORES}/[a-z0-9][a-z0-9._-]{{0,159}}\.h5")
 

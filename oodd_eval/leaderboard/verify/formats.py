@@ -37,8 +37,7 @@ MOST_TEST: Final = 2_000
 """Largest number of test trajectories: with more, recomputing the intervals takes too much room."""
 
 LONGEST_COMMAND: Final = 4000
-LARGEST: Final = 2**53
-"""Whole numbers beyond are not exact in a double."""
+LARGEST: Final = 2**53  # whole numbers beyond are not exact in a double
 
 MOST_COST: Final = 1e9
 """Seconds (thirty years) or megabytes (a thousand terabytes): nobody measured more."""

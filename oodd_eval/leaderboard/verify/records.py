@@ -37,14 +37,12 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
 from oodd_eval.results.tables.board import contribution
 
-Records = Mapping[str, Record]
-"""Records by where they stand."""
+Records = Mapping[str, Record]  # records by where they stand
 
 TOLERANCE: Final = 1e-12
 """Relative and absolute: sums may be taken in another order on another processor."""
 
-MOST_ROWS: Final = 64
-"""Rows of one entry; the paper's comparisons are some twenty."""
+MOST_ROWS: Final = 64  # rows of one entry; the paper's comparisons are some twenty
 
 
 def same(first: float, second: float) -> bool:

@@ -45,8 +45,7 @@ _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
 _FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
 
 Json = dict[str, Any]
-Complaints = Iterator[tuple[str, str]]
-"""Places in a file and what is wrong with them."""
+Complaints = Iterator[tuple[str, str]]  # places in a file and what is wrong with them
 
 _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
     (lambda d, _: isinstance(d, h5py.Dataset), "a dataset"),

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS
 
-Sums = Mapping[str, Contribution]
-"""Numerators and denominators of a record by metric."""
+Sums = Mapping[str, Contribution]  # numerators and denominators of a record by metric
 
-Mask = NDArray[np.bool_]
-"""Trajectories in which something is wrong."""
+Mask = NDArray[np.bool_]  # trajectories in which something is wrong
 
 Wrong = Iterator[tuple[str, Mask, str]]
 """Metrics, the trajectories in which they are wrong, and what is expected instead."""

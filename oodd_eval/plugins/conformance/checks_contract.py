@@ -11,8 +11,7 @@ from oodd_eval.plugins.contract import MAX_WARM_UP, Detector, Scores
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
 
-LEAST_AUC = 0.75
-"""Least probability that a gross anomaly scores above its nominal twin."""
+LEAST_AUC = 0.75  # least probability that a gross anomaly scores above its nominal twin
 
 _OTHER_SENSORS = 7
 

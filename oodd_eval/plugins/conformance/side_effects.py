@@ -73,8 +73,7 @@ class Effects(Events):
     running: list[str] = field(default_factory=list)  # threads and child processes left
 
 
-DAEMON: Final = "daemon thread"
-"""Prefix of the daemon threads in `Effects.running`."""
+DAEMON: Final = "daemon thread"  # prefix of the daemon threads in `Effects.running`
 
 _install: Final = functools.cache(sys.addaudithook)
 _recording: Final[list[Events]] = []  # the audit hook writes to the last one

@@ -22,8 +22,7 @@ from oodd_eval.plugins.isolation.worker import connect
 GATES: Final = frozenset({"factory", "fits"})
 """Checks without which no other one can be carried out."""
 
-MOST_ENDS: Final = 3
-"""After so many checks that ended their process, the rest are not tried."""
+MOST_ENDS: Final = 3  # after so many checks that ended their process, the rest are not tried
 
 
 def supervise(

@@ -24,8 +24,7 @@ from oodd_eval.plugins.isolation.worker import reason_of
 SENSORS: Final = 3
 ACTIONS: Final = 2
 EPISODES: Final = 12
-ROWS: Final = 80
-"""Observations of an episode, beyond the horizon."""
+ROWS: Final = 80  # observations of an episode, beyond the horizon
 
 Factory = Callable[..., Detector] | DetectorSpec
 """A detector's factory, or the spec that a plug-in offers."""

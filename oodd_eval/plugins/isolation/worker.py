@@ -50,8 +50,7 @@ _STATUSES: Final[dict[type[BaseException], str]] = {
 SCORED: Final = 93
 """Exit code of a process that has scored its group: no other one that ends itself has it."""
 
-PATIENCE: Final = 1.0
-"""Seconds that threads and processes of a fit have to end."""
+PATIENCE: Final = 1.0  # seconds that threads and processes of a fit have to end
 
 
 class TrajectoryFile(TrajectorySequence):

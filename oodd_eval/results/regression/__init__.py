@@ -20,8 +20,7 @@ from oodd_eval.results.regression.reference import Conditions, RecordSet
 
 By = Literal["cell", "group", "mean"]
 Side = Literal["+", "-", "±"]
-_Place = tuple[str, str, str]
-"""Split, place and detector of a difference."""
+_Place = tuple[str, str, str]  # split, place and detector of a difference
 
 Verdict = Literal[
     "same", "within", "better", "worse", "undefined", "failed", "missing", "recovered", "new"

@@ -30,8 +30,7 @@ _SIMPLE: Final = ("random", "persistence", *_BLIND, "range", "mahalanobis", "rf"
 _FEW: Final = 30
 """Test seeds per environment below which a board says that its comparisons are weak."""
 
-_BRIEF: Final = "\N{DAGGER}"
-"""Marks the figures of brief cells."""
+_BRIEF: Final = "\N{DAGGER}"  # marks the figures of brief cells
 
 _ALARMS: Final = (
     "delay", "missed", *(f"found_within_{k}" for k in FOUND_WITHIN),

@@ -12,8 +12,7 @@ from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.unit import Scored, UnitJob
 
-LOCAL: Final = "local"
-"""The executor where none is named."""
+LOCAL: Final = "local"  # the executor where none is named
 
 
 @dataclass(frozen=True, slots=True)
