@@ -20,15 +20,9 @@ if TYPE_CHECKING:
 __all__ = ["Detector", "DetectorSpec", "Trajectory", "__version__", "check_detector", "evaluate",
            "hookimpl", "load_split"]  # fmt: skip
 
-_HOMES = {
-    "Detector": "plugins.contract",
-    "DetectorSpec": "plugins.contract",
-    "Trajectory": "data.trajectory",
-    "check_detector": "testing",
-    "evaluate": "api",
-    "hookimpl": "plugins",
-    "load_split": "data.split",
-}
+_HOMES = {"Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
+          "Trajectory": "data.trajectory", "check_detector": "testing", "evaluate": "api",
+          "hookimpl": "plugins", "load_split": "data.split"}  # fmt: skip
 
 
 def __getattr__(name: str) -> object:

@@ -18,14 +18,7 @@ import numpy as np
 
 from oodd_eval._version import __version__
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.parts import (
-    PARTS,
-    TRAIN,
-    AnomalousSet,
-    EnvironmentData,
-    TrajectorySet,
-    parts_of,
-)
+from oodd_eval.data.parts import PARTS, AnomalousSet, EnvironmentData, TrajectorySet, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OutputError
@@ -50,9 +43,8 @@ def export(
     try:
         for environment in environments:
             with contextlib.closing(split.environment(environment)) as data:
-                parts = {TRAIN: data.train, **parts_of(data, data.anomalies)}
-                for part, trajectories in parts.items():
-                    identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(part)}"
+                for trajectories in (data.train, *parts_of(data, data.anomalies).values()):
+                    identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(trajectories.group)}"
                     _write(directory, identity, data, trajectories, split)
                     written.append(identity)
                     progress(identity)

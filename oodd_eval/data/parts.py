@@ -200,8 +200,3 @@ def parts_of(data: EnvironmentData, anomalies: Iterable[str]) -> dict[str, Traje
 def lengths_of(sets: Mapping[str, TrajectorySet], limit: int | None) -> dict[str, list[int]]:
     """Return the number of observations of each trajectory to score, by part."""
     return {part: [int(n) + 1 for n in s.lengths[:limit]] for part, s in sets.items()}
-
-
-def limited(n: int, limit: int | None) -> int:
-    """Return the number of trajectories that are used out of n."""
-    return n if limit is None else min(n, limit)

@@ -128,10 +128,7 @@ def place_of(record: Record) -> tuple[Cell, str, int, int | None]:
 
 
 def recorded_versions(records: Iterable[Record]) -> dict[str, str]:
-    """Return the versions that records were made with, by package and for ``python``.
-
-    Several versions of one are joined by ``+``.
-    """
+    """Return the versions that made records, by package and for ``python``, joined by ``+``."""
     found: dict[str, set[str]] = {}
     for record in records:
         origin = record.provenance

@@ -161,10 +161,7 @@ def judge(
 
 
 def summary(made: Sequence[Ruling]) -> str:
-    """Return how many claims came to which verdict, under either kind of measure.
-
-    Claims that are settled by definition or by construction are told apart and not counted.
-    """
+    """Return how many claims came to which verdict by either measure; settled ones apart."""
 
     def counted(judged: Sequence[Judgement], claims: str) -> str:
         count = Counter(j.verdict for j in judged)

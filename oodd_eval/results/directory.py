@@ -83,10 +83,7 @@ class ResultsDirectory:
         self.fits.remove_abandoned()
 
     def records(self) -> list[Record]:
-        """Read all records; `ResultsError` when there are none, or one cannot be read.
-
-        Those of a large entry of the leaderboard are compressed, in ``.gz``.
-        """
+        """Read all records, also compressed ones; `ResultsError` without any, or a damaged one."""
         file = files.find_file(self.path / RECORDS) or self.path / RECORDS
         if not file.exists():
             raise ResultsError(

@@ -68,10 +68,7 @@ def metric_of(name: str, contribution: Contribution, environment: str) -> Metric
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
-    """Return the records of one unit's cells with their metrics, computed from its scores.
-
-    Cells whose scores cannot be standardized become ``invalid``.
-    """
+    """Return the records of a unit with metrics; ``invalid`` if scores cannot be standardized."""
     try:
         rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm)
     except OverflowError:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from typing import Any
 
-from oodd_eval.data.parts import limited
 from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
@@ -165,7 +164,7 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
     device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
     outcome: dict[str, Any] = {
         "status": scored.status, "reason": scored.reason, "steps_scored": steps,
-        "counts": {part: limited(len(known), plan.limit) for part, known in counts.items()},
+        "counts": {part: len(known.lengths[: plan.limit]) for part, known in counts.items()},
         "provenance": {**origin, **device}, **{name: cost[name] for name in COSTS if name in cost},
     }  # fmt: skip
     records = [plan.blank(unit, anomaly, **outcome) for anomaly in unit.anomalies]

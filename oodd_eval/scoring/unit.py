@@ -10,14 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.parts import (
-    TWINS,
-    EnvironmentData,
-    TrajectorySet,
-    lengths_of,
-    limited,
-    parts_of,
-)
+from oodd_eval.data.parts import TWINS, EnvironmentData, TrajectorySet, lengths_of, parts_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins.contract import (
@@ -120,7 +113,7 @@ class _Work:
     def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
         """Fit (or load a fit) and score in worker processes."""
         unit, data = self._job.unit, self._job.data
-        train = 0 if load else limited(len(data.train), self._job.plan.limit)
+        train = 0 if load else len(data.train.lengths[: self._job.plan.limit])
         request = {
             "plugin": unit.plugin, "detector": unit.detector, "parameters": dict(unit.parameters),
             "seed": unit.seed, "horizon": unit.horizon,

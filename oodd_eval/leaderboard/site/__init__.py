@@ -48,14 +48,9 @@ def page(sections: Sequence[LeaderboardSection]) -> str:
         for i, part in enumerate(curves)
     )
     parts = {
-        "version": __version__,
-        "style": style,
-        "style-hash": _digest(style),
-        "script": script,
-        "script-hash": _digest(script),
-        "data": embedded(data),
-        "curves": "\n".join(tags),
-    }
+        "version": __version__, "style": style, "style-hash": _digest(style), "script": script,
+        "script-hash": _digest(script), "data": embedded(data), "curves": "\n".join(tags),
+    }  # fmt: skip
     # One pass, so that nothing in the data is taken for a place to fill in.
     return re.sub(r"@([a-z-]+)@", lambda match: parts[match[1]], _static("page.html"))
 

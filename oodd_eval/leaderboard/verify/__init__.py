@@ -17,6 +17,7 @@ from oodd_eval.data.files import GZIP
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, place_of, recorded_versions
+from oodd_eval.leaderboard.verify import scores
 from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, shown
 from oodd_eval.leaderboard.verify.formats import read_info, read_records
 from oodd_eval.leaderboard.verify.records import (
@@ -24,12 +25,6 @@ from oodd_eval.leaderboard.verify.records import (
     check_against_split,
     check_record,
     check_together,
-)
-from oodd_eval.leaderboard.verify.scores import (
-    check_curves,
-    check_recomputed_curves,
-    check_rescored,
-    check_scores,
 )
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
 from oodd_eval.results.directory import RECORDS
@@ -67,8 +62,8 @@ def verify_entry(
         return EntryVerdict(name, findings, records, entry)
     _check_statements(entry, records, findings)
     check_together(entry, records, sums, findings)
-    scored = check_scores(directory, contents, records, findings)
-    curves = check_curves(contents, records, findings)
+    scored = scores.check_scores(directory, contents, records, findings)
+    curves = scores.check_curves(contents, records, findings)
     complete = bool(scored) and all(w in scored for w, r in records.items() if r.ok)
     rescored = False
     opened, note = find_split(entry.split, entry.split_digest, split)
@@ -80,9 +75,9 @@ def verify_entry(
         scored = {w: r for w, r in scored.items() if w in own}
         check_against_split(own, sums, opened, findings)
         if scored:
-            rescored = check_rescored(scored, directory, opened, findings) and complete
+            rescored = scores.check_rescored(scored, directory, opened, findings) and complete
         if scored and curves is not None and sound:
-            check_recomputed_curves(curves, scored, directory, opened, findings)
+            scores.check_recomputed_curves(curves, scored, directory, opened, findings)
     again = compare_rerun(records, rerun, findings) if rerun else None
     if entry.trust == "re-scored" and not complete:
         message = "is 're-scored', but scores are not there, or not sound, for every record"

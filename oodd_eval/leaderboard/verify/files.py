@@ -100,10 +100,7 @@ class Findings:
 
 
 def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
-    """Return the content of an entry's files by relative name.
-
-    Everything else in the directory is refused: other files, directories, links, devices.
-    """
+    """Return the content of an entry's files by name; all else in the directory is refused."""
     listed = _scan(entry, "", findings)
     if SCORES in listed and stat.S_ISDIR(listed[SCORES].st_mode):
         del listed[SCORES]

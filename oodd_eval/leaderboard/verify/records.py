@@ -23,13 +23,7 @@ from oodd_eval.leaderboard.verify.files import Findings, plain, shown
 from oodd_eval.leaderboard.verify.terms import Mask, Sums, delays_of, wrong_terms
 from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.auc import FAR_START
-from oodd_eval.metrics.catalogue import (
-    FOUND_WITHIN,
-    GUARANTEED,
-    LEVELS,
-    METRICS,
-    split_name,
-)
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS, split_name
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.evaluate import metric_of

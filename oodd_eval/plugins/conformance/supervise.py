@@ -28,10 +28,7 @@ MOST_ENDS: Final = 3  # after so many checks that ended their process, the rest 
 def supervise(
     offer: Offer, arguments: Mapping[str, Any], checks: Sequence[str], limits: Limits
 ) -> Iterator[Result]:
-    """Carry out checks in processes of their own, each within limits; yield what they came to.
-
-    `arguments` are those of `Trial`.
-    """
+    """Carry out checks of a `Trial` in processes of their own, within limits; yield results."""
     request = {"plugin": offer.plugin, "detector": offer.spec.name, "arguments": arguments}
     last = ""
     for _ in range(MOST_ENDS):

@@ -63,10 +63,7 @@ class RecordSet:
 
 
 def read_record_set(path: Path | str) -> RecordSet:
-    """Read the records of a results directory or of a file, such as a reference.
-
-    ResultsError: there are none, or one cannot be read.
-    """
+    """Read the records of a results directory or of a file, such as a reference."""
     path = Path(path)
     if not path.exists():
         raise ResultsError(

@@ -42,10 +42,7 @@ def worth_showing(comparison: Comparison) -> list[Difference]:
 
 
 def tables(differences: Iterable[Difference], by: By = "cell") -> Iterator[tuple[Table, list[str]]]:
-    """Yield a table for each split and detector, with the colour of each row.
-
-    A verdict on a whole cell takes one row.
-    """
+    """Yield tables by split and detector with each row's colour; a whole cell takes one row."""
     header = [by, "metric", "reference", "now", "difference", "tolerance", "verdict"]
     for (split, detector), own in grouped(differences, _suite).items():
         several = Counter((d.place, d.verdict) for d in own)
