@@ -19,8 +19,6 @@ _AMOUNTS: Final = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9,
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     """Return the known names that a comma list of names and globs, or ``"all"``, selects, in order.
 
-    Examples
-    --------
     >>> select("environment", "hopper,a*", ["acrobot", "ant", "hopper"])
     ['hopper', 'acrobot', 'ant']
     """
@@ -88,8 +86,6 @@ def expression(text: str) -> Predicate:
 
     Words are substrings, regardless of case; ``and``, ``or``, ``not`` and round brackets join them.
 
-    Examples
-    --------
     >>> wanted = expression("hopper and not (iid or drift)")
     >>> wanted("mini/hopper/gravity::rf[h=1,seed=0]"), wanted("mini/hopper/iid::rf[h=1,seed=0]")
     (True, False)

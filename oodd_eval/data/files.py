@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import psutil
+
 from oodd_eval.errors import OutputError, ResultsError
 
 GZIP: Final = ".gz"
@@ -48,19 +50,9 @@ def write_text(path: Path, text: str) -> None:
 def remove_abandoned(directory: Path) -> None:
     """Remove temporary files of `replacing` whose process has ended."""
     for file in directory.glob(".*"):
-        found = re.fullmatch(r"\..+\.(\d+)", file.name)
-        if found and not process_exists(int(found[1])):
+        found = re.fullmatch(r"\..+\.(\d{1,9})", file.name)
+        if found and not psutil.pid_exists(int(found[1])):
             file.unlink(missing_ok=True)
-
-
-def process_exists(pid: int) -> bool:
-    """Tell whether a process with this id runs, whoever owns it."""
-    with contextlib.suppress(PermissionError):
-        try:
-            os.kill(pid, 0)
-        except (ProcessLookupError, OverflowError):
-            return False
-    return True
 
 
 @contextlib.contextmanager

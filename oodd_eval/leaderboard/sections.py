@@ -1,7 +1,8 @@
 """Entries sorted into the boards of the leaderboard."""
 
+import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +10,7 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import TRUST, SubmittedEntry, Trust, place_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import RankedBoard, boards, primary_settings, ranked
+from oodd_eval.results.tables.board import RankedBoard, boards, grouped, primary_settings, ranked
 
 TABLES: Final = "tables"  # directory of the CSV files
 
@@ -60,30 +61,29 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     Several entries may have records in one row (further seeds or environments of a detector) as
     long as they are results of the same thing: the same plug-in, version, source and parameters.
     """
-    owner: dict[int, SubmittedEntry] = {}
-    cells: dict[object, SubmittedEntry] = {}
+    owners: dict[object, SubmittedEntry] = {}
     records: list[Record] = []
-    ordered = sorted(entries, key=lambda entry: entry.meta.id)
-    for entry in ordered:
+    for entry in sorted(entries, key=lambda entry: entry.meta.id):
         for record in entry.records:
-            if (other := cells.setdefault(place_of(record), entry)) is not entry:
+            if (other := owners.setdefault(place_of(record), entry)) is not entry:
                 raise ResultsError(
                     f"entries {other.meta.id!r} and {entry.meta.id!r} both hold {record.cell} of "
                     f"split digest {record.split_digest[:12]}, expected one: remove the entry that "
                     "is replaced, or give the detector another name"
                 )
-            owner[id(record)] = entry
             records.append(record)
+
+    def entries_of(own: Iterable[Record]) -> list[SubmittedEntry]:
+        found = {entry.meta.id: entry for entry in (owners[place_of(r)] for r in own)}
+        return [found[name] for name in sorted(found)]
+
     found = []
     for board in boards(records):
-        _refuse_mixtures(board.records, owner)
-        rows: dict[Setting, set[int]] = {}
-        for record in board.records:
-            rows.setdefault(record.setting, set()).add(ordered.index(owner[id(record)]))
-        sources = {row: [ordered[i] for i in sorted(own)] for row, own in rows.items()}
-        own = [ordered[i] for i in sorted(set().union(*rows.values()))]
+        rows = grouped(board.records, lambda r: r.setting)
+        _refuse_mixtures(rows, owners)
+        sources = {row: entries_of(own) for row, own in rows.items()}
         ranks = ranked(board.records, _primary(board.records, sources))
-        found.append(LeaderboardSection(ranks, own, sources))
+        found.append(LeaderboardSection(ranks, entries_of(board.records), sources))
     return sorted(found, key=lambda section: section.place)
 
 
@@ -121,17 +121,18 @@ def _primary(
     return set(found.values())
 
 
-def _refuse_mixtures(records: Sequence[Record], owner: Mapping[int, SubmittedEntry]) -> None:
+def _refuse_mixtures(
+    rows: Mapping[Setting, Sequence[Record]], owners: Mapping[object, SubmittedEntry]
+) -> None:
     """Refuse rows whose records are not of one plug-in, version, source and parameters."""
-    first: dict[Setting, Record] = {}
-    for record in records:
-        one = first.setdefault(record.setting, record)
-        for field in ("plugin", "detector_version", "plugin_source", "parameters"):
-            its, other = getattr(one, field), getattr(record, field)
+    fields = ("plugin", "detector_version", "plugin_source", "parameters")
+    for row, (first, *others) in rows.items():
+        for record, field in itertools.product(others, fields):
+            its, other = getattr(first, field), getattr(record, field)
             if its != other:
+                one, two = (owners[place_of(r)].meta.id for r in (first, record))
                 raise ResultsError(
-                    f"row {str(record.setting)!r} of split digest {record.split_digest[:12]} has "
-                    f"{field} {its!r} in entry {owner[id(one)].meta.id!r} and {other!r} in entry "
-                    f"{owner[id(record)].meta.id!r}, expected one thing per row: remove the entry "
-                    "that is replaced, or give the detector another name"
+                    f"row {str(row)!r} of split digest {record.split_digest[:12]} has {field} "
+                    f"{its!r} in entry {one!r} and {other!r} in entry {two!r}, expected one thing "
+                    "per row: remove the entry that is replaced, or give the detector another name"
                 )

@@ -107,8 +107,6 @@ def quantile_rank(n: int, level: float) -> int:
 
     It is the smallest k with ``1 - k / (n + 1) <= level``; above n no number of the n will do.
 
-    Examples
-    --------
     >>> quantile_rank(19, 0.05), quantile_rank(18, 0.05), quantile_rank(20, 0.10)
     (19, 19, 19)
     """
@@ -206,8 +204,6 @@ class Monitor:
     whose alarm lasts as long as the statistic is above the threshold. `statistic` is that after the
     last score, before the new start that an alarm of an `AlarmRule` brings.
 
-    Examples
-    --------
     >>> from oodd_eval.metrics.cusum import Standardization
     >>> monitor = Monitor(AlarmRule(Standardization(mean=0.0, std=0.01), drift=0.25, threshold=1))
     >>> [(monitor.update(score), monitor.statistic) for score in (0.5, 0.5, 2.0, 0.0)]

@@ -101,8 +101,6 @@ def smoothed(x: Floats, weight: float = SMOOTHING) -> Floats:
 
     NaN stays NaN and changes nothing. Once a score was infinite, so are all that follow.
 
-    Examples
-    --------
     >>> smoothed(np.array([np.nan, 1.0, 1.0]), weight=0.5).tolist()
     [nan, 0.5, 0.75]
     """

@@ -19,8 +19,6 @@ _EXACT: Final = 1e-15
 def incomplete_beta(a: float, b: float, x: float) -> float:
     """Return the regularized incomplete beta function I_x(a, b), for a, b > 0 and x in [0, 1].
 
-    Examples
-    --------
     >>> round(incomplete_beta(2, 3, 0.5), 12)  # P(at least 2 of 4 with chance 1/2) = 11 / 16
     0.6875
     """
@@ -56,8 +54,6 @@ def clopper_pearson(successes: float, trials: float, level: float = 0.95) -> tup
 
     Numbers need not be whole: means over detector seeds are between the intervals of whole ones.
 
-    Examples
-    --------
     >>> [round(end, 4) for end in clopper_pearson(1, 20)]
     [0.0013, 0.2487]
     """
@@ -73,8 +69,6 @@ def clopper_pearson(successes: float, trials: float, level: float = 0.95) -> tup
 def t_quantile(p: float, freedom: int) -> float:
     """Return a quantile, for p above one half, of Student's t distribution.
 
-    Examples
-    --------
     >>> round(t_quantile(0.975, 19), 4)
     2.093
     """

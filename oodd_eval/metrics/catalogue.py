@@ -162,8 +162,6 @@ NAMES: Final = (*METRICS, *(f"{name}_{suffix}" for suffix in LEVELS for name in 
 def metric_info(name: str) -> MetricInfo:
     """Return the facts about a metric that records can have, with or without a level's suffix.
 
-    Examples
-    --------
     >>> metric_info("missed_at_5pct").title
     'Missed at 5 %'
     """
@@ -188,8 +186,6 @@ def metric_info(name: str) -> MetricInfo:
 def split_name(name: str) -> tuple[str, str]:
     """Return a metric's name without the suffix of its level, and that suffix or nothing.
 
-    Examples
-    --------
     >>> split_name("delay_null_at_5pct"), split_name("delay_null")
     (('delay_null', 'at_5pct'), ('delay_null', ''))
     """

@@ -131,8 +131,6 @@ def detecta_alarms(
     comparison and enters no metric. Equal to ``detecta.detect_cusum(scores, threshold, drift,
     ending=False)[0]`` of detecta 0.1.0.
 
-    Examples
-    --------
     >>> detecta_alarms(np.array([0.0, 0.0, 1.0, 1.0, 0.0]), drift=0.0, threshold=0.5).tolist()
     [2, 4]
     """

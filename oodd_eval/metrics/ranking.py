@@ -176,8 +176,6 @@ def holm(p: Floats) -> Floats:
     at least as large as those of smaller p-values, and at most 1. Calling significant what is at
     most alpha keeps the chance of any false call at alpha, whatever the dependence.
 
-    Examples
-    --------
     >>> holm(np.array([0.01, 0.04, 0.03, 0.005])).round(3).tolist()
     [0.03, 0.06, 0.06, 0.02]
     """
@@ -195,8 +193,6 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
     second is told apart from neither. Then there are two groups, with the second row in both.
     Significant pairs are (better, worse).
 
-    Examples
-    --------
     >>> tie_groups(["a", "b", "c"], [("a", "c")])
     [('a', 'b'), ('b', 'c')]
     """
@@ -216,8 +212,6 @@ def win_rates(values: Mapping[str, Mapping[Place, float]]) -> dict[tuple[str, st
     Shares are over the cells that both have, equal values counting one half, so that a pair's two
     rates sum to 1; NaN without common cells.
 
-    Examples
-    --------
     >>> win_rates({"a": {("ant", "iid"): 0.9, ("ant", "drift"): 0.5},
     ...            "b": {("ant", "iid"): 0.8, ("ant", "drift"): 0.5}})["a", "b"]
     0.75

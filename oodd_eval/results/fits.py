@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.data.files import process_exists
+import psutil
 
 INDEX: Final = "fitted.json"
 
 MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
 
-_FILLING: Final = re.compile(r"\.(\d+)-")
+_FILLING: Final = re.compile(r"\.(\d{1,9})-")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class FitStore:
         """Remove directories that were being filled by processes that have ended."""
         for directory in self.path.glob(".*"):
             found = _FILLING.match(directory.name)
-            if found and not process_exists(int(found[1])):
+            if found and not psutil.pid_exists(int(found[1])):
                 shutil.rmtree(directory, ignore_errors=True)
 
 

@@ -16,7 +16,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, Typ
 from pydantic_core import ValidationError
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
-from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo, Trust
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
 from oodd_eval.results import record as record_format
@@ -68,17 +67,11 @@ def _text(longest: int, least: int = 0) -> AfterValidator:
     return _rule(lambda value: _is_text(value, longest, least), expected)
 
 
-def _is_day(value: str) -> bool:
+def _written_as(parse: Callable[[str], object], value: str) -> bool:
+    """Tell whether a text is what parsing it and writing it again gives."""
     try:
-        return date.fromisoformat(value).isoformat() == value
+        return str(parse(value)) == value
     except ValueError:
-        return False
-
-
-def _is_row(value: str) -> bool:
-    try:
-        return str(Setting.parse(value)) == value
-    except UsageError:
         return False
 
 
@@ -111,7 +104,10 @@ def _is_free(value: Any, levels: int = _DEEPEST) -> bool:
 
 # fmt: off
 Row = Annotated[str, _text(300, least=1), _rule(
-    _is_row, "detector and settings as on the board, such as 'riqn[h=5]'")]
+    functools.partial(_written_as, Setting.parse),
+    "detector and settings as on the board, such as 'riqn[h=5]'")]
+Day = Annotated[str, _rule(
+    functools.partial(_written_as, date.fromisoformat), "a date such as 2026-11-21")]
 EntryId = Annotated[str, _matching(
     r"(?!.*\.\.)[a-z0-9][a-z0-9._-]{0,79}",
     "at most 80 lower-case letters, digits, '.', '_', '-', no '..'")]
@@ -200,7 +196,7 @@ class _Entry(_Strict):
     protocol: Annotated[int, _one_of([PROTOCOL])]
     plugins: Annotated[list[_Plugin], Field(max_length=100)]
     environment: _Environment
-    created: Annotated[str, _rule(_is_day, "a date such as 2026-11-21")]
+    created: Day
     command: Command
     caption: Annotated[str, _text(500)]
     primary: Annotated[list[Row], Field(max_length=100)]

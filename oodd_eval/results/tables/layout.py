@@ -148,7 +148,8 @@ def guaranteed(
     if not names:
         return None
     shown = [n for n in names if intervals or n.startswith("false_episodes")]
-    columns = [c._replace(title=_short_title(c.metric)) for c in _overall(board, names, shown)]
+    columns = [c._replace(title=c.title.partition(" at ")[0].lower())
+               for c in _overall(board, names, shown)]  # fmt: skip
     level = f"{100 * LEVELS[suffix]:g} %"
     title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
     note = (
@@ -162,11 +163,6 @@ def _strictest(board: Board) -> str:
     """Return the suffix of the headline level, or of the strictest one that records have."""
     found = [s for s in LEVELS if _present(board, [f"false_episodes_{s}"])]
     return HEADLINE if HEADLINE in found or not found else found[-1]
-
-
-def _short_title(metric: str) -> str:
-    """Return the title of a metric in a table that is of one level."""
-    return metric_info(metric).title.partition(" at ")[0].lower()
 
 
 def anomaly_groups(
