@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
-from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.parts import AnomalousSet, EnvironmentData, TrajectorySet
 from oodd_eval.data.split import Split
 from oodd_eval.leaderboard.entry import EntryInfo, place_of
 from oodd_eval.leaderboard.verify.files import Findings, plain, shown
-from oodd_eval.leaderboard.verify.terms import Mask, Sums, delays_of, wrong_terms
+from oodd_eval.leaderboard.verify.terms import Sums, Wrong, delays_of, wrong_terms
 from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS, split_name
@@ -57,21 +57,19 @@ def check_record(where: str, record: Record, findings: Findings) -> Sums | None:
     sums = {name: contribution(record, name) for name in record.per_trajectory}
     fresh = {name: metric_of(name, c, record.environment) for name, c in sums.items()}
     compare_metrics(where, record, fresh, "per_trajectory gives", findings)
-    for name, mask, expected in wrong_terms(sums):
-        _refuse_terms(where, name, sums, mask, expected, findings)
+    _refuse_terms(where, sums, wrong_terms(sums), findings)
     for name in (n for n in record.metrics if n not in sums):
         _check_threshold(where, name, record, findings)
     return sums
 
 
-def _refuse_terms(
-    where: str, name: str, sums: Sums, wrong: Mask, expected: str, findings: Findings
-) -> None:
-    """Refuse the first wrong trajectory of a metric, if any."""
-    for i in np.flatnonzero(wrong)[:1]:
-        terms = f"{sums[name].numerator[i]:g} / {sums[name].denominator[i]:g}"
-        message = f"trajectory {i} is {terms}, expected {expected}"
-        findings.refuse(where, f"per_trajectory.{name}", message)
+def _refuse_terms(where: str, sums: Sums, wrong: Wrong, findings: Findings) -> None:
+    """Refuse the first trajectory that breaks a rule, of every rule that is broken."""
+    for name, mask, expected in wrong:
+        for i in np.flatnonzero(mask)[:1]:
+            terms = f"{sums[name].numerator[i]:g} / {sums[name].denominator[i]:g}"
+            message = f"trajectory {i} is {terms}, expected {expected}"
+            findings.refuse(where, f"per_trajectory.{name}", message)
 
 
 def compare_metrics(
@@ -241,7 +239,7 @@ def _check_misses(records: Records, sums: Mapping[str, Sums], findings: Findings
                     known[first] = steps[first]
                 wrong = chosen & ((steps != known) if misses else (steps >= known))
                 expected = "the remainder of the episode, as in other misses, or less with an alarm"
-                _refuse_terms(where, censored, own, wrong, expected, findings)
+                _refuse_terms(where, own, iter([(censored, wrong, expected)]), findings)
 
 
 # -- records and their split ----------------------------------------------------------------------
@@ -263,23 +261,6 @@ def check_against_split(
                 _check_trajectories(where, record, sums.get(where), data, findings)
 
 
-def _check_found(
-    where: str, missed: str, shared: NDArray[np.int64], sums: Sums, findings: Findings
-) -> None:
-    """Check what was found in the rows from the effect on that an episode and its twin share."""
-    delay = sums[missed.replace("missed", "delay")]
-    defined = (sums[missed].denominator == 1) & (shared > 0)
-    for k in FOUND_WITHIN:
-        name = missed.replace("missed", f"found_within_{k}")
-        within = (delay.denominator == 1) & (delay.numerator < np.minimum(k, shared))
-        wrong = (sums[name].denominator == 1) != defined
-        expected = f"defined where {missed} is and both episodes have rows from the effect on"
-        _refuse_terms(where, name, sums, wrong, expected, findings)
-        expected = f"1 for a delay below {k} in the rows that both episodes have"
-        wrong = defined & ((sums[name].numerator == 1) != within)
-        _refuse_terms(where, name, sums, wrong, expected, findings)
-
-
 def _check_trajectories(
     where: str, record: Record, sums: Sums | None, data: EnvironmentData, findings: Findings
 ) -> None:
@@ -294,8 +275,14 @@ def _check_trajectories(
         findings.expect(where, f"counts.{name}", len(part), record.counts[name], "as the split has")
     if sums is None or findings.count > before:
         return
-    anomalous, twins = data.anomalous(record.anomaly), data.twins
+    anomalous = data.anomalous(record.anomaly)
     findings.expect(where, "brief", anomalous.brief, record.brief, "as the split has")
+    undefined = max(record.horizon, MAX_WARM_UP)
+    _refuse_terms(where, sums, _wrong_here(sums, anomalous, data.twins, undefined), findings)
+
+
+def _wrong_here(sums: Sums, anomalous: AnomalousSet, twins: TrajectorySet, undefined: int) -> Wrong:
+    """Yield every rule for single trajectories of the split; so many first rows may lack scores."""
     ends = np.minimum(anomalous.lengths, twins.lengths) + 1
     remainders = {
         "onset": anomalous.lengths + 1 - anomalous.onsets,
@@ -307,23 +294,33 @@ def _check_trajectories(
         miss, steps = sums[missed].numerator == 1, sums[censored].numerator
         wrong = defined & np.where(miss, steps != rest, steps >= rest)
         expected = f"the number of observations from the {start} on, or less with an alarm"
-        _refuse_terms(where, censored, sums, wrong, expected, findings)
+        yield censored, wrong, expected
         if start != "onset":
             early = sums[missed.replace("missed", "early")].numerator == 1
             wrong = defined != (~early & (rest > 0))
-            expected = f"a defined one if and only if no alarm precedes the {start}"
-            _refuse_terms(where, missed, sums, wrong, expected, findings)
-            _check_found(where, missed, ends - anomalous.effects, sums, findings)
+            yield missed, wrong, f"a defined one if and only if no alarm precedes the {start}"
+            yield from _wrong_found(sums, missed, ends - anomalous.effects)
     scored = sums["far"].denominator > 0
     wrong = scored & ((sums["auc_matched"].denominator == 1) != (ends > anomalous.effects))
-    expected = "a defined one where both episodes have scores from the effect on"
-    _refuse_terms(where, "auc_matched", sums, wrong, expected, findings)
-    undefined = max(record.horizon, MAX_WARM_UP)
+    yield "auc_matched", wrong, "a defined one where both episodes have scores from the effect on"
     for name, rows, least in (
         ("far", np.maximum(anomalous.onsets - FAR_START, 0), undefined - FAR_START),
         ("far_twin", twins.lengths + 1, undefined),
     ):
         steps = sums[name].denominator
         wrong = (steps > rows) | (steps < rows - least)
-        expected = f"as many steps as rows, of which {least} may be undefined"
-        _refuse_terms(where, name, sums, wrong, expected, findings)
+        yield name, wrong, f"as many steps as rows, of which {least} may be undefined"
+
+
+def _wrong_found(sums: Sums, missed: str, shared: NDArray[np.int64]) -> Wrong:
+    """Yield the rules of what is found in the rows from the effect on that both episodes have."""
+    delay = sums[missed.replace("missed", "delay")]
+    defined = (sums[missed].denominator == 1) & (shared > 0)
+    for k in FOUND_WITHIN:
+        name = missed.replace("missed", f"found_within_{k}")
+        within = (delay.denominator == 1) & (delay.numerator < np.minimum(k, shared))
+        wrong = (sums[name].denominator == 1) != defined
+        expected = f"defined where {missed} is and both episodes have rows from the effect on"
+        yield name, wrong, expected
+        wrong = defined & ((sums[name].numerator == 1) != within)
+        yield name, wrong, f"1 for a delay below {k} in the rows that both episodes have"
