@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from tabulate import tabulate
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData
@@ -100,7 +101,5 @@ def _span(values: NDArray[np.int64]) -> str:
 
 
 def _table(title: str, header: Sequence[str], rows: Rows) -> str:
-    from tabulate import tabulate  # noqa: PLC0415  only where tables are set
-
     # Numbers are formatted already; tabulate would parse them and drop zeros behind the point.
     return f"{title}\n\n{tabulate(rows, header, 'simple', disable_numparse=True)}"

@@ -19,6 +19,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, get_args
 
+from pydantic import TypeAdapter, ValidationError
+
 from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
 from oodd_eval.results.directory import ResultsDirectory
@@ -91,8 +93,6 @@ class SubmittedEntry:
 
 def read_entry(path: Path | str) -> SubmittedEntry:
     """Read the entry in a directory; ResultsError when it cannot be read."""
-    from pydantic import TypeAdapter, ValidationError  # noqa: PLC0415  only where entries are read
-
     file = Path(path) / ENTRY
     try:
         meta = TypeAdapter(EntryInfo).validate_json(file.read_bytes())

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+from pydantic import TypeAdapter
+
 from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.data.files import GZIP, write_bytes
 from oodd_eval.data.split import Split
@@ -51,8 +53,6 @@ class Reproduction:
     @classmethod
     def load(cls, directory: Path) -> "Reproduction":
         """Read the header of a directory, fields of other versions left out."""
-        from pydantic import TypeAdapter  # noqa: PLC0415  only where a header is read
-
         path = directory / HEADER
         try:
             plain = json.loads(path.read_text(encoding="utf-8"))

@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, conlist, create_model
+
 from oodd_eval.data import files
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.parts import CALIBRATION, TWINS
@@ -83,8 +85,6 @@ def read_curves(path: Path | str) -> dict[str, Any]:
 
 def check_curves(plain: Any, where: str) -> dict[str, Any]:
     """Return a JSON value if it is the content of ``curves.json``; see `read_curves`."""
-    from pydantic import ValidationError  # noqa: PLC0415  only where curves are read
-
     try:
         _layout().validate_python(plain)
     except ValidationError as error:
@@ -111,10 +111,8 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
 
 
 @functools.cache
-def _layout() -> Any:
+def _layout() -> TypeAdapter[Any]:
     """Return the reader of the layout: fields, types and ranges of single values."""
-    from pydantic import ConfigDict, Field, TypeAdapter, conlist, create_model  # noqa: PLC0415
-
     strict = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
     def part(**types: Any) -> Any:

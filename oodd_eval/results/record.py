@@ -4,12 +4,13 @@ A record is plain data. `Record.to_json` and `Record.from_json` are inverse to e
 written as null, so that results can be stored, compared and published as lines of JSON.
 """
 
-import functools
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
+
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.results.identity import Cell, Setting
@@ -24,21 +25,8 @@ STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 
 NAN: Final = float("nan")
 
-
-class _NullIsNan:
-    """Tells pydantic to read null as NaN; it is imported only when records are read."""
-
-    @staticmethod
-    def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema  # noqa: PLC0415
-
-        number = core_schema.float_schema(strict=True)
-        return core_schema.no_info_before_validator_function(
-            lambda value: NAN if value is None else value, number
-        )
-
-
-Number = Annotated[float, _NullIsNan]
+Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None else value)]
+"""A number that is read from null where it is NaN."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +166,8 @@ class Record:
 
         `where` says in messages where it stands, such as ``"out/records.jsonl:3"``.
         """
-        from pydantic import ValidationError  # noqa: PLC0415  only where records are read
-
         try:
-            record: Record = _reader().validate_json(line)
+            record = _READER.validate_json(line)
         except ValidationError as error:
             raise ResultsError(f"{where} {_problem(line, error)}") from None
         if record.schema != SCHEMA:
@@ -189,14 +175,10 @@ class Record:
         return record
 
 
-@functools.cache
-def _reader() -> Any:
-    from pydantic import TypeAdapter  # noqa: PLC0415  only where records are read
-
-    return TypeAdapter(Record)
+_READER: Final = TypeAdapter(Record)
 
 
-def _problem(line: str, error: Any) -> str:
+def _problem(line: str, error: ValidationError) -> str:
     """Describe the first problem of a line that is no record, after `where`."""
     try:
         plain = json.loads(line)

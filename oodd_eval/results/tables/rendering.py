@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
+from tabulate import tabulate
+
 from oodd_eval.data.facts import GROUPS, SPLITS
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.catalogue import RANKING
@@ -59,8 +61,6 @@ def _section(board: Board, *, intervals: bool) -> str:
 
 def markdown(table: Table) -> str:
     """Return a table as Markdown under its title, its note below it."""
-    from tabulate import tabulate  # noqa: PLC0415  only where tables are set
-
     rows = [[escape(cell) for cell in row] for row in table.rows]
     sides = table.alignment if rows else None
     header = [escape(h) for h in table.header]
