@@ -41,8 +41,7 @@ def train(options: argparse.Namespace) -> int:
 def evaluate(options: argparse.Namespace) -> int:
     """Carry out ``policies evaluate``: mean return over fresh nominal episodes."""
     name = options.environment
-    policy = load_policy(name, options.policy)
-    found = evaluate_policy(name, policy, episodes=options.episodes)
+    found = evaluate_policy(name, load_policy(name, options.policy), episodes=options.episodes)
     mean, paper = f"{found.mean():.1f} ± {found.std():.1f}", ENVIRONMENTS[name].paper_return
     make_console().print(f"{name}: return {mean} over {options.episodes} episodes (paper: {paper})")
     return 0

@@ -159,10 +159,7 @@ def _publishable(record: Record) -> Record:
 
 
 def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
-    """Return the records that curves are made of.
-
-    With ``"detectors"`` these are, of each detector, those of the row that is primary by default.
-    """
+    """Return the records that curves are made of; ``"detectors"`` means rows primary by default."""
     seeds = first_seeds(records)
     if extent == "none":
         return []

@@ -28,7 +28,6 @@ def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
     """Return the true-positive rate at given false-positive rates, ties as diagonal lines.
 
     Where the curve is vertical, it is its upper end; NaN when either class has no defined score.
-    The area under the curve is `oodd_eval.metrics.auc.auc`.
     """
     positives = np.sort(positives[~np.isnan(positives)])
     negatives = np.sort(negatives[~np.isnan(negatives)])
@@ -53,8 +52,7 @@ def mean_matched_roc(
 ) -> Floats:  # fmt: skip
     """Return the matched ROC curve of a cell: averaged over trajectories at equal rates.
 
-    Scores are compared at the times of ``auc_matched``, so the area under the average is the
-    average of the areas. NaN when no trajectory has a curve.
+    Scores are compared at the times of ``auc_matched``. NaN when no trajectory has a curve.
     """
     grid = np.asarray(fpr, dtype=np.float64)
     triples = zip(effects, anomalous, twins, strict=True)
@@ -83,8 +81,7 @@ def thresholds(twins: Sequence[Floats], rule: AlarmRule, n: int = THRESHOLDS) ->
 class Sweep:
     """One fitted detector's alarms on the nominal twins under several thresholds, ascending.
 
-    They are the same for all anomalies, and most of the work. `quiet` has the alarms of each twin
-    for each rule.
+    They are the same for all anomalies, and most of the work; `quiet` has them by rule and twin.
     """
 
     rules: list[AlarmRule]
@@ -130,10 +127,9 @@ def example(
 ) -> dict[str, Any]:  # fmt: skip
     """Return the trajectory with the median matched AUC of a cell, around its onset.
 
-    It is typical of what the detector does in this cell. Of an even number it is the lower median,
-    of equals the first. All lists begin at the row ``start``: scores in standard deviations from
-    the calibration mean, CUSUM statistics before the reset that an alarm brings, and rows with an
-    alarm. None stands for what is undefined.
+    Of an even number it is the lower median, of equals the first. All lists begin at the row
+    ``start``: scores in standard deviations from the calibration mean (None where undefined), CUSUM
+    statistics before the reset that an alarm brings, and rows with an alarm.
     """
     areas = [
         auc_same_times(a, b, effect, min(len(a), len(b)))

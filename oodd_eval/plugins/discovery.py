@@ -256,8 +256,7 @@ def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = N
 def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
     """Return the hooks of one plug-in, which may be those for detectors and those specified.
 
-    Raises `UnknownNameError` when it implements a hook that does not exist, and
-    `pluggy.PluginValidationError` when one has an argument that the hook does not have.
+    Raises `UnknownNameError` for an unknown hook, `PluginValidationError` for such an argument.
     """
     manager = pluggy.PluginManager(hooks.PROJECT)
     for specification in (hooks, *specifications):

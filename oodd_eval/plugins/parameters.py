@@ -119,8 +119,7 @@ def resolve_parameters(
 ) -> dict[str, Any]:
     """Return a detector's parameters with defaults filled in, sorted by name.
 
-    Raises `UnknownNameError` for a name that it does not declare, unless it takes `others`, and
-    `UsageError` for a value of another type or out of bounds.
+    Raises `UsageError` for a wrong value, or a name not declared, unless it takes `others`.
     """
     known = parameters_of(declared)
     for name, value in given.items():

@@ -35,10 +35,7 @@ LARGEST: Final = 1e15  # no number is larger
 def make_curves(
     records: Iterable[Record], results: ResultsDirectory, split: Split
 ) -> dict[str, Any]:
-    """Compute the content of ``curves.json`` from the stored scores of all evaluated cells.
-
-    ResultsError: the split is not the one that the records are of, or scores are missing.
-    """
+    """Compute the content of ``curves.json`` from the stored scores of all evaluated cells."""
     units = []
     fitted: dict[str, tuple[Sweep, AlarmRule]] = {}
     with split.opened() as environment:

@@ -46,10 +46,7 @@ class FitStore:
         self._made: set[str] = set()
 
     def has(self, key: str, *, fresh: bool = False) -> bool:
-        """Tell whether a fit is kept under a key; when `fresh`, only one that this object kept.
-
-        Its files are not looked at: that is for `find`.
-        """
+        """Tell whether a fit is kept under a key; when `fresh`, only one that this object kept."""
         return (key in self._made or not fresh) and (self.path / key / INDEX).is_file()
 
     def find(self, key: str, *, fresh: bool = False) -> KeptFit | None:

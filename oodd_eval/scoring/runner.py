@@ -90,8 +90,7 @@ def _as_they_finish(
 ) -> Generator[tuple[int, Scored], None, None]:  # fmt: skip
     """Yield places of jobs and their scores as they finish.
 
-    A unit whose fit another unit is about to make waits for that one. Only a few more units are
-    begun than are taken, so that few scores are in memory, however many units there are.
+    Only a few more units are begun than are taken, so that few scores are in memory.
     """
     end = None if settings.deadline is None else time.monotonic() + settings.deadline
     # With twice as many, no thread is idle while records are made. What waits in the pool begins

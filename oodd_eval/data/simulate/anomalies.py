@@ -40,10 +40,7 @@ have more than 8 distinct values (a contact of 0.87 gives itself away).
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One anomaly as drawn for one trajectory: corrupted `sensors`, the simulator's `attributes`.
-
-    A split stores the `parameters`.
-    """
+    """One anomaly as drawn for a trajectory: corrupted `sensors`, the simulator's `attributes`."""
 
     anomaly: str
     parameters: dict[str, Any]

@@ -137,10 +137,7 @@ def _record_anomalous(
 
 
 def first_difference(rows: _Rows, twin: _Rows) -> int | None:
-    """Return the index of the first row that differs from the twin's, None if no common row does.
-
-    Rows of shape (n, D) and (m, D) have min(n, m) in common.
-    """
+    """Return the index of the first row that differs from the twin's; None without such a row."""
     common = min(len(rows), len(twin))
     differs = (rows[:common] != twin[:common]).any(axis=1)
     return int(differs.argmax()) if differs.any() else None

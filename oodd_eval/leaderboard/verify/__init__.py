@@ -42,8 +42,7 @@ def verify_entry(
 ) -> EntryVerdict:  # fmt: skip
     """Check one entry, which is going to have another name if one is given.
 
-    `split` is the name or path of its split, where that is not at its usual place; `rerun` are the
-    records of a run that the verifier made.
+    `split` names its split where that is not at its usual place, `rerun` are a verifier's records.
     """
     name = name or Path(os.path.abspath(directory)).name  # noqa: PTH100  a link is not followed
     findings = Findings()

@@ -95,10 +95,9 @@ _Pair = tuple[str, Record, Record]
 
 
 def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings) -> Rerun:
-    """Compare an entry's records with those of the verifier's own run.
+    """Compare an entry's records with those of the verifier's own run, on its split or another.
 
-    That is on the same split or on one of fresh seeds; possibly of fewer environments, and with
-    more than the entry's cells.
+    The run may be of fewer environments, and have more than the entry's cells.
     """
     before = findings.count
     pairs, place = _pairs(records, fresh, findings)

@@ -75,7 +75,6 @@ class Report:
         return f"{len(self.results)} {checks}: {', '.join(parts) or 'none ran'} in {seconds:.1f} s"
 
     def __str__(self) -> str:
-        """Return a line per check and the summary."""
         width = max((len(result.name) for result in self.results), default=0)
         return "\n".join([*(result.line(width) for result in self.results), self.summary()])
 

@@ -231,7 +231,6 @@ def _set_apart(here: Path) -> Iterator[None]:
 
 
 def _generators() -> dict[str, object]:
-    """Return the states of the global random generators."""
     kind, words, *rest = np.random.get_state()  # noqa: NPY002
     numpy_state = kind, np.asarray(words).tobytes(), rest
     found: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}

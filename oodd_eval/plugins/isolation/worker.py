@@ -54,10 +54,7 @@ PATIENCE: Final = 1.0  # seconds that threads and processes of a fit have to end
 
 
 class TrajectoryFile(TrajectorySequence):
-    """Trajectories in a temporary file: a sequence that may be larger than memory.
-
-    Every access reads the trajectory again, so that only those that somebody holds are in memory.
-    """
+    """Trajectories in a temporary file, read at every access: they may be larger than memory."""
 
     def __init__(self, trajectories: Iterable[Trajectory]) -> None:
         self._places: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []

@@ -81,8 +81,7 @@ def worse_side(metric: str) -> Side:
 def parse_tolerance(text: str, known: Collection[str] = NAMES) -> Tolerance:
     """Read a tolerance for one of the known metrics, such as ``delay:+10%``.
 
-    UnknownNameError: there is no such metric. UsageError: the text has another form, or its sign is
-    the metric's better side.
+    UsageError: no such metric, another form, or a sign that is the metric's better side.
     """
     match = re.fullmatch(r"([^:\s]+):([+-]?)(\d+(?:\.\d*)?|\.\d+)(%?)", text.strip())
     if not match:

@@ -147,10 +147,7 @@ def _rich(table: Table, colours: Sequence[str], console: Console) -> RichTable:
 
 
 def junit(comparison: Comparison) -> str:
-    """Return JUnit XML: a suite per split and detector, a test case per cell (or mean) and metric.
-
-    A figure for which the comparison fails is a failure; a new cell is skipped.
-    """
+    """Return JUnit XML: a suite per split and detector, a case per cell (or mean) and metric."""
     whole = {"name": "oodd-eval compare", **_counts(comparison.differences)}
     root = ET.Element("testsuites", whole)
     for (split, detector), differences in grouped(comparison.differences, _suite).items():

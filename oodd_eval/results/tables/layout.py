@@ -71,10 +71,9 @@ class Table:
 
 
 def show_value(value: Value, metric: str) -> str:
-    """Return a mean as printed: percent or number, a dash where undefined, a failure's state.
+    """Return a mean as printed: a number, a dash where undefined, a failure's state, or nothing.
 
-    A star marks a mean over fewer cells than other rows have, a dagger one of brief cells only; an
-    empty text, no cell at all.
+    A star marks a mean over fewer cells than other rows have, a dagger one of brief cells only.
     """
     if not value.cells:
         return ""
@@ -109,7 +108,6 @@ def _by_group(board: Board, title: str, *, intervals: bool) -> list[_Mean]:
 
 
 def _overall(board: Board, names: Iterable[str], intervals: Collection[str] = ()) -> list[_Mean]:
-    """Return metrics over all cells."""
     over = board.environments, board.anomalies
     return [_Mean(metric_info(n).title, n, *over, n in intervals) for n in names]
 
