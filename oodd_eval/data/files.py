@@ -14,11 +14,8 @@ import psutil
 from oodd_eval.errors import OutputError, ResultsError
 
 GZIP: Final = ".gz"
-COMPRESSED_FROM: Final = 10**6
-"""Bytes beyond which `compress_large` compresses; smaller files stay readable in a pull request."""
-
-MAX_BYTES: Final = 64 * 10**6
-"""Most bytes that a compressed file may decompress to, unless the caller says otherwise."""
+COMPRESSED_FROM: Final = 10**6  # bytes; smaller files stay readable in a pull request
+MAX_BYTES: Final = 64 * 10**6  # most bytes that a compressed file may decompress to
 
 
 @contextlib.contextmanager

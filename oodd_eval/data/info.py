@@ -17,8 +17,7 @@ _KINDS = ("nominal", *ANOMALIES)
 HEADER: Final = ("group", "trajectories", "transitions", "length", "onset", "effect", "tail",
                  "redraws", "return")  # fmt: skip
 Rows = list[list[str]]
-Returns = Mapping[str, NDArray[np.float64]]
-"""Of the test part by kind: ``nominal`` and the anomalies."""
+Returns = Mapping[str, NDArray[np.float64]]  # by kind: ``nominal`` and anomalies
 
 
 def describe(split: Split) -> str:

@@ -17,8 +17,7 @@ from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, PARTS, EnvironmentData
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
 
-SHIPPED = Path(__file__).with_name("shipped")
-"""Directory of the splits that come with the package: ``mini``."""
+SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
 
 
 def data_home() -> Path:

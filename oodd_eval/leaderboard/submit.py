@@ -34,8 +34,7 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.board import primary_settings
 
-LARGE: Final = 10 * 10**6
-"""Bytes beyond which an entry is said to be large: a repository keeps every version of it."""
+LARGE: Final = 10 * 10**6  # bytes of a large entry: a repository keeps every version of it
 
 Extent = Literal["rows", "detectors", "none"]
 

@@ -23,8 +23,7 @@ Floats = NDArray[np.float64]
 AlarmKind = Literal["cusum", "score"]
 """Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself."""
 
-_ROUNDING: Final = 1e-9
-"""Share of one episode that a level may be off by rounding: (n + 1) x 0.05 is to be whole."""
+_ROUNDING: Final = 1e-9  # share of an episode that levels may be off: (n + 1) x 0.05 is whole
 
 
 @dataclass(frozen=True, slots=True)

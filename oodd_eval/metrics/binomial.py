@@ -9,8 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-_TERMS: Final = 10_000
-"""Most terms of the continued fraction; some ten times the square root of a or b are enough."""
+_TERMS: Final = 10_000  # most of the fraction: ten times the root of a or b are enough
 
 _TINY: Final = 1e-300
 _EXACT: Final = 1e-15

@@ -22,8 +22,7 @@ from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import number
 
 NOT_RUN: Final = "not run"
-RETURN: Final = "return"
-"""The measure of claims about the policies' returns, that is about data instead of detectors."""
+RETURN: Final = "return"  # the measure of claims about the policies, not about detectors
 
 Settled = Literal["by definition", "by construction"]
 Verdict = Literal["confirmed", "negligible", "refuted", "undecided", "not run", Settled]

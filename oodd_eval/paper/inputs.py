@@ -26,8 +26,7 @@ RETURNS: Final = "returns.json"
 SCHEMA: Final = 1
 KINDS: Final = ("nominal", *ANOMALIES)
 
-Returns = Mapping[str, Mapping[str, Sequence[float]]]
-"""Return of every test trajectory by environment and kind."""
+Returns = Mapping[str, Mapping[str, Sequence[float]]]  # by environment and kind
 
 
 @dataclass(frozen=True, slots=True)

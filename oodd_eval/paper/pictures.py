@@ -23,8 +23,7 @@ from oodd_eval.results.record import NAN
 
 STYLE: Final = Path(__file__).with_name("pictures.mplstyle")
 
-LOOK: Final = 1
-"""Raise it when a change of this module changes how figures look, so that all are drawn again."""
+LOOK: Final = 1  # raise it when a change of this module changes how figures look
 
 MARKERS: Final = "osD^vP*X"
 DRAWN: Final = ("auc", "auc_matched", "delay", "delay_censored", "far")

@@ -34,9 +34,7 @@ Raise it by hand when a change of the harness changes scores.
 MAX_WARM_UP: Final = 20
 """Longest leading block, in rows, that a detector may declare undefined beyond its horizon."""
 
-PROBES: Final = 4
-"""Episodes of a unit that are scored a second time, cut short: a few percent of its cost."""
-
+PROBES: Final = 4  # episodes of a unit that are scored twice, cut short: a few percent
 MIN_ROWS: Final = 8  # observations of the shortest episode that is cut
 
 TOLERANCE: Final = 1e-5

@@ -24,8 +24,7 @@ from oodd_eval.plugins.contract import DetectorSpec
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
-LONGEST_REASON: Final = 600
-"""Characters of a reason, at most; of a longer one, the start and the end are kept."""
+LONGEST_REASON: Final = 600  # characters; of a longer one, the start and the end are kept
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,10 +25,7 @@ from oodd_eval.results.evaluate import must_be_of, stored_scores
 from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1  # version of the layout; a reader refuses others
-
-LONGEST: Final = 1000
-"""Most numbers in any list: a file has to stay small enough to be embedded in a page."""
-
+LONGEST: Final = 1000  # most numbers in any list: a page that embeds them has to stay small
 LARGEST: Final = 1e15  # no number is larger
 
 

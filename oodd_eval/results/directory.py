@@ -30,12 +30,10 @@ from oodd_eval.results.record import Record
 RECORDS: Final = "records.jsonl"
 REPORT: Final = "report.md"
 
-WRITING_SHARE: Final = 0.05
-"""Records are written again once the last writing took less than this share of the time since."""
+WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next one may take
 
 
-ORDER_BITS: Final = 53
-"""Random bits that decide the order of groups: as many as a float64 attribute keeps exactly."""
+ORDER_BITS: Final = 53  # random bits of the order of groups: a float64 keeps them exactly
 
 
 @dataclass(frozen=True, slots=True)

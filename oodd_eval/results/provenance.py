@@ -10,8 +10,7 @@ from typing import Any, Final
 
 from oodd_eval._version import __version__
 
-PACKAGES: Final = ("h5py", "numpy", "scikit-learn", "scipy", "torch")
-"""Packages on whose versions scores may depend."""
+PACKAGES: Final = ("h5py", "numpy", "scikit-learn", "scipy", "torch")  # scores depend on them
 
 _HOME: Final = Path(__file__).parents[1]
 

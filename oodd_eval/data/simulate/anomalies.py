@@ -16,11 +16,8 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.simulate.environments import Row, Simulator
 from oodd_eval.errors import UnknownNameError
 
-NOMINAL_MARGIN: Final = 0.02
-"""Draws within this share of the nominal value are redrawn: they would change next to nothing."""
-
-SENSOR_SHARE: Final = 0.2
-"""Share of the sensors that a sensor anomaly corrupts, rounded down, at least one."""
+NOMINAL_MARGIN: Final = 0.02  # draws this near to the nominal value change next to nothing
+SENSOR_SHARE: Final = 0.2  # of the sensors that an anomaly corrupts, rounded down, at least one
 
 VALUES: Final[dict[str, dict[str, Any]]] = json.loads(
     Path(__file__).with_name("anomaly_values.json").read_text(encoding="utf-8")

@@ -39,11 +39,8 @@ from oodd_eval.data.simulate.record import (
 from oodd_eval.data.split import Split
 from oodd_eval.errors import SimulationError, SplitError, UnknownNameError, UsageError
 
-CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}
-"""Seeds per chunk; a test seed is nine episodes."""
-
-MOST_CANDIDATES: Final = 10
-"""A test part looks at up to this many seeds per trajectory for twins that are long enough."""
+CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}  # seeds; a test seed is nine episodes
+MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
 
 PACKAGES: Final = ("oodd-eval", "numpy", "gymnasium", "pybullet", "pybullet-envs-gymnasium")
 Progress = Callable[[int, int, str], None]

@@ -30,9 +30,7 @@ SCRIPTS: Final = (
 )  # fmt: skip
 """Parts of the page's one script, in order."""
 
-LEVELS: Final = 250
-"""Least number of steps between zero and the largest value of a drawing, about one a pixel."""
-
+LEVELS: Final = 250  # least steps from zero to the largest value of a drawing: one a pixel
 HEAVY: Final = 30  # A largest value this many times the typical one asks for a logarithmic scale
 
 _STATIC = Path(__file__).with_name("static")

@@ -31,9 +31,7 @@ from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
-
-Seen = dict[object, tuple[str, str]]
-"""By cell or detector: the entry that has it, and the distribution that a detector is from."""
+Seen = dict[object, tuple[str, str]]  # by cell or detector: its entry, a detector's distribution
 
 
 def verify_entry(

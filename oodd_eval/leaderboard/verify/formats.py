@@ -25,14 +25,11 @@ from oodd_eval.results.record import Record, Status
 
 MOST_RECORDS: Final = 20_000
 MOST_LINE: Final = 4 * MB
-MOST_TEST: Final = 2_000
-"""Largest number of test trajectories: with more, recomputing the intervals takes too much room."""
+MOST_TEST: Final = 2_000  # trajectories: with more, recomputing intervals takes too much room
 
 LONGEST_COMMAND: Final = 4000
 LARGEST: Final = 2**53  # whole numbers beyond are not exact in a double
-
-MOST_COST: Final = 1e9
-"""Seconds (thirty years) or megabytes (a thousand terabytes): nobody measured more."""
+MOST_COST: Final = 1e9  # seconds (thirty years) or megabytes: nobody measured more
 
 _DEEPEST: Final = 5
 _MOST_ITEMS: Final = 200

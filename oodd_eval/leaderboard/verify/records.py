@@ -32,10 +32,7 @@ from oodd_eval.results.record import Metric, Record
 from oodd_eval.results.tables.board import contribution
 
 Records = Mapping[str, Record]  # records by where they stand
-
-TOLERANCE: Final = 1e-12
-"""Relative and absolute: sums may be taken in another order on another processor."""
-
+TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders
 MOST_ROWS: Final = 64  # rows of one entry; the paper's comparisons are some twenty
 
 

@@ -32,14 +32,12 @@ from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
-MOST_VALUES: Final = 20_000_000
-"""Most scores of one file: its compressed size says little of its decompressed one."""
+MOST_VALUES: Final = 20_000_000  # of a file: its size says little of its decompressed one
 
 PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
 """Groups of a score file."""
 
-ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}
-"""Tolerance of curves, which are rounded to three digits and five decimals."""
+ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}  # curves have three digits and five decimals
 
 _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
 _FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}

@@ -90,8 +90,7 @@ class EntryVerdict:
         return "re-scored" if self.rescored else "reported"
 
 
-_Pair = tuple[str, Record, Record]
-"""Place of a record of the entry, the record, and that of the new run."""
+_Pair = tuple[str, Record, Record]  # place of an entry's record, the record, and the new one
 
 
 def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings) -> Rerun:

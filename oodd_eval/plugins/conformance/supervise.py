@@ -19,9 +19,7 @@ from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.supervisor import Child, GivenUpError, Limits
 from oodd_eval.plugins.isolation.worker import connect
 
-GATES: Final = frozenset({"factory", "fits"})
-"""Checks without which no other one can be carried out."""
-
+GATES: Final = frozenset({"factory", "fits"})  # without them no other check is possible
 MOST_ENDS: Final = 3  # after so many checks that ended their process, the rest are not tried
 
 

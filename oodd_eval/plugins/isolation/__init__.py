@@ -26,8 +26,7 @@ class ChannelGarbledError(OoddError, ValueError):
     """Bytes that are no message: the detector wrote into the pipe."""
 
 
-LONGEST_FRAME: Final = 2**31
-"""Bytes of a frame, at most; a length beyond that was not written by a channel."""
+LONGEST_FRAME: Final = 2**31  # bytes; a larger length was not written by a channel
 
 
 class Channel:

@@ -47,9 +47,7 @@ _STATUSES: Final[dict[type[BaseException], str]] = {
 """Status of a cell by what its detector raised."""
 
 
-SCORED: Final = 93
-"""Exit code of a process that has scored its group: no other one that ends itself has it."""
-
+SCORED: Final = 93  # exit code of a process that has scored its group, and of no other
 PATIENCE: Final = 1.0  # seconds that threads and processes of a fit have to end
 
 

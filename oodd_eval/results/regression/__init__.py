@@ -39,8 +39,7 @@ MEANINGS: Final[dict[Verdict, str]] = {
 }
 """Possible results of the comparison of one figure."""
 
-RESOLUTION: Final = 1e-6
-"""Differences up to this are none: sums may be taken in another order on another processor."""
+RESOLUTION: Final = 1e-6  # smaller differences are none: processors order sums differently
 
 
 class NothingInCommonError(ResultsError):

@@ -28,8 +28,7 @@ _COLOURS: Final = {"better": "green", "recovered": "green", "within": "yellow"}
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 cannot hold, not even escaped."""
 
-_WHOLE: Final = ("failed", "missing", "recovered", "new")
-"""Verdicts on cells, the same for every metric."""
+_WHOLE: Final = ("failed", "missing", "recovered", "new")  # of cells, for every metric
 
 
 def worth_showing(comparison: Comparison) -> list[Difference]:

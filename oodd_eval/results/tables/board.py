@@ -21,8 +21,7 @@ from oodd_eval.results.record import NAN, Record
 Item = TypeVar("Item")
 Key = TypeVar("Key")
 
-SEEDS: Final = 3
-"""Detector seeds that a primary row of a detector with randomness needs to be ranked."""
+SEEDS: Final = 3  # detector seeds that a primary row with randomness needs for a rank
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,15 +21,12 @@ from oodd_eval.metrics.catalogue import (
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables.board import Board, RankedBoard, Standing, Value
 
-_BLIND: Final = ("clock", "comb")
-"""Rows that know the time alone: their AUC says nothing of dynamics."""
+_BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
 _SIMPLE: Final = ("random", "persistence", *_BLIND, "range", "mahalanobis", "rf", "rf-ewma")
 """Rows that a detector with a learned model of the dynamics should beat."""
 
-_FEW: Final = 30
-"""Test seeds per environment below which a board says that its comparisons are weak."""
-
+_FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
 _BRIEF: Final = "\N{DAGGER}"  # marks the figures of brief cells
 
 _ALARMS: Final = (
