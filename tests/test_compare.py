@@ -207,11 +207,11 @@ def test_what_failed_in_the_reference_already_does_not_fail():
 def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
     changed = record(auc=0.4, auc_null=0.9, delay=0.4, far=0.6)
     found = against([changed], [record()])
-    assert {d.metric for d in found.differences} == {
+    assert {d.tolerance.metric for d in found.differences} == {
         "auc", "auc_matched", "auc_smoothed", "auc_unpaired", "delay", "delay_censored", "missed",
         "far", "far_twin",
     }  # fmt: skip
-    assert {d.metric for d in found.failures} == {"auc", "far"}
+    assert {d.tolerance.metric for d in found.failures} == {"auc", "far"}
 
 
 def test_a_metric_that_the_reference_lacks_is_an_error_and_not_a_pass():

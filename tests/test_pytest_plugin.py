@@ -124,7 +124,9 @@ def test_an_improvement_fails_only_when_both_sides_count(cells, pytester, refere
     for two_sided in (False, True):
         own = cells(oodd_reference=str(better), oodd_env="hopper", oodd_two_sided=two_sided)
         own.run(set(own.cells))
-        failing = {d.metric for found in own._differences.values() for d in found if d.fails}
+        failing = {
+            d.tolerance.metric for found in own._differences.values() for d in found if d.fails
+        }
         assert failing == ({"far"} if two_sided else set())
 
 

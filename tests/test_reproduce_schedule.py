@@ -37,7 +37,7 @@ def make_unit(setting=RIQN, fit="a", seed=0, key=""):
 
 
 def test_every_unit_is_there_once(mini):
-    labels = [(u.environment, u.label) for u in mini]
+    labels = [(u.environment, u.setting.label(u.seed)) for u in mini]
     assert len(set(labels)) == len(labels) == 315
     assert len({u.scores_key for u in mini}) == 315
     assert {u.environment for u in mini} == set(ENVIRONMENTS)
@@ -47,7 +47,7 @@ def test_every_unit_is_there_once(mini):
 def test_a_device_reaches_the_detectors_that_have_one_and_changes_no_row(mini):
     controls = [e for e in EXPERIMENTS if e.id == "controls"]
     placed = lay_out(controls, TIERS["mini"], load_split("mini"), discover(), "auto")
-    devices = {u.detector: u.parameters.get("device") for u in placed}
+    devices = {u.setting.detector: u.parameters.get("device") for u in placed}
     assert devices["riqn"] == devices["npn"] == "auto"
     assert devices["rf"] is devices["clock"] is None
     assert {(u.setting, u.scores_key) for u in placed} < {(u.setting, u.scores_key) for u in mini}
@@ -56,7 +56,7 @@ def test_a_device_reaches_the_detectors_that_have_one_and_changes_no_row(mini):
 def test_stages_follow_one_another_and_each_goes_environment_by_environment(mini):
     order = [(stage_of(u), list(ENVIRONMENTS).index(u.environment)) for u in mini]
     assert order == sorted(order)
-    first = {(u.detector, u.horizon) for u in mini if stage_of(u) <= 1}
+    first = {(u.setting.detector, u.setting.horizon) for u in mini if stage_of(u) <= 1}
     assert ("riqn", 1) in first
     assert all(horizon == 1 for _, horizon in first)
 
@@ -79,14 +79,14 @@ def test_only_what_is_wanted_is_laid_out():
 
 def test_sampling_sizes_share_a_fit_that_the_first_of_them_makes(mini):
     ant = [u for u in mini if u.environment == "ant" and u.seed == 0]
-    own = [u for u in ant if u.detector == "riqn" and "members" not in u.setting.overrides]
+    own = [u for u in ant if u.setting.detector == "riqn" and "members" not in u.setting.overrides]
     near = [u for u in own if u.setting.horizon == 1]
     assert len(near) > 1
     assert len({u.fit_key for u in near}) == 1
     assert near[0].setting == RIQN
     # Networks are trained on their own samples where they are to forecast further than one step.
     assert len({u.fit_key for u in own}) == len({u.setting.horizon for u in own}) == 3
-    assert len({u.fit_key for u in ant if u.detector == "rf"}) == 1
+    assert len({u.fit_key for u in ant if u.setting.detector == "rf"}) == 1
 
 
 def test_a_shared_fit_is_counted_once_and_a_kept_one_not_at_all():
@@ -136,8 +136,8 @@ def test_durations_are_readable(seconds, text):
 
 def finish(progress, unit, resumed=False, **changes):
     for anomaly in unit.anomalies:
-        record = make_record(unit.detector, unit.environment, anomaly, seed=unit.seed,
-                             horizon=unit.horizon)  # fmt: skip
+        record = make_record(unit.setting.detector, unit.environment, anomaly, seed=unit.seed,
+                             horizon=unit.setting.horizon)  # fmt: skip
         progress.oodd_cell_finished(dataclasses.replace(record, **changes), resumed=resumed)
 
 

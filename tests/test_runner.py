@@ -534,7 +534,7 @@ def tuned_unit(plugins, digest="dd", **changes):
 
 def test_cells_name_what_is_not_a_default(tuned):
     unit = tuned_unit(tuned)
-    assert unit.label == "tuned[h=10,seed=3,size=7]"
+    assert unit.setting.label(unit.seed) == "tuned[h=10,seed=3,size=7]"
     assert unit.parameters == {"device": "cpu", "draws": 1, "kind": "a", "size": 7}
 
 

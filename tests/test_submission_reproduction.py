@@ -48,7 +48,7 @@ def submit(many, root, *options):
 
 
 def labels(entry):
-    return {record.label for record in entry.records}
+    return {record.cell.label for record in entry.records}
 
 
 ALL = {
@@ -162,7 +162,7 @@ def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
 def test_curves_are_of_first_seeds_and_of_as_many_rows_as_asked_for(many, extent, expected):
     records = ResultsDirectory(many[1]).records()
     drawn = with_curves(records, extent)
-    assert {r.label for r in drawn} == expected
+    assert {r.cell.label for r in drawn} == expected
     assert len(drawn) == 16 * len(expected)
 
 

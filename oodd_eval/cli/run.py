@@ -11,11 +11,12 @@ from oodd_eval import cli
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.files import write_text
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import expression, select, whole_numbers
 from oodd_eval.plugins.isolation.supervisor import Limits
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.tables import rendering
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.planning import make_plan
@@ -86,7 +87,8 @@ def run(options: argparse.Namespace) -> int:
     done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
     if done.records:
         report = rendering.report(results.records(), intervals=options.intervals)
-        path = results.write_report(report)
+        path = results.path / REPORT
+        write_text(path, report)
         if options.verbosity >= 0:
             console.print(f"results in {results.path}, tables in {path}")
     if done.interrupted:

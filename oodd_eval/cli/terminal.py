@@ -71,10 +71,12 @@ class TerminalReporter:
     def oodd_run_started(self, plan: Plan) -> None:
         """Say what is going to happen."""
         self._start = time.perf_counter()
-        self._sizes = {(u.environment, u.label): len(u.anomalies) for u in plan.units}
+        self._sizes = {
+            (u.environment, u.setting.label(u.seed)): len(u.anomalies) for u in plan.units
+        }
         if self.verbosity < 0:
             return
-        names = dict.fromkeys(u.detector for u in plan.units)
+        names = dict.fromkeys(u.setting.detector for u in plan.units)
         limited = f", first {plan.limit} trajectories of each part" if plan.limit else ""
         self._print(f"oodd-eval {__version__}, protocol {PROTOCOL}")
         self._print(f"split {plan.split}, digest {plan.split_digest[:12]}{limited}")
@@ -92,7 +94,7 @@ class TerminalReporter:
         self._resumed += resumed
         if self._progress:
             self._progress.advance(self._progress.task_ids[0])
-        unit = record.environment, record.label
+        unit = record.environment, record.cell.label
         finished = self._open.setdefault(unit, [])
         finished.append(record)
         if self.verbosity > 0:
@@ -132,7 +134,7 @@ class TerminalReporter:
     def failures(self, records: Sequence[Record]) -> None:
         """Print why fits failed."""
         for record in (record for board in boards(records) for record in board.failures()):
-            name = f"{record.environment}/{record.label}"
+            name = f"{record.environment}/{record.cell.label}"
             self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
             if self.verbosity <= 0 or not self._log or not record.scores:
                 continue

@@ -132,7 +132,7 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Leave out the seeds of rows that lack cells which any row here has."""
     cells: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for r in records:
-        cells[r.label].add((r.environment, r.anomaly))
+        cells[r.cell.label].add((r.environment, r.anomaly))
     every = set().union(*cells.values())
     partial = {label: len(own) for label, own in sorted(cells.items()) if own != every}
     if len(partial) == len(cells):
@@ -141,7 +141,7 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
             "run the rest, or choose cells that all rows have with -k"
         )
     left_out = [f"{label}, which has {n} of {len(every)} cells" for label, n in partial.items()]
-    return [r for r in records if r.label not in partial], left_out
+    return [r for r in records if r.cell.label not in partial], left_out
 
 
 def _publishable(record: Record) -> Record:

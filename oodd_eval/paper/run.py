@@ -57,14 +57,14 @@ def lay_out(
 
 def stage_of(unit: Unit) -> int:
     """Return the index into `STAGES`."""
-    if unit.detector in CONTROLS:
+    if unit.setting.detector in CONTROLS:
         return 0
     variant = bool(unit.setting.parameters)
-    if unit.horizon > 1:
-        return 7 if unit.seed else 3 if unit.horizon == 10 else 4
+    if unit.setting.horizon > 1:
+        return 7 if unit.seed else 3 if unit.setting.horizon == 10 else 4
     if unit.seed:
-        return 5 if unit.detector in ("riqn", "riqn-ms") and not variant else 6
-    return 2 if variant or unit.detector == "n-riqn" else 1
+        return 5 if unit.setting.detector in ("riqn", "riqn-ms") and not variant else 6
+    return 2 if variant or unit.setting.detector == "n-riqn" else 1
 
 
 def unfinished(units: Iterable[Unit], records: Iterable[Record]) -> list[Unit]:
@@ -137,7 +137,7 @@ class Progress:
         self, units: Sequence[Unit], rows: Mapping[str, int], jobs: int,
         tell: Callable[[str], None] | None = None, fitted: Collection[str] = (),
     ) -> None:  # fmt: skip
-        self._open = {(u.environment, u.label): u for u in units}
+        self._open = {(u.environment, u.setting.label(u.seed)): u for u in units}
         self._total, self._rows, self._jobs = len(units), rows, jobs
         self._tell, self._fitted = tell, set(fitted)
         self._cells: Counter[tuple[str, str]] = Counter()
@@ -146,7 +146,7 @@ class Progress:
     @hookimpl
     def oodd_cell_finished(self, record: Record, resumed: bool) -> None:
         """Tell of a unit when its last cell is there."""
-        key = record.environment, record.label
+        key = record.environment, record.cell.label
         self._cells[key] += 1
         if key not in self._open or self._cells[key] < len(self._open[key].anomalies):
             return

@@ -105,15 +105,6 @@ class ResultsDirectory:
             files.write_text(self.path / RECORDS, text)
         return merged
 
-    def write_report(self, text: str) -> Path:
-        """Write ``report.md`` and return its path."""
-        files.write_text(self.path / REPORT, text)
-        return self.path / REPORT
-
-    def write_log(self, key: str, text: str) -> None:
-        """Keep the end of the output of a failing detector."""
-        files.write_text(self.log_path(key), text)
-
     def log_path(self, key: str) -> Path:
         """Return the place of the log of a failed unit."""
         return self.path / "logs" / f"{key}.txt"

@@ -137,11 +137,6 @@ class Record:
         )
 
     @property
-    def label(self) -> str:
-        """Setting and seed, such as ``riqn[h=1,seed=0]``."""
-        return self.setting.label(self.seed)
-
-    @property
     def identity(self) -> tuple[str, ...]:
         """Equal for two results of the same cell, of which the later replaces the earlier."""
         conditions = [self.protocol, self.parameters, self.limit]

@@ -36,21 +36,6 @@ class Unit:
     fit_key: str = ""
 
     @property
-    def detector(self) -> str:
-        """Name of the detector."""
-        return self.setting.detector
-
-    @property
-    def horizon(self) -> int:
-        """Prediction horizon in steps."""
-        return self.setting.horizon
-
-    @property
-    def label(self) -> str:
-        """Setting and seed, such as ``riqn[h=1,seed=0]``."""
-        return self.setting.label(self.seed)
-
-    @property
     def local(self) -> bool:
         """True if the detector is no plug-in's and runs in this process."""
         return not self.plugin
@@ -88,11 +73,12 @@ class Plan:
     def blank(self, unit: Unit, anomaly: str, **outcome: Any) -> Record:
         """Return the record of a cell with its identity filled in, and no metrics."""
         return Record(
-            detector=unit.detector, detector_version=unit.version,
-            plugin=f"{unit.distribution}:{unit.plugin}", plugin_source=unit.source,
-            parameters=dict(unit.shown), overrides=unit.setting.overrides, inputs=unit.inputs,
-            alarm=unit.alarm, deterministic=unit.deterministic, environment=unit.environment,
-            anomaly=anomaly, group=ANOMALIES[anomaly].group, horizon=unit.horizon, seed=unit.seed,
+            detector=unit.setting.detector, horizon=unit.setting.horizon, seed=unit.seed,
+            detector_version=unit.version, plugin=f"{unit.distribution}:{unit.plugin}",
+            plugin_source=unit.source, parameters=dict(unit.shown),
+            overrides=unit.setting.overrides, inputs=unit.inputs, alarm=unit.alarm,
+            deterministic=unit.deterministic, environment=unit.environment, anomaly=anomaly,
+            group=ANOMALIES[anomaly].group,
             split=self.split, split_digest=self.split_digest, limit=self.limit,
             scores=unit.scores_key, protocol=PROTOCOL, **outcome,
         )  # fmt: skip

@@ -23,9 +23,8 @@ def make_plan(
 ) -> Plan:  # fmt: skip
     """Lay out every unit, environments outermost; the cells are the product of all names.
 
-    `device` is the value of the parameter ``device`` for those detectors that have it.
-    Unknown detectors and parameters raise `UnknownNameError`; refused values, and a device that no
-    detector has, `UsageError`.
+    `device` is the value of the parameter ``device`` for those detectors that have it. What is
+    unknown or refused, and a device that no detector has, raises `UsageError`.
     """
     offers = [plugins.offer(name) for name in detectors]
     given = [{**(parameters or {}), **_placed(offer, device)} for offer in offers]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from typing import Any
 
+from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
@@ -59,7 +60,7 @@ def run(
     try:
         data = opened.enter_context(split.opened())
         jobs = [
-            UnitJob(plan, unit, data(unit.environment), plugins.offer(unit.detector))
+            UnitJob(plan, unit, data(unit.environment), plugins.offer(unit.setting.detector))
             for unit in plan.units
         ]
         hearing.notify("oodd_run_started", plan=plan)
@@ -107,7 +108,7 @@ def _as_they_finish(
             if scored.status == "ok" and not scored.resumed:
                 results.write_scores(job.unit.scores_key, scored.file)
             if scored.log:
-                results.write_log(job.unit.scores_key, scored.log)
+                write_text(results.log_path(job.unit.scores_key), scored.log)
         return scored
 
     pool = ThreadPoolExecutor(max_workers=executor.jobs)

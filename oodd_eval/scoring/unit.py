@@ -115,8 +115,8 @@ class _Work:
         unit, data = self._job.unit, self._job.data
         train = 0 if load else len(data.train.lengths[: self._job.plan.limit])
         request = {
-            "plugin": unit.plugin, "detector": unit.detector, "parameters": dict(unit.parameters),
-            "seed": unit.seed, "horizon": unit.horizon,
+            "plugin": unit.plugin, "detector": unit.setting.detector, "seed": unit.seed,
+            "horizon": unit.setting.horizon, "parameters": dict(unit.parameters),
             "train": train, "load": load, "save": save,
         }  # fmt: skip
         nominal = map(self._shown, islice(data.train, train))
@@ -145,7 +145,7 @@ class _Work:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
         unit, limit = self._job.unit, self._job.plan.limit
         detector = make_detector(
-            self._job.offer.spec.factory, seed=unit.seed, horizon=unit.horizon,
+            self._job.offer.spec.factory, seed=unit.seed, horizon=unit.setting.horizon,
             parameters=unit.parameters,
         )  # fmt: skip
         detector.fit([*map(self._shown, islice(self._job.data.train, limit))])
@@ -174,11 +174,11 @@ class _Work:
             for (part, i, rows), one in zip(map(astuple, group), scores[k], strict=True):
                 where = f"{unit.environment}/{part}[{i}]"
                 found = check_scores(
-                    one, rows, horizon=unit.horizon, warm_up=warm_up, detector=unit.detector,
-                    where=where,
+                    one, rows, horizon=unit.setting.horizon, warm_up=warm_up,
+                    detector=unit.setting.detector, where=where,
                 )  # fmt: skip
                 if group is self._probes:
-                    check_prefix(found, parts[part][i], detector=unit.detector, where=where)
+                    check_prefix(found, parts[part][i], detector=unit.setting.detector, where=where)
                 else:
                     parts[part][i] = found
         return parts

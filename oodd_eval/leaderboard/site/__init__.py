@@ -2,8 +2,7 @@
 
 Data is embedded as JSON, styles and scripts are in the page, and its content security policy
 allows nothing else, by digest. What is embedded is computed in `oodd_eval.leaderboard.site.data`;
-here its curves are made small: lists that are shared stand in the page once, and examples are on a
-grid as fine as the screen's.
+here its curves are made small.
 """
 
 import base64

@@ -1,8 +1,7 @@
 """The content of the site as plain data: boards, rows, cells, intervals, curves.
 
-Everything that is not simple arithmetic is computed here; the page filters, averages over cells,
-sorts and draws. It has the intervals of a mean for every selection of cells that its filters can
-make.
+Everything that is not simple arithmetic is computed here, such as the intervals of means over all
+selections of cells; the page filters, averages over cells, sorts and draws.
 """
 
 import math

@@ -178,7 +178,7 @@ def _agreements(record: Record) -> Iterator[tuple[str, Any, Any, str]]:
             yield f"parameters.{name}", detector, _exact(value), reason
     for name, count in record.counts.items():
         yield f"counts.{name}", record.environment, count, "both are of the same trajectories"
-    fit = f"{record.label} on {record.environment}"
+    fit = f"{record.cell.label} on {record.environment}"
     yield "scores", record.scores, fit, "a score file is of one fit"
     if not record.ok:
         return

@@ -131,11 +131,6 @@ class Difference:
     reason: str = ""
     outside: bool = False
 
-    @property
-    def metric(self) -> str:
-        """Name of the metric."""
-        return self.tolerance.metric
-
     def __str__(self) -> str:
         return f"{self.split}/{self.place}::{self.detector}"
 
@@ -171,9 +166,6 @@ def compare(
     A cell of the reference that is missing now, or fails now, fails the comparison; one that failed
     in the reference already does not. A number against NaN is a difference that no tolerance
     covers; NaN against NaN is none.
-
-    NothingInCommonError: no cell is in both under the same conditions. UsageError: a metric is not
-    in the reference.
     """
     common = [c for c in reference.boards if c in now.boards]
     _require_common(now, reference, common)

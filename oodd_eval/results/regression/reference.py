@@ -77,8 +77,7 @@ def read_record_set(path: Path | str) -> RecordSet:
 def write_reference(records: Iterable[Record], path: Path | str) -> None:
     """Write a file of records to compare with later: values, without intervals and costs.
 
-    Records stand in the order of the benchmark, whatever the order in which cells ran. OutputError:
-    the file cannot be written.
+    Records stand in the order of the benchmark, whatever the order in which cells ran.
     """
     environments, anomalies = list(ENVIRONMENTS), list(ANOMALIES)
 

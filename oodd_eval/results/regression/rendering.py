@@ -48,8 +48,8 @@ def tables(differences: Iterable[Difference], by: By = "cell") -> Iterator[tuple
         rows: dict[tuple[str, str], list[str]] = {}
         colours = []
         for d in own:
-            figures = [_number(d.reference, d.metric), _number(d.now, d.metric)]
-            row = [d.metric, *figures, change(d), d.tolerance.text]
+            figures = [_number(d.reference, d.tolerance.metric), _number(d.now, d.tolerance.metric)]
+            row = [d.tolerance.metric, *figures, change(d), d.tolerance.text]
             if d.verdict in _WHOLE and several[d.place, d.verdict] > 1:
                 row = ["all", "", "", change(d), ""]
             if (d.place, row[0]) not in rows:
@@ -76,7 +76,7 @@ def summary(comparison: Comparison) -> str:
     known = [d for d in comparison.differences if d.verdict != "new"]
     what = {"cell": "cells", "group": "group means", "mean": "means"}[comparison.by]
     units = len({str(d) for d in known})
-    metrics = list(dict.fromkeys(d.metric for d in known))
+    metrics = list(dict.fromkeys(d.tolerance.metric for d in known))
     counts = Counter(d.verdict for d in known)
     found = ", ".join(f"{counts[v]} {v}" for v in MEANINGS if counts[v])
     new = len({str(d) for d in comparison.differences if d.verdict == "new"})
@@ -154,7 +154,7 @@ def junit(comparison: Comparison) -> str:
         suite = ET.SubElement(root, "testsuite", {"name": name, **_counts(differences)})
         suite.set("skipped", str(sum(d.verdict == "new" for d in differences)))
         for d in differences:
-            names = {"name": d.metric, "classname": _clean(str(d)), "time": "0"}
+            names = {"name": d.tolerance.metric, "classname": _clean(str(d)), "time": "0"}
             case = ET.SubElement(suite, "testcase", names)
             if d.fails:
                 failure = ET.SubElement(case, "failure", type=d.verdict, message=_clean(message(d)))
@@ -174,7 +174,7 @@ def message(d: Difference) -> str:
     """Return one line about a difference: figures, change, tolerance and verdict."""
     both = d.reference, d.now
     reference, now = ("undefined" if math.isnan(v) else f"{v:.6g}" for v in both)
-    figures = f"{d.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
+    figures = f"{d.tolerance.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
     return f"{figures}, tolerance {d.tolerance.text}"
 
 

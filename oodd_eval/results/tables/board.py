@@ -109,7 +109,7 @@ class Board:
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
         failed = [r for r in self.records if not r.ok]
-        units = {(r.label, r.environment, r.status): r for r in reversed(failed)}
+        units = {(r.cell.label, r.environment, r.status): r for r in reversed(failed)}
         return list(reversed(units.values()))
 
 

@@ -222,7 +222,7 @@ def by_anomaly(
 
 def failures(board: Board) -> Table | None:
     """Return why fits failed; None when none did."""
-    rows = [[r.environment, r.label, r.status, r.reason] for r in board.failures()]
+    rows = [[r.environment, r.cell.label, r.status, r.reason] for r in board.failures()]
     header = ["environment", "detector", "state", "reason"]
     return Table("Failures", header, rows, labels=4) if rows else None
 

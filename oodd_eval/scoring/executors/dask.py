@@ -91,10 +91,11 @@ class DaskExecutor:
         except Exception as error:
             if self._stopping.is_set():
                 return Scored("error", "interrupted")
+            where = f"{job.unit.setting.label(job.unit.seed)} on {job.unit.environment}"
             raise ExecutorError(
-                f"{job.unit.label} on {job.unit.environment} could not be run on the cluster at "
-                f"{self._address} ({type(error).__name__}: {error}); its workers need oodd-eval "
-                "and the same plug-ins as this side"
+                f"{where} could not be run on the cluster at {self._address} "
+                f"({type(error).__name__}: {error}); its workers need oodd-eval and the same "
+                "plug-ins as this side"
             ) from error
         finally:
             self._running.discard(future)
@@ -164,7 +165,7 @@ def _scored(order: Message, stop: Stop) -> Message:
     unit = _unit(order["unit"])
     plan = Plan(units=(unit,), **order["plan"])
     try:
-        offer = offer_of(unit.plugin, unit.detector)
+        offer = offer_of(unit.plugin, unit.setting.detector)
     except PluginError as error:
         raise ExecutorError(f"on the other side, {error}") from None
     found = {"version": offer.version, "source": source_digest(offer.module)}
