@@ -9,7 +9,6 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.names import select
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import Offer, discover
-from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
@@ -84,6 +83,6 @@ def evaluate(
         horizons=[horizon], seeds=[seed], parameters=given, limit=limit,
     )  # fmt: skip
     # One at a time: a factory's detector need not be able to share this process with another.
-    settings = RunSettings(jobs=1, limits=Limits())
+    settings = RunSettings(jobs=1)
     results = ResultsDirectory(output) if output is not None else None
     return run(plan, opened, plugins, settings, results).records

@@ -140,9 +140,6 @@ def _check_threshold(where: str, name: str, record: Record, findings: Findings) 
             findings.refuse(where, f"metrics.{name}.value", message)
 
 
-# -- records with each other ----------------------------------------------------------------------
-
-
 def check_together(
     entry: EntryInfo, records: Records, sums: Mapping[str, Sums], findings: Findings
 ) -> None:
@@ -237,9 +234,6 @@ def _check_misses(records: Records, sums: Mapping[str, Sums], findings: Findings
                 wrong = chosen & ((steps != known) if misses else (steps >= known))
                 expected = "the remainder of the episode, as in other misses, or less with an alarm"
                 _refuse_terms(where, own, iter([(censored, wrong, expected)]), findings)
-
-
-# -- records and their split ----------------------------------------------------------------------
 
 
 def check_against_split(

@@ -181,9 +181,6 @@ def check_rescored(records: Records, directory: Path, split: Split, findings: Fi
     return findings.count == before
 
 
-# -- curves ---------------------------------------------------------------------------------------
-
-
 def first_seeds(records: Iterable[Record]) -> dict[Setting, int]:
     """Return the lowest seed of each row that has an evaluated cell."""
     found: dict[Setting, int] = {}
