@@ -24,12 +24,8 @@ TWINS: Final = "test/nominal"
 PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
 """All parts in the benchmark's order. Each is a group of the environment's file."""
 
-NAMES: Final = "names"
-"""The group of an environment's file that names the columns of observations and actions."""
-
-_ROWS: Final = 1 << 14
-"""Transitions that are read at once from a large part, unless a single trajectory has more."""
-
+NAMES: Final = "names"  # the group that names the columns of observations and actions
+_ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 
 

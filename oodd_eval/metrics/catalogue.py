@@ -28,14 +28,9 @@ LEVELS: Final[Mapping[str, float]] = MappingProxyType(
 )
 """Largest share of nominal episodes with an alarm, by the suffix of the metrics at this level."""
 
-HEADLINE: Final = "at_5pct"
-"""Suffix of the level that tables show."""
-
-FOUND_WITHIN: Final = (20, 100)
-"""Rows from the effect on within which an episode counts as found."""
-
-UNDEFINED: Final = "\N{EN DASH}"
-"""Printed for NaN."""
+HEADLINE: Final = "at_5pct"  # suffix of the level that tables show
+FOUND_WITHIN: Final = (20, 100)  # rows from the effect on within which an episode counts as found
+UNDEFINED: Final = "\N{EN DASH}"  # printed for NaN
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,22 +25,14 @@ ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
 
 MIN_RESAMPLES: Final = 10_000  # least number of bootstrap resamples
-
-RESAMPLES_PER_PAIR: Final = 50
-"""Resamples per ordered pair: no p-value is below 1 / (R + 1), so R has to grow with the number of
-pairs for anything to stay significant after Holm's correction."""
-
+RESAMPLES_PER_PAIR: Final = 50  # no p-value is below 1 / (R + 1): R has to grow with the pairs
 OWN_SEEDS: Final = "detector seeds"  # source of noise that a row's own detector seeds are
-
-NOISE: Final = 1e-12
-"""Largest difference that is taken for rounding, so that equal rows are equal on every machine."""
+NOISE: Final = 1e-12  # larger differences are no rounding: equal rows are equal anywhere
 
 Floats = NDArray[np.float64]
 Place = tuple[str, str]  # environment and anomaly; cells of one environment share their resamples
-Row = Mapping[int, Mapping[Place, Contribution]]
-"""One row's contributions by detector seed and cell."""
-Influences = dict[str, Floats]
-"""By source of noise: how much each test or detector seed shifts a mean, centred on 0."""
+Row = Mapping[int, Mapping[Place, Contribution]]  # by detector seed and cell
+Influences = dict[str, Floats]  # by source of noise: shifts of a mean by each seed, centred on 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,7 @@ SHORTEST_TAIL: Final = 20
 """An anomalous episode has more than this many transitions beyond the onset, if any draw does."""
 
 MAX_REDRAWS: Final = 100
-EVALUATION_SEED: Final = 900_000_000
-"""First seed of evaluation episodes: outside every split (bases times a million) and training."""
+EVALUATION_SEED: Final = 900_000_000  # outside every split and training
 
 
 class TwinTooShortError(SimulationError):

@@ -23,8 +23,7 @@ from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES
 from oodd_eval.results.directory import RECORDS
 
 MB: Final = 10**6
-MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}
-"""Largest decompressed sizes of files that may be compressed."""
+MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
 
 MOST_BYTES: Final = {ENTRY: MB // 4, **MOST_PLAIN, **{n + GZIP: 8 * MB for n in MOST_PLAIN}}
 """Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""

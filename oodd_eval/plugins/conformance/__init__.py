@@ -104,8 +104,7 @@ class Check:
         return self.name
 
 
-_latest: list[Any] = []
-"""The arguments of the last check that was called with a factory, and its trial."""
+_latest: list[Any] = []  # arguments and trial of the last check of a factory
 
 CHECKS: Final = {
     (name := function.__name__.removeprefix("check_").replace("_", "-")): Check(

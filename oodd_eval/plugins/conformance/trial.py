@@ -25,9 +25,7 @@ SENSORS: Final = 3
 ACTIONS: Final = 2
 EPISODES: Final = 12
 ROWS: Final = 80  # observations of an episode, beyond the horizon
-
-Factory = Callable[..., Detector] | DetectorSpec
-"""A detector's factory, or the spec that a plug-in offers."""
+Factory = Callable[..., Detector] | DetectorSpec  # a factory, or what a plug-in offers
 
 
 class CheckFailedError(ContractError, AssertionError):
