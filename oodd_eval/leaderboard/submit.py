@@ -14,15 +14,8 @@ from typing import Any, Final, Literal
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.files import compress_large
 from oodd_eval.errors import OutputError, UsageError
-from oodd_eval.leaderboard.entry import (
-    CURVES,
-    ENTRY,
-    SCORES,
-    EntryInfo,
-    Trust,
-    read_entries,
-    recorded_versions,
-)
+from oodd_eval.leaderboard import entry as stored
+from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo, Trust
 from oodd_eval.leaderboard.verify import Seen, check_clashes, find_split, formats, verify_entry
 from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.leaderboard.verify.scores import first_seeds
@@ -99,7 +92,7 @@ def submit(
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
             seen = Seen()
-            for other in read_entries(root):
+            for other in stored.read_entries(root):
                 numbered = {str(i): record for i, record in enumerate(other.records)}
                 check_clashes(other.meta.id, numbered, seen, Findings())
             check_clashes(verdict.name, verdict.records, seen, verdict.findings)
@@ -207,7 +200,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
         names = ("distribution", "plugin", "version", "source_digest")
         plugins.append(dict(zip(names, (*plugin.split(":", 1), *source), strict=True)))
     packages = {r.plugin.partition(":")[0]: r.detector_version for r in records}
-    packages |= recorded_versions(records)
+    packages |= stored.recorded_versions(records)
     platforms = sorted({r.provenance.get("platform", "") for r in records})
     environment = {"python": packages.pop("python"), "platform": "+".join(platforms)[:200],
                    "packages": dict(sorted(packages.items()))}  # fmt: skip

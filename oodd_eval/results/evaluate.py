@@ -7,12 +7,8 @@ from dataclasses import dataclass, replace
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.alarms import (
-    AlarmKind,
-    GuaranteedAlarm,
-    guaranteed_contributions,
-    offered_levels,
-)
+from oodd_eval.metrics import alarms
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import GUARANTEED, metric_info
@@ -37,7 +33,7 @@ class Rules:
     @classmethod
     def fit(cls, calibration: Sequence[Scores], alarm: AlarmKind = "cusum") -> "Rules":
         """Standardize and find thresholds on the scores of nominal trajectories."""
-        levels = offered_levels(len(calibration), alarm)
+        levels = alarms.offered_levels(len(calibration), alarm)
         rules = GuaranteedAlarm.fits(calibration, list(levels.values()), alarm)
         paper = AlarmRule(Standardization.fit(calibration))
         return cls(paper, dict(zip(levels, rules, strict=True)))
@@ -51,8 +47,8 @@ def cell_metrics(
     found = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
     thresholds = {}
     for suffix, rule in rules.guaranteed.items():
-        alarms = guaranteed_contributions(anomalous, twins, effects, rule)
-        found |= {f"{name}_{suffix}": alarms[name] for name in GUARANTEED}
+        own = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
+        found |= {f"{name}_{suffix}": own[name] for name in GUARANTEED}
         # JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
         finite = math.isfinite(rule.threshold)
         thresholds[f"threshold_{suffix}"] = Metric(rule.threshold if finite else NAN)

@@ -13,15 +13,8 @@ import numpy as np
 from oodd_eval.data.parts import TWINS, EnvironmentData, TrajectorySet, lengths_of, parts_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import (
-    Probe,
-    Scores,
-    check_prefix,
-    check_scores,
-    make_detector,
-    probes,
-    score_chunk,
-)
+from oodd_eval.plugins import contract
+from oodd_eval.plugins.contract import Probe, Scores
 from oodd_eval.plugins.discovery import Offer, printable
 from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Stop, run_isolated
 from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory, ScoreFile
@@ -105,7 +98,7 @@ class _Work:
         self._job, self._sets = job, sets
         self._lengths = lengths_of(sets, job.plan.limit)
         self._order = secrets.randbits(ORDER_BITS)
-        self._probes = probes(self._lengths, self._order)
+        self._probes = contract.probes(self._lengths, self._order)
         self._ordered = [*groups(self._lengths), self._probes]
         self._drawn = np.random.default_rng(self._order).permutation(len(self._ordered))
         self._groups = [self._ordered[k] for k in self._drawn]
@@ -144,14 +137,13 @@ class _Work:
     def in_process(self) -> Scored:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
         unit, limit = self._job.unit, self._job.plan.limit
-        detector = make_detector(
+        detector = contract.make_detector(
             self._job.offer.spec.factory, seed=unit.seed, horizon=unit.setting.horizon,
             parameters=unit.parameters,
         )  # fmt: skip
         detector.fit([*map(self._shown, islice(self._job.data.train, limit))])
-        returned = [
-            score_chunk(copy.deepcopy(detector), [*self._members(group)]) for group in self._groups
-        ]
+        shown = ([*self._members(group)] for group in self._groups)
+        returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in shown]
         parts = self._placed(returned, getattr(detector, "warm_up", 0))
         return Scored(file=ScoreFile(parts, {}, self._order))
 
@@ -165,20 +157,19 @@ class _Work:
 
     def _placed(self, returned: list[list[object]], warm_up: object) -> dict[str, list[Scores]]:
         """Check the scores of all groups; raise `ContractError`, or return them by part."""
-        parts: dict[str, list[Scores]] = {
-            p: [np.empty(0)] * len(n) for p, n in self._lengths.items()
-        }
+        parts: dict[str, list[Scores]]
+        parts = {p: [np.empty(0)] * len(n) for p, n in self._lengths.items()}
         scores, unit = dict(zip(self._drawn, returned, strict=True)), self._job.unit
+        detector, horizon = unit.setting.detector, unit.setting.horizon
         # In the order of the split: the first fault that is told is the same in every run.
         for k, group in enumerate(self._ordered):
             for (part, i, rows), one in zip(map(astuple, group), scores[k], strict=True):
                 where = f"{unit.environment}/{part}[{i}]"
-                found = check_scores(
-                    one, rows, horizon=unit.setting.horizon, warm_up=warm_up,
-                    detector=unit.setting.detector, where=where,
-                )  # fmt: skip
+                found = contract.check_scores(
+                    one, rows, horizon=horizon, warm_up=warm_up, detector=detector, where=where
+                )
                 if group is self._probes:
-                    check_prefix(found, parts[part][i], detector=unit.setting.detector, where=where)
+                    contract.check_prefix(found, parts[part][i], detector=detector, where=where)
                 else:
                     parts[part][i] = found
         return parts

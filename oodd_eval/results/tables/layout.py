@@ -7,17 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS
-from oodd_eval.metrics.catalogue import (
-    ALARM_RANKING,
-    FOUND_WITHIN,
-    GUARANTEED,
-    HEADLINE,
-    LEVELS,
-    METRICS,
-    RANKING,
-    UNDEFINED,
-    metric_info,
-)
+from oodd_eval.metrics import catalogue
+from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables.board import Board, RankedBoard, Standing, Value
 
@@ -30,8 +21,8 @@ _FEW: Final = 30  # test seeds per environment below which a board calls compari
 _BRIEF: Final = "\N{DAGGER}"  # marks the figures of brief cells
 
 _ALARMS: Final = (
-    "delay", "missed", *(f"found_within_{k}" for k in FOUND_WITHIN),
-    f"found_within_{FOUND_WITHIN[-1]}_null", "false_episodes", "early",
+    "delay", "missed", *(f"found_within_{k}" for k in catalogue.FOUND_WITHIN),
+    f"found_within_{catalogue.FOUND_WITHIN[-1]}_null", "false_episodes", "early",
 )  # fmt: skip
 """Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
 
@@ -138,14 +129,14 @@ def guaranteed(
     Where `standings` are given, rows are in their order and have their places.
     """
     suffix = suffix or _strictest(board)
-    bases = _ALARMS if not nulls else GUARANTEED
+    bases = _ALARMS if not nulls else catalogue.GUARANTEED
     names = _present(board, (f"{name}_{suffix}" for name in bases))
     if not names:
         return None
     shown = [n for n in names if intervals or n.startswith("false_episodes")]
     columns = [c._replace(title=c.title.partition(" at ")[0].lower())
                for c in _overall(board, names, shown)]  # fmt: skip
-    level = f"{100 * LEVELS[suffix]:g} %"
+    level = f"{100 * catalogue.LEVELS[suffix]:g} %"
     title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
     note = (
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
@@ -156,8 +147,8 @@ def guaranteed(
 
 def _strictest(board: Board) -> str:
     """Return the suffix of the headline level, or of the strictest one that records have."""
-    found = [s for s in LEVELS if _present(board, [f"false_episodes_{s}"])]
-    return HEADLINE if HEADLINE in found or not found else found[-1]
+    found = [s for s in catalogue.LEVELS if _present(board, [f"false_episodes_{s}"])]
+    return catalogue.HEADLINE if catalogue.HEADLINE in found or not found else found[-1]
 
 
 def anomaly_groups(
@@ -196,13 +187,13 @@ def anomaly_groups(
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric without a level, mean over all cells, with nulls and the placebo."""
-    columns = _overall(board, METRICS, METRICS if intervals else ())
+    columns = _overall(board, catalogue.METRICS, catalogue.METRICS if intervals else ())
     return _by_metric(board, "All metrics, mean over cells", columns)
 
 
 def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
     """Return guaranteed alarms at every level that records have, with their nulls."""
-    tables = (guaranteed(board, suffix, intervals=intervals, nulls=True) for suffix in LEVELS)
+    tables = (guaranteed(board, s, intervals=intervals, nulls=True) for s in catalogue.LEVELS)
     return [table for table in tables if table]
 
 
@@ -325,8 +316,8 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
             "pushes no other row down."
         )
     if ranks.alarms.ranks:
-        title = metric_info(ALARM_RANKING).title[0].lower() + metric_info(ALARM_RANKING).title[1:]
-        lines.append(f"Alarm rank: the same by {title}, lower is better.")
+        title = metric_info(catalogue.ALARM_RANKING).title
+        lines.append(f"Alarm rank: the same by {title[0].lower()}{title[1:]}, lower is better.")
         without = (one for one in ranks.standings if one.alarm_state and not one.state)
         lines += [f"Without an alarm rank: {one.entry}, {one.alarm_state}." for one in without]
     seeds = ranks.board.test_seeds()
