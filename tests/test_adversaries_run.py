@@ -77,7 +77,7 @@ def test_the_tree_would_win_if_partners_met():
         def __deepcopy__(self, memo):
             return self
 
-    with patch.object(unit, "probes", lambda *_: []):
+    with patch.object(unit.contract, "probes", lambda *_: []):
         assert mean_auc(adversaries.Tree) == 0.5
         assert mean_auc(Shared) > 0.7
 

@@ -164,7 +164,7 @@ def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_spl
     assert [record.value("auc_matched") for record in records] == [0.5] * 4
     # With one memory for all groups, it knows who leaves the others. Which of two twins comes
     # first is drawn, so it may rank either of them higher.
-    with patch.object(unit, "probes", lambda *_: []):
+    with patch.object(unit.contract, "probes", lambda *_: []):
         records = evaluate(Shared, tiny_split, **settings)
     assert max(abs(record.value("auc_matched") - 0.5) for record in records) > 0.1
 
@@ -377,6 +377,6 @@ def test_an_object_in_this_process_is_copied_for_every_group(tiny_split):
         scored = evaluate(detector, tiny_split, environments="hopper", anomalies="iid")
         return scored[0].value("auc_matched")
 
-    with patch.object(unit, "probes", lambda *_: []):
+    with patch.object(unit.contract, "probes", lambda *_: []):
         assert value(Company) == 0.5
         assert value(Shared) != 0.5
