@@ -154,7 +154,9 @@ def first(detector, split, **settings):
     return records[0]
 
 
-def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_split):
+def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_split, monkeypatch):
+    monkeypatch.setattr(unit.secrets, "randbits", lambda _: 2)  # one of the orders that are drawn
+
     class Shared(Tree):
         def __deepcopy__(self, memo):
             return self
@@ -162,11 +164,10 @@ def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_spl
     settings = {"environments": "hopper", "anomalies": "iid,drift,shutdown,gravity"}
     records = evaluate("company", tiny_split, **settings)
     assert [record.value("auc_matched") for record in records] == [0.5] * 4
-    # With one memory for all groups, it knows who leaves the others. Which of two twins comes
-    # first is drawn, so it may rank either of them higher.
+    # With one memory for all groups, it knows who leaves the others.
     with patch.object(unit.contract, "probes", lambda *_: []):
         records = evaluate(Shared, tiny_split, **settings)
-    assert max(abs(record.value("auc_matched") - 0.5) for record in records) > 0.1
+    assert max(record.value("auc_matched") for record in records) > 0.6
 
 
 def test_state_that_outlives_an_episode_is_found(plugin, tiny_split):
