@@ -5,12 +5,13 @@ and the exit code, and nothing of it is used. (pluggy's own loader stops at the 
 and silently drops the second of two that share a name.)
 """
 
+import functools
 import inspect
 import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Final
@@ -303,11 +304,17 @@ def _foreign(point: EntryPoint) -> bool:
 
 
 def _distribution(point: EntryPoint) -> str:
-    return point.dist.name if point.dist else "unknown distribution"
+    return _metadata(point.dist)[0] if point.dist else "unknown distribution"
 
 
 def _version(point: EntryPoint) -> str:
-    return point.dist.version if point.dist else ""
+    return _metadata(point.dist)[1] if point.dist else ""
+
+
+@functools.lru_cache(maxsize=64)
+def _metadata(distribution: Distribution) -> tuple[str, str]:
+    """Return name and version, for which a distribution reads its files anew every time."""
+    return distribution.name, distribution.version
 
 
 def _importable(name: str) -> bool:
