@@ -57,7 +57,9 @@ def shared_weights(environment: str, n: int) -> Weights:
 
 def resampled(contribution: Contribution, weights: Weights) -> Samples:
     """Return a metric in every resample; NaN where its denominator is 0."""
-    numerator = np.einsum("rn,n->r", weights, contribution.numerator)
+    numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
+    if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
+        return numerator / len(contribution.denominator)
     denominator = np.einsum("rn,n->r", weights, contribution.denominator)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(denominator > 0, numerator / denominator, np.nan)
@@ -210,6 +212,8 @@ def mean_over_seeds(parts: Sequence[Samples], *, key: str = "") -> Samples:
     The draws depend on nothing but the number of seeds and `key`, so that differences of two means
     over the same seeds are paired. An environment as key gives each environment its own draws.
     """
+    if len(parts) == 1:
+        return parts[0]
     stacked = np.array(parts)  # (seeds, R)
     rng = np.random.default_rng([zlib.crc32(key.encode()), len(stacked)] if key else 0)
     drawn = rng.integers(len(stacked), size=stacked.shape)
