@@ -4,7 +4,7 @@ import ast
 import fnmatch
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Final
 
 from oodd_eval.errors import UnknownNameError, UsageError
@@ -14,6 +14,13 @@ Predicate = Callable[[str], bool]
 _TIMES: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 _AMOUNTS: Final = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9,
                    "kib": 2**10, "mib": 2**20, "gib": 2**30}  # fmt: skip
+
+
+def check_known(kind: str, known: Collection[str], *names: str) -> None:
+    """Raise `UnknownNameError` for the first name that is not among the known ones."""
+    for name in names:
+        if name not in known:
+            raise UnknownNameError(kind, name, known)
 
 
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:

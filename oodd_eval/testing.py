@@ -16,15 +16,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.conformance import (
-    CHECKS,
-    Check,
-    Report,
-    Result,
-    carry_out,
-    expected,
-    must_exist,
-)  # fmt: skip
+from oodd_eval.names import check_known
+from oodd_eval.plugins.conformance import CHECKS, Check, Report, Result, carry_out, expected
 from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
 
 __all__ = ["Check", "CheckFailedError", "CheckSkipped", "NonConformingError", "Report", "Result",
@@ -71,7 +64,7 @@ def run_checks(
     arguments
         ``horizon`` (1), ``seed`` (0) and ``parameters`` that the factory is called with.
     """
-    must_exist(expected_failures or {})
+    check_known("check", CHECKS, *(expected_failures or {}))
     results = carry_out(Trial(factory, **arguments), CHECKS)
     return Report([expected(result, expected_failures or {}) for result in results])
 

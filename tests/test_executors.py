@@ -18,7 +18,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import LocalExecutor, RunSettings, open_executor
+from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
 from oodd_eval.scoring.planning import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
@@ -72,7 +72,7 @@ def test_the_local_executor_uses_all_cores_unless_told():
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
     there = ordered(job, tiny_split)
-    here = LocalExecutor(RunSettings(jobs=1), None, NEVER)(job)
+    here = Executor(RunSettings(jobs=1), None, NEVER)(job)
     assert there["status"] == here.status == "ok"
     assert {k: [s.tolist() for s in v] for k, v in there["parts"].items()} == {
         k: [s.tolist() for s in v] for k, v in here.file.parts.items()

@@ -5,8 +5,8 @@ from typing import Final
 
 from oodd_eval.cli import Parser, add_detector, add_limits, at_least, say, value
 from oodd_eval.cli.terminal import discovered, make_console
-from oodd_eval.names import assignment, expression
-from oodd_eval.plugins.conformance import CHECKS, Report, expected, must_exist
+from oodd_eval.names import assignment, check_known, expression
+from oodd_eval.plugins.conformance import CHECKS, Report, expected
 from oodd_eval.plugins.conformance.supervise import supervise
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval check``: 1 when a check failed, 5 when none ran, else 0."""
     limits = Limits(options.timeout, options.memory)
     expecting, parameters = dict(options.expect), dict(options.param)
-    must_exist(expecting)
+    check_known("check", CHECKS, *expecting)
     offer = discovered(options).offer(options.detector)
     offer.require()
     spec = offer.spec

@@ -8,8 +8,8 @@ from oodd_eval.cli.data import record_split
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UnknownNameError, UsageError
-from oodd_eval.names import seconds, select
+from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
+from oodd_eval.names import check_known, seconds, select
 from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, TIERS
 from oodd_eval.paper.inputs import Reproduction, keep_inputs, load_records, load_returns
 from oodd_eval.paper.page import publish
@@ -51,8 +51,7 @@ def define(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Carry out the command; 1 when units failed, 2 when units are left."""
-    if options.tier not in TIERS:
-        raise UnknownNameError("tier", options.tier, TIERS)
+    check_known("tier", TIERS, options.tier)
     if options.render_only:
         header = Reproduction.load(Path(options.output))
         places = [Path(place) for place in options.records or [options.output]]

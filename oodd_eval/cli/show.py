@@ -5,8 +5,8 @@ import argparse
 from oodd_eval.cli import Parser, say
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.split import load_split
-from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import NAMES
+from oodd_eval.names import check_known
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
@@ -34,8 +34,7 @@ def define(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval show``; 1 when one of the cells failed."""
-    if options.metric not in NAMES:
-        raise UnknownNameError("metric", options.metric, NAMES)
+    check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()
     if not options.stored:
@@ -48,8 +47,8 @@ def run(options: argparse.Namespace) -> int:
         return code
     reporter = TerminalReporter(make_console(), intervals=options.intervals)
     name, intervals = options.detector, options.intervals
-    if name and name not in (known := {r.detector for r in records}):
-        raise UnknownNameError("detector of these results", name, known)
+    if name:
+        check_known("detector of these results", {r.detector for r in records}, name)
     for board in boards(records) if name else ():
         for entry in (e for e in board.entries if e.detector == name):
             reporter.table(layout.by_anomaly(board, entry, options.metric, intervals=intervals))

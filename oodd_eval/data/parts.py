@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
-from oodd_eval.errors import SplitError, UnknownNameError
+from oodd_eval.errors import SplitError
+from oodd_eval.names import check_known
 
 TRAIN: Final = "train"
 CALIBRATION: Final = "calibration"
@@ -124,25 +125,22 @@ class AnomalousSet(TrajectorySet):
 
 
 class EnvironmentData:
-    """The verified content of one environment: `id` is its name, `digest` that of all its parts."""
+    """The verified content of one environment: `id` is its name, `digest` that of all its parts.
+
+    `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
+    calibrate alarms, `twins` those of the test seeds. `anomalies` are the names of those in this
+    split. `sensors` and `actions` are names and units of the columns of observations and actions.
+    """
 
     def __init__(self, environment: str, file: h5py.File, digest: str) -> None:
         self.id, self.digest, self._file = environment, digest, file
-
-    @functools.cached_property
-    def train(self) -> TrajectorySet:
-        """Nominal trajectories to fit on."""
-        return TrajectorySet(self._file, TRAIN)
-
-    @functools.cached_property
-    def calibration(self) -> TrajectorySet:
-        """Nominal trajectories that standardize scores and calibrate alarms."""
-        return TrajectorySet(self._file, CALIBRATION)
-
-    @functools.cached_property
-    def twins(self) -> TrajectorySet:
-        """Nominal test trajectories, one per test seed."""
-        return TrajectorySet(self._file, TWINS)
+        nominal = (TrajectorySet(file, part) for part in (TRAIN, CALIBRATION, TWINS))
+        self.train, self.calibration, self.twins = nominal
+        self.anomalies = tuple(a for a in ANOMALIES if f"test/{a}" in file)
+        self.sensors, self.actions = (
+            tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, file[kind][:]))
+            for kind in (f"{NAMES}/sensors", f"{NAMES}/actions")
+        )
 
     def anomalous(self, anomaly: str) -> AnomalousSet:
         """Return the test trajectories with one anomaly, in the order of their twins.
@@ -157,30 +155,10 @@ class EnvironmentData:
         UnknownNameError, SplitError
             When the benchmark has no such anomaly, or this split has no such part.
         """
-        if anomaly not in ANOMALIES:
-            raise UnknownNameError("anomaly", anomaly, ANOMALIES)
+        check_known("anomaly", ANOMALIES, anomaly)
         if f"test/{anomaly}" not in self._file:
             raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
         return AnomalousSet(self._file, f"test/{anomaly}")
-
-    @functools.cached_property
-    def sensors(self) -> tuple[Quantity, ...]:
-        """Names and units of the columns of observations."""
-        return self._named("sensors")
-
-    @functools.cached_property
-    def actions(self) -> tuple[Quantity, ...]:
-        """Names and units of the columns of actions."""
-        return self._named("actions")
-
-    def _named(self, kind: str) -> tuple[Quantity, ...]:
-        rows = map(json.loads, self._file[f"{NAMES}/{kind}"][:])
-        return tuple(Quantity(row["name"], row["unit"]) for row in rows)
-
-    @property
-    def anomalies(self) -> tuple[str, ...]:
-        """Names of the anomalies in this split."""
-        return tuple(a for a in ANOMALIES if f"test/{a}" in self._file)
 
     def close(self) -> None:
         """Close the file."""

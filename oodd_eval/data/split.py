@@ -16,6 +16,7 @@ from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
 from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, PARTS, EnvironmentData
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
+from oodd_eval.names import check_known
 
 SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
 
@@ -118,8 +119,7 @@ class Split:
         SplitNotFoundError, SplitError, DigestError
             When the file is missing, damaged, or not what the manifest names.
         """
-        if name not in self.environments:
-            raise UnknownNameError(f"environment of split {self.name}", name, self.environments)
+        check_known(f"environment of split {self.name}", self.environments, name)
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(self._open(name))
             bad = next((check for check in self._checks(name, file) if not check.ok), None)

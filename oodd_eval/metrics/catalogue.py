@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal
 
-from oodd_eval.errors import UnknownNameError
+from oodd_eval.names import check_known
 
 Unit = Literal["percent", "steps", "rate"]
 Better = Literal["higher", "lower", ""]
@@ -160,8 +160,7 @@ def metric_info(name: str) -> MetricInfo:
     >>> metric_info("missed_at_5pct").title
     'Missed at 5 %'
     """
-    if name not in NAMES:
-        raise UnknownNameError("metric", name, NAMES)
+    check_known("metric", NAMES, name)
     if name in METRICS:
         return METRICS[name]
     base, suffix = split_name(name)

@@ -15,8 +15,9 @@ from typing import Any, Final, Literal, get_args
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.names import check_known
 from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
-from oodd_eval.paper.experiments import check_known, read_tables
+from oodd_eval.paper.experiments import read_tables
 from oodd_eval.paper.inputs import Returns
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import number
@@ -82,8 +83,8 @@ class Claim:
         ends = {k: others.pop(k) for k in ("above", "below", "negligible") if k in others}
         sides = (Side.of(1.0, **plus), *([Side.of(-1.0, **minus)] if minus else []))
         environments = tuple(others.pop("environments", ENVIRONMENTS))
-        check_known("environment", environments, ENVIRONMENTS)
-        check_known("metric", filter(None, (metric, others.get("fair"))), (*NAMES, RETURN))
+        check_known("environment", ENVIRONMENTS, *environments)
+        check_known("metric", (*NAMES, RETURN), *filter(None, (metric, others.get("fair"))))
         if any(bool(side.settings) == (metric == RETURN) for side in sides):
             raise ValueError("expected settings on every side, unless the metric is 'return'")
         if (settled := others.get("settled")) not in (None, *get_args(Settled)):

@@ -9,7 +9,8 @@ from typing import Any, Final, Literal, Self, TypeVar
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, paper_tables
-from oodd_eval.errors import OoddError, ResultsError, UnknownNameError
+from oodd_eval.errors import OoddError, ResultsError
+from oodd_eval.names import check_known
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN
 
@@ -90,9 +91,9 @@ class Experiment:
         """Make an experiment from a table of ``experiments.toml``."""
         grid = others.pop("picture", {})
         plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in others.items()}
-        check_known("environment", plain.get("environments", ()), ENVIRONMENTS)
+        check_known("environment", ENVIRONMENTS, *plain.get("environments", ()))
         for key, known in _CHOICES.items():
-            check_known(key, [(plain | grid).get(key, known[0])], known)
+            check_known(key, known, (plain | grid).get(key, known[0]))
         by_label = tuple(Series(k, tuple(map(Setting.parse, v))) for k, v in series.items())
         return cls(series=by_label, scopes=tuple(map(scope, scopes)), picture=Grid(**grid), **plain)
 
@@ -121,14 +122,8 @@ def scope(name: str) -> Scope:
         return Scope(name, f"{name.capitalize()}-injected", within)
     if name == "all":
         return Scope(name, "All anomalies", tuple(ANOMALIES))
-    check_known("scope", [name], ("all", *GROUPS, *ANOMALIES))
+    check_known("scope", ("all", *GROUPS, *ANOMALIES), name)
     return Scope(name, ANOMALIES[name].title, (name,))
-
-
-def check_known(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raise UnknownNameError for the first name that is not known."""
-    if unknown := [name for name in names if name not in known]:
-        raise UnknownNameError(kind, unknown[0], known)
 
 
 def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...]:

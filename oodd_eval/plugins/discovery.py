@@ -20,7 +20,7 @@ import pluggy
 
 from oodd_eval import plugins as hooks
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
-from oodd_eval.names import select
+from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
 
 _BUILT_IN: Final = "trivial"
@@ -139,8 +139,7 @@ class Plugins:
         for point in sorted(self._waiting, key=lambda p: (_foreign(p), p.name != name)):
             if name not in self._offers:
                 self._load(point)
-        if name not in self._offers:
-            raise UnknownNameError("detector", name, self._offers)
+        check_known("detector", self._offers, name)
         return self._offers[name]
 
     def select(self, patterns: str) -> list[str]:
@@ -242,9 +241,7 @@ def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = N
     names = {point.name for point in (*points, *observers)}
     if only is None and RESTRICT in os.environ:
         only = [name.strip() for name in os.environ[RESTRICT].split(",") if name.strip()]
-    for name in (*disabled, *(only or ())):
-        if name not in names:
-            raise UnknownNameError("plug-in", name, names)
+    check_known("plug-in", names, *disabled, *(only or ()))
 
     def wanted(point: EntryPoint) -> bool:
         built_in = point.name == _BUILT_IN and not _foreign(point)
@@ -263,9 +260,7 @@ def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
         manager.add_hookspecs(specification)
     manager.register(plugin)
     known = {"oodd_detectors", "oodd_detector_from_spec", *hooks.OBSERVER_HOOKS}
-    for caller in manager.get_hookcallers(plugin) or ():
-        if caller.name not in known:
-            raise UnknownNameError("hook", caller.name, known)
+    check_known("hook", known, *(caller.name for caller in manager.get_hookcallers(plugin) or ()))
     return manager.hook
 
 

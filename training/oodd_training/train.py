@@ -15,7 +15,8 @@ from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import evaluate_policy
-from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError
+from oodd_eval.errors import MissingExtraError, PolicyError
+from oodd_eval.names import check_known
 from oodd_training.freeze import freeze_policy
 
 SELECTION_SEED: Final = 910_000_000
@@ -68,8 +69,7 @@ def train_policy(
     steps in all, those of earlier runs included; `progress` is called with one line per
     evaluation.
     """
-    if environment not in ENVIRONMENTS:
-        raise UnknownNameError("environment", environment, ENVIRONMENTS)
+    check_known("environment", ENVIRONMENTS, environment)
     algorithm = ENVIRONMENTS[environment].policy
     total = DEFAULT_STEPS[environment] if steps is None else steps
     learner = _make_learner(environment, algorithm, seed)

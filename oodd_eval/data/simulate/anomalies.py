@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.simulate.environments import Row, Simulator
-from oodd_eval.errors import UnknownNameError
+from oodd_eval.names import check_known
 
 NOMINAL_MARGIN: Final = 0.02  # draws this near to the nominal value change next to nothing
 SENSOR_SHARE: Final = 0.2  # of the sensors that an anomaly corrupts, rounded down, at least one
@@ -76,8 +76,7 @@ class Draw:
 
 def draw(environment: str, anomaly: str, simulator: Simulator, rng: np.random.Generator) -> Draw:
     """Draw an anomaly for one trajectory; nominal values are read from the nominal simulator."""
-    if anomaly not in ANOMALIES:
-        raise UnknownNameError("anomaly", anomaly, ANOMALIES)
+    check_known("anomaly", ANOMALIES, anomaly)
     info = ENVIRONMENTS[environment]
     if ANOMALIES[anomaly].group == "sensor":
         count = max(1, int(SENSOR_SHARE * info.observation_dim))

@@ -37,7 +37,8 @@ from oodd_eval.data.simulate.record import (
     record_seed,
 )
 from oodd_eval.data.split import Split
-from oodd_eval.errors import SimulationError, SplitError, UnknownNameError, UsageError
+from oodd_eval.errors import SimulationError, SplitError, UsageError
+from oodd_eval.names import check_known
 
 CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}  # seeds; a test seed is nine episodes
 MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
@@ -78,8 +79,7 @@ def build_split(
     one worker process per core. `UsageError` for a wrong size, or another split in the directory.
     """
     asked = list(ENVIRONMENTS if environments is None else environments)
-    if unknown := [e for e in asked if e not in ENVIRONMENTS]:
-        raise UnknownNameError("environment", unknown[0], ENVIRONMENTS)
+    check_known("environment", ENVIRONMENTS, *asked)
     names = [e for e in ENVIRONMENTS if e in asked]
     _check_sizes(definition)
     paths = {e: str((policies or {}).get(e, "")) for e in names}

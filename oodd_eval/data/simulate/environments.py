@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.errors import MissingExtraError, UnknownNameError
+from oodd_eval.errors import MissingExtraError
+from oodd_eval.names import check_known
 
 
 @contextmanager
@@ -264,8 +265,7 @@ class Bullet(Simulator):
 
 def make(environment: str) -> Simulator:
     """Return a fresh simulator of an environment, to be used for one episode and closed."""
-    if environment not in ENVIRONMENTS:
-        raise UnknownNameError("environment", environment, ENVIRONMENTS)
+    check_known("environment", ENVIRONMENTS, environment)
     classic: dict[str, Any] = {"acrobot": Acrobot, "cartpole": CartPole, "lunarlander": LunarLander}
     found: Simulator = classic.get(environment, functools.partial(Bullet, environment))()
     return found

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS, EnvironmentInfo
 from oodd_eval.data.layout import content_digest
-from oodd_eval.errors import PolicyError, UnknownNameError
+from oodd_eval.errors import PolicyError
+from oodd_eval.names import check_known
 
 FROZEN: Final = Path(__file__).with_name("frozen")
 ACTION_GRID: Final = 2.0**16
@@ -90,8 +91,7 @@ def policy_digest(arrays: Arrays) -> str:
 
 def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     """Load the frozen policy of an environment, or another file; `PolicyError` if it is none."""
-    if environment not in ENVIRONMENTS:
-        raise UnknownNameError("environment", environment, ENVIRONMENTS)
+    check_known("environment", ENVIRONMENTS, environment)
     info = ENVIRONMENTS[environment]
     file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
     try:

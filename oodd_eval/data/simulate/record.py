@@ -18,7 +18,8 @@ from oodd_eval.data.simulate.anomalies import draw
 from oodd_eval.data.simulate.environments import make
 from oodd_eval.data.simulate.policies import Policy
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import SimulationError, UnknownNameError
+from oodd_eval.errors import SimulationError
+from oodd_eval.names import check_known
 
 _Rows = NDArray[np.float32]
 
@@ -67,8 +68,7 @@ def record_seed(
     changes nothing in 100 redraws.
     """
     names = list(anomalies)
-    if unknown := [name for name in names if name not in ANOMALIES]:
-        raise UnknownNameError("anomaly", unknown[0], ANOMALIES)
+    check_known("anomaly", ANOMALIES, *names)
     twin = record_nominal(environment, seed, policy=policy, episode_cap=episode_cap)
     if names and twin.trajectory.transitions < SHORTEST_TWIN:
         raise TwinTooShortError(

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.conformance import checks_consistency, checks_contract, checks_process
 from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
 from oodd_eval.plugins.discovery import printable
@@ -115,13 +114,6 @@ CHECKS: Final = {
     if getattr(function, "__name__", "").startswith("check_")
 }
 """The checks by name, in the order in which they are carried out; a docstring says what holds."""
-
-
-def must_exist(names: Iterable[str]) -> None:
-    """Refuse names of checks that do not exist."""
-    for name in names:
-        if name not in CHECKS:
-            raise UnknownNameError("check", name, CHECKS)
 
 
 def carry_out(trial: Trial, checks: Iterable[str]) -> Iterator[Result]:

@@ -11,9 +11,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
+from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.names import check_known
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.regression.reference import Conditions, RecordSet
@@ -89,8 +90,7 @@ def parse_tolerance(text: str, known: Collection[str] = NAMES) -> Tolerance:
             "than 0.01) or 'delay:+10%' (rose by more than 10 %)"
         )
     metric, sign, number, percent = match.groups()
-    if metric not in known:
-        raise UnknownNameError("metric", metric, known)
+    check_known("metric", known, metric)
     worse = worse_side(metric)
     if sign and worse not in (sign, "±"):
         better = "higher" if worse == "-" else "lower"

@@ -3,7 +3,7 @@
 import os
 import threading
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final
 from urllib.parse import urlsplit
 
 from oodd_eval.data.split import Split
@@ -34,30 +34,12 @@ class RunSettings:
     command: str = ""
 
 
-class Executor(Protocol):
-    """Runs units; called from several threads at a time."""
+class Executor:
+    """Runs units, here each in a worker process of its own; called from several threads at a time.
 
-    jobs: int
-    """Units at a time."""
-
-    keeps_fits: bool
-    """True if units with one fit key share the fit that the first one keeps."""
-
-    def __call__(self, job: UnitJob) -> Scored:
-        """Score a unit, or find its scores in an earlier run's results."""
-        ...
-
-    def stop(self) -> None:
-        """Give up what is under way: calls return soon, or raise, and no process is left."""
-        ...
-
-    def close(self) -> None:
-        """Release what is held, once no call is under way."""
-        ...
-
-
-class LocalExecutor:
-    """Gives each unit a worker process of its own, which is killed when the run stops."""
+    `jobs` are units at a time. Where it `keeps_fits`, units with one fit key share the fit that the
+    first one keeps.
+    """
 
     def __init__(
         self, settings: RunSettings, results: ResultsDirectory | None, stopping: threading.Event
@@ -67,16 +49,16 @@ class LocalExecutor:
         self._settings, self._results, self._stopping = settings, results, stopping
 
     def __call__(self, job: UnitJob) -> Scored:
-        """Score a unit."""
+        """Score a unit, or find its scores in an earlier run's results."""
         fresh = self._settings.fresh
         return job(self._settings.limits, self._stopping, self._results, fresh=fresh)
 
     def stop(self) -> None:
-        """Kill the workers."""
+        """Give up what is under way: calls return soon, or raise, and no process is left."""
         self._stopping.set()
 
     def close(self) -> None:
-        """Do nothing: workers end with their calls."""
+        """Release what is held, once no call is under way."""
 
 
 def available_cores() -> int:
@@ -90,7 +72,7 @@ def open_executor(
     """Return the executor that the settings name."""
     check_executor(settings.executor)
     if settings.executor == LOCAL:
-        return LocalExecutor(settings, results, threading.Event())
+        return Executor(settings, results, threading.Event())
     from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra
 
     return DaskExecutor(f"tcp://{urlsplit(settings.executor).netloc}", settings, split, results)

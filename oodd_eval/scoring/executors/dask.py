@@ -26,7 +26,7 @@ from oodd_eval.plugins.discovery import offer_of
 from oodd_eval.plugins.isolation.supervisor import Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Setting
-from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.executors import Executor, RunSettings
 from oodd_eval.scoring.keys import source_digest
 from oodd_eval.scoring.plan import Plan, Unit
 from oodd_eval.scoring.unit import Scored, UnitJob
@@ -44,17 +44,15 @@ CONNECT_SECONDS: Final = 10.0
 Message = dict[str, Any]
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """Sends units to the workers of a cluster."""
-
-    keeps_fits = False
 
     def __init__(
         self, address: str, settings: RunSettings, split: Split, results: ResultsDirectory | None
     ) -> None:
-        self._address, self._settings = address, settings
-        self._split, self._results = split, results
-        self._stopping = threading.Event()
+        super().__init__(settings, results, threading.Event())
+        self.keeps_fits = False
+        self._address, self._split = address, split
         self._running: set[Any] = set()
         try:
             # Differing versions of Dask are the cluster's affair; ours are compared unit by unit.
@@ -106,7 +104,7 @@ class DaskExecutor:
 
     def stop(self) -> None:
         """Tell the workers that nobody waits any more."""
-        self._stopping.set()
+        super().stop()
         for future in list(self._running):
             with contextlib.suppress(Exception):
                 future.cancel()
