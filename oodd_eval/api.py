@@ -13,7 +13,7 @@ from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 

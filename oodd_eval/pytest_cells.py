@@ -14,12 +14,17 @@ from oodd_eval.names import select
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.regression import Difference, compare, parse_tolerances
-from oodd_eval.results.regression.reference import Conditions, RecordSet, read_record_set
+from oodd_eval.results.regression import (
+    Conditions,
+    Difference,
+    RecordSet,
+    compare,
+    parse_tolerances,
+    read_record_set,
+)
 from oodd_eval.results.regression.rendering import message
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.plan import Plan
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
 
 
@@ -30,16 +35,10 @@ class Regression(Exception):  # noqa: N818  a finding, not an error of the progr
 class Cells:
     """The plug-in object: it adds the tests and holds what they share."""
 
-    def __init__(self, config: pytest.Config) -> None:
-        self._option = config.getoption
+    def __init__(self, option: Callable[[str], Any]) -> None:
+        self._option = option
         self._records: dict[str, Record] = {}
         self._differences: dict[str, list[Difference]] = {}
-        try:
-            self._prepare(config.getoption)
-        except OoddError as error:
-            raise pytest.UsageError(f"oodd-eval: {error}") from None
-
-    def _prepare(self, option: Callable[[str], Any]) -> None:
         self.plugins = discover()
         names = _detectors(option("oodd_detector"), self.plugins)
         self.split = load_split(option("oodd_split"))

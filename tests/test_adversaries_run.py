@@ -13,7 +13,7 @@ from oodd_eval.metrics.auc import auc
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.scoring import unit
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 ENVIRONMENT = "hopper"

@@ -26,17 +26,15 @@ from oodd_eval.names import expression
 from oodd_eval.results.record import Metric
 from oodd_eval.results.regression import (
     MEANINGS,
+    Conditions,
     NothingInCommonError,
+    RecordSet,
     Tolerance,
     compare,
     parse_tolerance,
+    read_record_set,
     rendering,
     worse_side,
-)
-from oodd_eval.results.regression.reference import (
-    Conditions,
-    RecordSet,
-    read_record_set,
     write_reference,
 )
 

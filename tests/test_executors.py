@@ -19,7 +19,7 @@ from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
 remote = pytest.importorskip("oodd_eval.scoring.executors.dask", reason="needs the extra dask")

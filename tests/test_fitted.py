@@ -11,7 +11,7 @@ from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.fits import FitStore
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 PLUGIN = """

@@ -19,7 +19,7 @@ from oodd_eval.plugins.isolation import Channel
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.scoring import unit
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 PLUGIN = '''

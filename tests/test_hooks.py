@@ -16,7 +16,7 @@ from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring import observers as observer_hooks
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.planning import make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 SPECS = {

@@ -9,8 +9,7 @@ from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression
 from oodd_eval.results import regression
-from oodd_eval.results.regression import rendering
-from oodd_eval.results.regression.reference import RecordSet, read_record_set, write_reference
+from oodd_eval.results.regression import RecordSet, read_record_set, rendering, write_reference
 
 
 def define(parser: Parser) -> None:

@@ -4,6 +4,8 @@ import argparse
 from collections.abc import Iterable
 from dataclasses import asdict
 
+from tabulate import tabulate
+
 from oodd_eval.cli import Parser
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.errors import UnknownNameError
@@ -40,11 +42,7 @@ def run(options: argparse.Namespace) -> int:
         case _:
             kinds = "detectors", "envs", "anomalies", "splits", "metrics"
             raise UnknownNameError("thing to list", options.what, kinds)
-    lines = list(rows)
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in lines:
-        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
-        print("  ".join(cells).rstrip())
+    print(tabulate(rows, tablefmt="plain", disable_numparse=True))
     return code
 
 

@@ -2,8 +2,10 @@
 
 import contextlib
 import gzip
+import hashlib
 import os
 import re
+import shutil
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,11 +47,23 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_abandoned(directory: Path) -> None:
-    """Remove temporary files of `replacing` whose process has ended."""
-    for file in directory.glob(".*"):
-        found = re.fullmatch(r"\..+\.(\d{1,9})", file.name)
+    """Remove what has a temporary name, ``.NAME.PID`` as in `replacing`, of an ended process."""
+    for place in directory.glob(".*"):
+        found = re.fullmatch(r"\..+\.(\d{1,9})", place.name)
         if found and not psutil.pid_exists(int(found[1])):
-            file.unlink(missing_ok=True)
+            if place.is_dir():
+                shutil.rmtree(place, ignore_errors=True)
+            else:
+                place.unlink(missing_ok=True)
+
+
+def digests(directory: Path, *, without: str = "") -> dict[str, str]:
+    """Return the SHA-256 of files below a directory by relative name, but for those of a name."""
+    return {
+        path.relative_to(directory).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(directory.rglob("*"))
+        if path.is_file() and path.name != without
+    }
 
 
 @contextlib.contextmanager

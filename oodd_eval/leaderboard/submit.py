@@ -1,6 +1,5 @@
 """Write an entry of the leaderboard from a results directory."""
 
-import hashlib
 import os
 import shutil
 from collections import defaultdict
@@ -9,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.files import compress_large
+from oodd_eval.data.files import compress_large, digests
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo, Trust
@@ -87,7 +86,10 @@ def submit(
             evaluated = [record for record in records if record.ok]
             for file in _score_files(evaluated, source, "leave out --scores, or"):
                 shutil.copyfile(file, directory / SCORES / file.name)
-        entry = replace(entry, files=_facts(directory))
+        entry = replace(entry, files={
+            name: {"sha256": digest, "bytes": (directory / name).stat().st_size}
+            for name, digest in digests(directory).items()
+        })  # fmt: skip
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
@@ -234,16 +236,6 @@ def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: s
             advice = f"{instead} run again into this directory"
             raise UsageError(f"scores are not there in {str(file)!r}: {advice}")
     return list(files.values())
-
-
-def _facts(directory: Path) -> dict[str, dict[str, Any]]:
-    """Return digest and size of every file."""
-    found = {}
-    for path in sorted(p for p in directory.rglob("*") if p.is_file()):
-        content = path.read_bytes()
-        facts = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
-        found[path.relative_to(directory).as_posix()] = facts
-    return found
 
 
 @contextmanager

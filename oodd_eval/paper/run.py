@@ -21,8 +21,7 @@ from oodd_eval.plugins.parameters import parameters_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.layout import Table
-from oodd_eval.scoring.plan import Unit
-from oodd_eval.scoring.planning import make_unit
+from oodd_eval.scoring.plan import Unit, make_unit
 
 # Units run stage after stage, and within a stage environment by environment.
 STAGES: Final = (

@@ -76,9 +76,8 @@ class ResultsDirectory:
             ) from None
         if (self.path / RECORDS).exists():
             self.records()
-        for directory in (self.path, self.path / "scores", self.path / "logs"):
+        for directory in (self.path, self.path / "scores", self.path / "logs", self.fits.path):
             files.remove_abandoned(directory)
-        self.fits.remove_abandoned()
 
     def records(self) -> list[Record]:
         """Read all records, also compressed ones; `ResultsError` without any, or a damaged one."""

@@ -10,10 +10,8 @@ files are compared with their digests before a detector is asked to load them.
 """
 
 import contextlib
-import hashlib
 import json
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -21,13 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import psutil
+from oodd_eval.data.files import digests
 
 INDEX: Final = "fitted.json"
 
 MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
-
-_FILLING: Final = re.compile(r"\.(\d{1,9})-")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +52,7 @@ class FitStore:
         place = self.path / key
         try:
             index = json.loads((place / INDEX).read_text(encoding="utf-8"))
-            if _digests(place) != index["files"]:
+            if digests(place, without=INDEX) != index["files"]:
                 return None
             return KeptFit(place, float(index["seconds_fit"]))
         except (OSError, ValueError, KeyError, TypeError):
@@ -66,15 +62,14 @@ class FitStore:
     def filling(self) -> Iterator[Path]:
         """Give an empty directory for a detector to save itself in; remove it afterwards."""
         self.path.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{os.getpid()}-", dir=self.path))
-        try:
-            yield made
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
+        with tempfile.TemporaryDirectory(
+            prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
+        ) as made:
+            yield Path(made)
 
     def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
         """Move a filled directory to its key; do nothing when it is empty or too large."""
-        files = _digests(directory)
+        files = digests(directory, without=INDEX)
         size = sum((directory / name).stat().st_size for name in files)
         if not files or size > MAX_BYTES:
             return
@@ -89,19 +84,3 @@ class FitStore:
     def distrust(self, key: str) -> None:
         """Treat the fit under a key as an earlier run's: it could not be loaded."""
         self._made.discard(key)
-
-    def remove_abandoned(self) -> None:
-        """Remove directories that were being filled by processes that have ended."""
-        for directory in self.path.glob(".*"):
-            found = _FILLING.match(directory.name)
-            if found and not psutil.pid_exists(int(found[1])):
-                shutil.rmtree(directory, ignore_errors=True)
-
-
-def _digests(place: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file below a directory, by relative name."""
-    return {
-        str(path.relative_to(place)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(place.rglob("*"))
-        if path.is_file() and path.name != INDEX
-    }

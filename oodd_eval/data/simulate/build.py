@@ -161,7 +161,10 @@ def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> l
     """Return chunks of one further seed for each test seed whose twin was too short."""
     tests = [c for c in planned if c.part == "test"]
     looked_at = sum(c.count for c in tests)
-    short = definition.test - sum(_recorded(work / c.file_name) for c in tests)
+    short = definition.test
+    for chunk in tests:
+        with np.load(work / chunk.file_name, allow_pickle=False) as stored:
+            short -= len(stored[f"{TWINS}:seeds"]) if stored.files else 0
     if looked_at + short > MOST_CANDIDATES * definition.test:
         raise SimulationError(
             f"{tests[0].environment}: of {looked_at} test seeds only {definition.test - short} had "
@@ -170,11 +173,6 @@ def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> l
     last = tests[-1]
     seeds = range(last.first_seed + last.count, last.first_seed + last.count + short)
     return [dataclasses.replace(last, first_seed=seed, count=1) for seed in seeds]
-
-
-def _recorded(file: Path) -> int:
-    with np.load(file, allow_pickle=False) as stored:
-        return len(stored[f"{TWINS}:seeds"]) if stored.files else 0
 
 
 def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
