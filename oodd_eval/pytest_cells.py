@@ -35,10 +35,16 @@ class Regression(Exception):  # noqa: N818  a finding, not an error of the progr
 class Cells:
     """The plug-in object: it adds the tests and holds what they share."""
 
-    def __init__(self, option: Callable[[str], Any]) -> None:
-        self._option = option
+    def __init__(self, config: pytest.Config) -> None:
+        self._option = config.getoption
         self._records: dict[str, Record] = {}
         self._differences: dict[str, list[Difference]] = {}
+        try:
+            self._prepare(config.getoption)
+        except OoddError as error:
+            raise pytest.UsageError(f"oodd-eval: {error}") from None
+
+    def _prepare(self, option: Callable[[str], Any]) -> None:
         self.plugins = discover()
         names = _detectors(option("oodd_detector"), self.plugins)
         self.split = load_split(option("oodd_split"))

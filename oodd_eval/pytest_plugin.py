@@ -39,13 +39,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the check if a detector is named."""
     if config.getoption("oodd_detector"):
-        from oodd_eval.errors import OoddError  # noqa: PLC0415  see above
-        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415
+        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415  see above
 
-        try:
-            config.pluginmanager.register(Cells(config.getoption), "oodd-eval-cells")
-        except OoddError as error:
-            raise pytest.UsageError(f"oodd-eval: {error}") from None
+        config.pluginmanager.register(Cells(config), "oodd-eval-cells")
         return
     for name in _OTHERS:
         if config.getoption(f"oodd_{name}"):

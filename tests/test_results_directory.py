@@ -64,7 +64,7 @@ def test_leftovers_of_killed_processes_go_away_and_those_of_living_ones_stay(tmp
     foreign = tmp_path / ".gitignore"
     for file in (*stale, living, foreign):
         file.write_text("x")
-    fits = [tmp_path / "fitted" / f".{pid}-abc" for pid in (gone.pid, os.getppid())]
+    fits = [tmp_path / "fitted" / f".abc.{pid}" for pid in (gone.pid, os.getppid())]
     for fit in fits:
         fit.mkdir(parents=True)
         (fit / "weights").write_text("x")
