@@ -1,13 +1,15 @@
 """The catalogue of metrics: name, title, meaning, unit and better side of everything measured.
 
 The metrics of guaranteed alarms have a name for each level, with a suffix: ``delay_at_5pct`` is the
-delay where at most 5 % of nominal episodes raise an alarm.
+delay where at most 5 % of nominal episodes raise an alarm. ``catalogue.toml`` has them all.
 """
 
 import functools
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
 
@@ -69,82 +71,12 @@ class MetricInfo:
         return f"{value:.1f}" if self.unit == "steps" else f"{value:.3f}"
 
 
-# fmt: off
-_METRICS: Final = (
-    MetricInfo("auc", "AUC",
-        "the paper's: scores from the onset on against scores before it, mean over trajectories",
-        "percent", "higher", null="auc_null"),
-    MetricInfo("auc_null", "AUC null",
-        "the same on the nominal twin: what the phase of the episode alone gives", "percent"),
-    MetricInfo("auc_matched", "matched AUC",
-        "what the rank goes by: anomalous scores from the effect on against the twin's at the same "
-        "times",
-        "percent", "higher", null="auc_placebo"),
-    MetricInfo("auc_placebo", "placebo",
-        "two nominal twins against each other at the same times: 0.5 within noise", "percent"),
-    MetricInfo("auc_unpaired", "unpaired AUC",
-        "matched AUC against the next seed's twin: without the noise that the own twin shares",
-        "percent", "higher", null="auc_placebo"),
-    MetricInfo("auc_smoothed", "smoothed AUC",
-        "matched AUC after the same moving average for every detector: what accumulation adds",
-        "percent", "higher"),
-    MetricInfo("delay", "Delay",
-        "steps from the onset to the first alarm, over trajectories that have one",
-        "steps", "lower", null="delay_null"),
-    MetricInfo("delay_null", "Delay null",
-        "the same on the nominal twin: what false alarms alone give", "steps"),
-    MetricInfo("delay_censored", "Delay censored",
-        "delay with a miss counted as the whole remainder of the episode", "steps", "lower"),
-    MetricInfo("missed", "Missed",
-        "share of trajectories without an alarm from the onset on", "rate", "lower"),
-    MetricInfo("far", "FAR",
-        "false-alarm rate: alarms before the onset over the steps before it, from row 20 on",
-        "rate", "lower"),
-    MetricInfo("far_twin", "FAR twin",
-        "false-alarm rate over whole nominal twins", "rate", "lower"),
-)
+_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
-_ALARMS: Final = (
-    MetricInfo("early", "Early",
-        "share of anomalous episodes whose first alarm comes before the effect; they count in no "
-        "other figure", "percent", "lower"),
-    MetricInfo("delay", "Delay",
-        "steps from the effect to the first alarm, over episodes that have one", "steps", "lower"),
-    MetricInfo("missed", "Missed", "share of episodes without an alarm", "percent", "lower"),
-    MetricInfo("delay_censored", "Delay censored",
-        "delay with a miss counted as the whole remainder of the episode", "steps", "lower"),
-    *(MetricInfo(f"found_within_{k}", f"Found within {k}",
-        f"share of episodes with the first alarm in the {k} rows from the effect on, counting rows "
-        "that the twin has, too",
-        "percent", "higher") for k in FOUND_WITHIN),
-)
-# fmt: on
-
-METRICS: Final = MappingProxyType({info.name: info for info in _METRICS})
+METRICS: Final = MappingProxyType({row["name"]: MetricInfo(**row) for row in _TABLES["metric"]})
 """Metrics without a level, in the order of records."""
 
-
-def _with_nulls(infos: tuple[MetricInfo, ...]) -> list[MetricInfo]:
-    found = []
-    for info in infos:
-        null = f"{info.name}_null"
-        summary = f"{info.name} of the nominal twin: what false alarms alone give"
-        found += [replace(info, null=null),
-                  MetricInfo(null, f"{info.title} null", summary, info.unit)]  # fmt: skip
-    return found
-
-
-_BY_LEVEL: Final = {
-    info.name: info
-    for info in (
-        MetricInfo(
-            "false_episodes", "False episodes", "share of nominal twins with an alarm", "percent",
-            "lower",
-        ),
-        *_with_nulls(_ALARMS),
-        MetricInfo("threshold", "Threshold", "threshold of the statistic", "rate"),
-    )
-}  # fmt: skip
+_BY_LEVEL: Final = {row["name"]: MetricInfo(**row) for row in _TABLES["alarm"]}
 
 GUARANTEED: Final = tuple(name for name in _BY_LEVEL if name != "threshold")
 """Metrics of guaranteed alarms, which have a suffix for each level."""
