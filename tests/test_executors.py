@@ -48,7 +48,7 @@ def closed_files():
     remote._environment.cache_clear()
 
 
-def ordered(job, tiny_split, limits=Limits(), stop=NEVER, **changes):  # noqa: B008
+def ordered(job, tiny_split, limits=Limits(), stop=NEVER.is_set, **changes):  # noqa: B008
     """Send an order through JSON, as to another machine, and return what comes back."""
     order = json.loads(json.dumps(remote.order_of(job, load_split(tiny_split), limits)))
     for place, value in changes.items():
@@ -87,7 +87,7 @@ def test_limits_travel_with_the_order(job, tiny_split):
 def test_work_that_nobody_waits_for_is_given_up(job, tiny_split):
     stop = threading.Event()
     stop.set()
-    found = ordered(job, tiny_split, stop=stop)
+    found = ordered(job, tiny_split, stop=stop.is_set)
     assert (found["status"], found["reason"]) == ("error", "interrupted")
 
 

@@ -5,11 +5,12 @@ The module needs neither simulators nor data. Values of the paper are from Danes
 
 import functools
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 PROTOCOL: Final = 2
 """Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
@@ -91,44 +92,19 @@ class SplitDefinition:
     seed_base: int
 
 
-_Row = TypeVar("_Row", EnvironmentInfo, AnomalyInfo, SplitDefinition)
+_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
-
-def _by_id(*rows: _Row) -> Mapping[str, _Row]:
-    return MappingProxyType({r.name if isinstance(r, SplitDefinition) else r.id: r for r in rows})
-
-
-ENVIRONMENTS: Final = _by_id(
-    EnvironmentInfo("acrobot", "Acrobot", "Acrobot-v1", "classic", 6, 3, "IQN", -78.7, 500),
-    EnvironmentInfo("cartpole", "CartPole", "CartPole-v1", "classic", 4, 2, "IQN", 500.0, 500),
-    EnvironmentInfo("lunarlander", "LunarLander", "LunarLander-v3", "classic", 8, 4,
-                    "IQN", 213.5, 1000),
-    EnvironmentInfo("ant", "Ant", "AntBulletEnv-v0", "bullet", 28, 8, "TD3", 3297.2, 1000),
-    EnvironmentInfo("halfcheetah", "HalfCheetah", "HalfCheetahBulletEnv-v0", "bullet", 26, 6,
-                    "TD3", 2820.9, 1000),
-    EnvironmentInfo("hopper", "Hopper", "HopperBulletEnv-v0", "bullet", 15, 3, "TD3", 2678.0, 1000),
-    EnvironmentInfo("walker2d", "Walker2D", "Walker2DBulletEnv-v0", "bullet", 22, 6,
-                    "TD3", 2240.8, 1000),
-)  # fmt: skip
+ENVIRONMENTS: Final = MappingProxyType(
+    {row["id"]: EnvironmentInfo(**row) for row in _TABLES["environment"]}
+)
 """Environments by id, in the order of the paper's tables."""
 
-ANOMALIES: Final = _by_id(
-    AnomalyInfo("iid", "IID", "sensor", "chosen sensors += fresh Normal(mean, std)"),
-    AnomalyInfo("calibration", "Calibration Failure", "sensor", "chosen sensors *= factor"),
-    AnomalyInfo("drift", "Sensor Drift", "sensor", "chosen sensors += slope * step"),
-    AnomalyInfo("shutdown", "Sensor Shutdown", "sensor", "chosen sensors = 0"),
-    AnomalyInfo("wind-l2r", "L2R", "dynamics", "wind from left to right"),
-    AnomalyInfo("wind-r2l", "R2L", "dynamics", "wind from right to left"),
-    AnomalyInfo("gravity", "Gravity", "dynamics", "another magnitude of gravity"),
-    AnomalyInfo(
-        "components", "Agent's Components", "dynamics", "other lengths, masses or motor powers"
-    ),
-)
+ANOMALIES: Final = MappingProxyType({row["id"]: AnomalyInfo(**row) for row in _TABLES["anomaly"]})
 """Anomaly types by id, in the order of the paper's Table 2."""
 
 GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
 
-SPLITS: Final = _by_id(
+_SPLITS: Final = (
     # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
     SplitDefinition("mini", 40, 40, 10, 300, 4),
     SplitDefinition("standard", 500, 200, 50, None, 5),
@@ -136,6 +112,8 @@ SPLITS: Final = _by_id(
     SplitDefinition("reduced", 500, 50, 20, None, 5),
     SplitDefinition("paper", 10_000, 1_000, 1_000, None, 6),
 )
+
+SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 """The published splits by name."""
 
 OWN_SEED_BASES: Final = range(10, 900)

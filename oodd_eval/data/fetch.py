@@ -173,7 +173,7 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
     """Raise unless a file is whole in itself, and all in it is what the manifest says."""
     split.environment(environment).close()
     with h5py.File(file, "r") as stored:
-        if elsewhere := stored.visititems_links(_leads_away) or stored.visititems(_is_outside):
+        if elsewhere := stored.visititems_links(_elsewhere) or stored.visititems(_elsewhere):
             raise SplitError(f"{file.name} {elsewhere}: refused")
         for name, group in entry["groups"].items():
             found = (len(stored[name]["seeds"]), int(stored[name]["offsets"][-1]))
@@ -185,13 +185,12 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
                 )
 
 
-def _leads_away(name: str, link: object) -> str | None:
-    return None if isinstance(link, h5py.HardLink) else f"holds {name}, which points elsewhere"
-
-
-def _is_outside(name: str, item: h5py.Group | h5py.Dataset) -> str | None:
-    outside = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
-    return f"keeps the content of {name} in another file" if outside else None
+def _elsewhere(name: str, item: object) -> str | None:
+    """Say in which way a link, or what it leads to, is not of the file itself."""
+    if isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+        return f"keeps the content of {name} in another file"
+    here = isinstance(item, h5py.HardLink | h5py.Group | h5py.Dataset | h5py.Datatype)
+    return None if here else f"holds {name}, which points elsewhere"
 
 
 @contextlib.contextmanager

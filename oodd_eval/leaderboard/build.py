@@ -1,40 +1,30 @@
 """The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.data.facts import GROUPS
+from oodd_eval.data.facts import GROUPS, SPLITS
 from oodd_eval.data.files import write_text
+from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.leaderboard.sections import TABLES, LeaderboardSection, sections
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.layout import Table
-from oodd_eval.results.tables.rendering import about_split, escape
+from oodd_eval.results.tables.rendering import escape
 from oodd_eval.results.tables.rendering import markdown as table
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
 STALE: Final = "no part of the leaderboard any more"
 
-_INTRODUCTION = """# Leaderboard
-
-Detectors of out-of-distribution dynamics on frozen splits, ranked by matched AUC. This page is
-written by `oodd-eval leaderboard build` from the entries under [results](results); edit those, not
-this. How to read it: [docs/leaderboard.md](../docs/leaderboard.md). How to take part:
-[docs/submitting.md](../docs/submitting.md).
-"""
-
-_LEGEND = """Rank is 1 + the number of primary rows, one a detector, that are significantly better
-(paired bootstrap over test seeds, Holm's correction over all their pairs). Primary rows that share
-a letter under *ties* cannot be told apart. Trivial rows know nothing of the dynamics: what does not
-beat them has found nothing. AUC is the paper's, for which the trivial row *clock* has 100 by
-construction. Brackets hold 95 % intervals.
-"""
+TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 
 MANY: Final = 6  # findings beyond which they are folded away
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
@@ -80,7 +70,7 @@ def _files(output: Path) -> set[str]:
 def page(sections: Sequence[LeaderboardSection], *, site: str = "") -> str:
     """Return the whole page, which links to the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
-    parts = [_INTRODUCTION]
+    parts = [TEXTS["introduction"]]
     if site:
         parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
     parts += [_contents(sections)] if len(sections) > 1 else []
@@ -134,7 +124,7 @@ def _section(section: LeaderboardSection) -> str:
         f"{size} As CSV: {files}.\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
         table(layout.ranking(ranks, section.trust)),
-        _LEGEND,
+        TEXTS["legend"],
         *(f"- {escape(line)}" for line in layout.ranking_notes(ranks)),
         "",
         *_findings(board),
@@ -142,6 +132,20 @@ def _section(section: LeaderboardSection) -> str:
         *(f"- {escape(line)}" for line in layout.notes(board)),
     ]
     return "\n".join(parts) + "\n"
+
+
+def about_split(board: Board) -> str:
+    """Return which tier a board is of and what its split holds, as Markdown.
+
+    A split is a published one by its digest, not by its name.
+    """
+    name = board.split
+    if name not in SPLITS or published_digests().get(name) != board.digest:
+        return str(TEXTS["unpublished"].format(name=escape(name)))
+    split, tier = SPLITS[name], TEXTS["tiers"][name]
+    cap = split.episode_cap
+    episodes = "whole episodes" if cap is None else f"episodes of at most {cap} steps"
+    return str(TEXTS["published"].format(**asdict(split), **tier, episodes=episodes))
 
 
 def _findings(board: Board) -> list[str]:

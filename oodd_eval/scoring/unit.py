@@ -189,7 +189,7 @@ def _with_kept_fit(
     outcome = isolated(load=str(fit.path.absolute()))
     if outcome.seconds_fit is not None:
         outcome.seconds_fit = fit.seconds_fit
-    elif outcome.status != "ok" and not stop.is_set():
+    elif outcome.status != "ok" and not stop():
         # It ended before it was loaded; whatever the reason, a fit of its own is what counts.
         fits.distrust(key)
         return _with_kept_fit(isolated, fits, key, stop, fresh=True)

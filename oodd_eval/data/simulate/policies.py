@@ -7,7 +7,7 @@ that the last bits of a matrix product cannot reach the simulator.
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
@@ -29,16 +29,6 @@ LAYERS: Final = {
 Arrays = Mapping[str, NDArray[Any]]
 
 
-class Policy(Protocol):
-    """A deterministic controller."""
-
-    digest: str
-
-    def act(self, row: NDArray[np.float32]) -> Any:
-        """Return the action for an observation row of shape (D,): an int, or float32 (A,)."""
-        ...
-
-
 class TD3Policy:
     """tanh(relu(relu(o W1 + b1) W2 + b2) W3 + b3): the actor of TD3 (Fujimoto et al. 2018)."""
 
@@ -47,6 +37,7 @@ class TD3Policy:
         self._layers = [np.asarray(arrays[name], dtype=np.float64) for name in LAYERS["TD3"]]
 
     def act(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action for an observation row of shape (D,): float32 of shape (A,)."""
         w1, b1, w2, b2, w3, b3 = self._layers
         hidden = np.maximum(row.astype(np.float64) @ w1 + b1, 0)
         hidden = np.maximum(hidden @ w2 + b2, 0)
@@ -80,8 +71,12 @@ class IQNPolicy:
         return q
 
     def act(self, row: NDArray[np.float32]) -> int:
+        """Return the action for an observation row of shape (D,)."""
         # Rounded like continuous actions, so that ties are ties on every processor.
         return int(np.argmax(np.round(self.values(row) * ACTION_GRID)))
+
+
+Policy = TD3Policy | IQNPolicy  # deterministic controllers
 
 
 def policy_digest(arrays: Arrays) -> str:

@@ -15,12 +15,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import psutil
 
@@ -70,10 +70,7 @@ class Outcome:
     log: str = ""
 
 
-class Stop(Protocol):
-    """A flag that another thread sets to end the work, such as `threading.Event`."""
-
-    def is_set(self) -> bool: ...  # noqa: D102  see there
+Stop = Callable[[], bool]  # tells whether the work is to end, such as `threading.Event.is_set`
 
 
 class GivenUpError(OoddError, RuntimeError):
@@ -195,7 +192,7 @@ class Child:
         return bool(select.select([self._receiving], [], [], seconds)[0])
 
     def _check(self) -> None:
-        if self._stop and self._stop.is_set():
+        if self._stop and self._stop():
             raise GivenUpError("error", "interrupted")
         seconds, memory = self._limits.seconds, self._limits.memory
         if seconds is not None and time.monotonic() - self._start > seconds:
@@ -232,8 +229,8 @@ def run_isolated(
     replaces fitting; ``save`` is an empty directory where the detector may save its fit. One of the
     two may be empty.
     Each iterable is read once, lazily and from another thread, the next one when the one before is
-    exhausted. Scores come back in the order of the groups. When `stop` is set, the worker is killed
-    and the status is ``"error"``. Only errors of reading the trajectories are raised.
+    exhausted. Scores come back in the order of the groups. When `stop` says True, the worker is
+    killed and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
     child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
     # From another thread, so that neither side can deadlock on a full pipe.

@@ -4,32 +4,16 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
 
 from tabulate import tabulate
 
-from oodd_eval.data.facts import GROUPS, SPLITS
-from oodd_eval.data.split import published_digests
+from oodd_eval.data.facts import GROUPS
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record
 from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import Board, RankedBoard, Value, boards
 from oodd_eval.results.tables.layout import Table
-
-_TITLES: Final = {
-    "standard": "The leaderboard's own split",
-    "paper": "The paper's size",
-    "reduced": "Reduced tier",
-    "mini": "Trial tier",
-}
-_REMARKS: Final = {
-    "reduced": " They are the first trajectories of the split standard, for machines on which the "
-    "whole of it takes too long: intervals are wider than they would be there, fewer rows can be "
-    "told apart, and the numbers are not those of standard.",
-    "mini": " It comes with the package, for trying and for continuous integration: shorter "
-    "episodes and too few test seeds to publish a method on.",
-}
 
 
 def report(records: Sequence[Record], *, intervals: bool = False) -> str:
@@ -77,64 +61,38 @@ def escape(text: str) -> str:
     return flat
 
 
-def about_split(board: Board) -> str:
-    """Return which tier a board is of and what its split holds, as Markdown.
-
-    A split is a published one by its digest, not by its name.
-    """
-    name = board.split
-    if name not in SPLITS or published_digests().get(name) != board.digest:
-        return (
-            f"**Not a published split.** {escape(name)} was built by those who submitted these "
-            "results; compare the rows with one another alone."
-        )
-    split = SPLITS[name]
-    cap = split.episode_cap
-    episodes = "whole episodes" if cap is None else f"episodes of at most {cap} steps"
-    return (
-        f"**{_TITLES[name]}.** Per environment {split.train} training and {split.calibration} "
-        f"calibration trajectories, and {split.test} test seeds, each with its nominal twin and "
-        f"all anomalies; {episodes}.{_REMARKS.get(name, '')}"
-    )
-
-
 def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     """Return one line per row: place, cost, and every metric over all cells with its interval."""
     board = ranks.board
-    wanted = [(name, name, board.anomalies) for name in _metrics(ranks)]
-    wanted += [(f"{RANKING}_{g}", RANKING, board.in_group(g)) for g in GROUPS if board.in_group(g)]
-    header = ["rank", "ties", "alarm_rank", "state", "detector", "horizon", "overrides",
-              "trivial", "primary", "seeds", "inputs", "trust", "win_rate", "seconds_fit",
-              "microseconds_per_step", "peak_rss_mb",
-              *_with_ends(column for column, _, _ in wanted)]  # fmt: skip
+    wanted = {name: (name, board.anomalies) for name in _metrics(ranks)}
+    wanted |= {f"{RANKING}_{g}": (RANKING, board.in_group(g)) for g in GROUPS if board.in_group(g)}
     lines = []
     for one in ranks.standings:
-        entry, cost = one.entry, one.cost
-        values = [
-            board.mean(entry, board.environments, anomalies, metric, intervals=True)
-            for _, metric, anomalies in wanted
-        ]
-        lines.append([
-            one.rank, one.ties, one.alarm_rank, one.state, *_setting(entry),
-            str(one.trivial).lower(), str(one.primary).lower(), one.seeds, one.inputs,
-            trust.get(entry, ""), *map(number, (one.wins, cost.fit, cost.step, cost.peak)),
-            *_ends(values),
-        ])  # fmt: skip
-    return csv_text([header, *lines])
+        means = {
+            column: board.mean(one.entry, board.environments, anomalies, metric, intervals=True)
+            for column, (metric, anomalies) in wanted.items()
+        }
+        lines.append({
+            "rank": one.rank, "ties": one.ties, "alarm_rank": one.alarm_rank, "state": one.state,
+            **_setting(one.entry), "trivial": str(one.trivial).lower(),
+            "primary": str(one.primary).lower(), "seeds": one.seeds, "inputs": one.inputs,
+            "trust": trust.get(one.entry, ""), "win_rate": number(one.wins),
+            "seconds_fit": number(one.cost.fit), "microseconds_per_step": number(one.cost.step),
+            "peak_rss_mb": number(one.cost.peak), **_ends(means),
+        })  # fmt: skip
+    return csv_rows(lines)
 
 
 def cells_csv(ranks: RankedBoard) -> str:
     """Return one line per cell with its stored metrics and their intervals."""
     names = _metrics(ranks)
-    header = ["detector", "horizon", "overrides", "seed", "environment", "group", "anomaly",
-              "status", "brief", *_with_ends(names)]  # fmt: skip
-    lines = [
-        [*_setting(one.entry), r.seed, r.environment, r.group, r.anomaly, r.status,
-         str(r.brief).lower(), *_ends(map(r.metrics.get, names))]
+    return csv_rows([
+        {**_setting(one.entry), "seed": r.seed, "environment": r.environment, "group": r.group,
+         "anomaly": r.anomaly, "status": r.status, "brief": str(r.brief).lower(),
+         **_ends({name: r.metrics.get(name) for name in names})}
         for one in ranks.standings
         for r in one.records
-    ]  # fmt: skip
-    return csv_text([header, *lines])
+    ])  # fmt: skip
 
 
 def comparisons_csv(ranks: RankedBoard) -> str:
@@ -165,18 +123,23 @@ def _metrics(ranks: RankedBoard) -> list[str]:
     return list(dict.fromkeys(name for r in ranks.board.records for name in r.metrics))
 
 
-def _setting(setting: Setting) -> tuple[str, int, str]:
-    return setting.detector, setting.horizon, setting.overrides_json
+def _setting(setting: Setting) -> dict[str, object]:
+    return {"detector": setting.detector, "horizon": setting.horizon,
+            "overrides": setting.overrides_json}  # fmt: skip
 
 
-def _with_ends(names: Iterable[str]) -> list[str]:
-    return [column for name in names for column in (name, f"{name}_low", f"{name}_high")]
+def _ends(values: Mapping[str, Value | Metric | None]) -> dict[str, str]:
+    """Return the texts of values and of the ends of their intervals, by column."""
+    found: dict[str, str] = {}
+    for name, v in values.items():
+        ends = (v.value, v.low, v.high) if v else (NAN, NAN, NAN)
+        found |= dict(zip((name, f"{name}_low", f"{name}_high"), map(number, ends), strict=True))
+    return found
 
 
-def _ends(values: Iterable[Value | Metric | None]) -> list[str]:
-    """Return the texts of values under the columns of `_with_ends`."""
-    ends = ((v.value, v.low, v.high) if v else (NAN, NAN, NAN) for v in values)
-    return [number(end) for three in ends for end in three]
+def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return rows with the same columns as CSV."""
+    return csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
 
 
 def csv_text(lines: Iterable[Sequence[object]]) -> str:

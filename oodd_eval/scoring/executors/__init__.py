@@ -51,7 +51,7 @@ class Executor:
     def __call__(self, job: UnitJob) -> Scored:
         """Score a unit, or find its scores in an earlier run's results."""
         fresh = self._settings.fresh
-        return job(self._settings.limits, self._stopping, self._results, fresh=fresh)
+        return job(self._settings.limits, self._stopping.is_set, self._results, fresh=fresh)
 
     def stop(self) -> None:
         """Give up what is under way: calls return soon, or raise, and no process is left."""

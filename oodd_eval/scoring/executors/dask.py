@@ -14,7 +14,7 @@ import contextlib
 import functools
 import threading
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -129,21 +129,14 @@ def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
 def on_worker(order: Message) -> Message:
     """Run an order inside a Dask worker; the outcome tells which."""
     worker = distributed.get_worker()
-    outcome = run_order(order, _Withdrawn(worker, worker.get_current_task()))
-    return {**outcome, "worker": worker.address}
+    key = worker.get_current_task()
 
-
-@dataclass(frozen=True, slots=True)
-class _Withdrawn:
-    """Set when the scheduler has withdrawn a task: its client cancelled it, or is no more."""
-
-    worker: Any
-    key: Any
-
-    def is_set(self) -> bool:
-        """Return True if nobody waits for the task's result."""
-        task = self.worker.state.tasks.get(self.key)
+    def withdrawn() -> bool:
+        """Tell whether nobody waits for the result: the client cancelled it, or is no more."""
+        task = worker.state.tasks.get(key)
         return task is None or task.state == "cancelled"
+
+    return {**run_order(order, withdrawn), "worker": worker.address}
 
 
 def run_order(order: Message, stop: Stop) -> Message:
