@@ -104,14 +104,16 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
     return whole
 
 
+def strict_model(**types: Any) -> Any:
+    """Return a model of JSON objects that have these fields, no others, and only finite numbers."""
+    strict = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    fields: dict[str, Any] = {name: (kind, ...) for name, kind in types.items()}
+    return create_model("Part", __config__=strict, **fields)
+
+
 @functools.cache
 def _layout() -> TypeAdapter[Any]:
     """Return the reader of the layout: fields, types and ranges of single values."""
-    strict = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-    def part(**types: Any) -> Any:
-        fields: dict[str, Any] = {name: (kind, ...) for name, kind in types.items()}
-        return create_model("Part", __config__=strict, **fields)
 
     def numbers(item: Any) -> Any:
         return conlist(item, max_length=LONGEST)
@@ -122,20 +124,20 @@ def _layout() -> TypeAdapter[Any]:
     amounts = numbers(Annotated[float, Field(ge=0, le=LARGEST)])
     scores = numbers(Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None)
     # fmt: off
-    unit = part(
+    unit = strict_model(
         cell=str, detector=str, horizon=int, seed=int, overrides=dict[str, Any],
         environment=Literal[*ENVIRONMENTS], anomaly=Literal[*ANOMALIES],
-        roc=part(fpr=rates, tpr=rates),
-        delay_far=part(threshold=amounts, far=rates, delay_censored=amounts, missed=rates,
+        roc=strict_model(fpr=rates, tpr=rates),
+        delay_far=strict_model(threshold=amounts, far=rates, delay_censored=amounts, missed=rates,
             null_censored=amounts),
-        example=part(index=row, auc_matched=rate | None, onset=row, length=row, start=row,
+        example=strict_model(index=row, auc_matched=rate | None, onset=row, length=row, start=row,
             scores=scores, twin=scores, cusum=amounts, twin_cusum=amounts,
             alarms=numbers(row), twin_alarms=numbers(row)),
     )
     # fmt: on
     # `schema` is a name that pydantic's models have taken.
     version = Annotated[int, Field(alias="schema")]
-    return TypeAdapter(part(version=version, units=conlist(unit)))
+    return TypeAdapter(strict_model(version=version, units=conlist(unit)))
 
 
 def _check_points(lists: Mapping[str, Sequence[float]], where: str) -> None:

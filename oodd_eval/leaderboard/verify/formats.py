@@ -19,6 +19,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo, Trust
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
 from oodd_eval.results import record as record_format
+from oodd_eval.results.curve_file import strict_model
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record, Status
@@ -151,68 +152,6 @@ Pair = Annotated[tuple[Terms, Terms], _rule(
 # fmt: on
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class _Plugin(_Strict):
-    distribution: Name
-    plugin: Name
-    version: Version
-    source_digest: Digest
-
-
-class _Environment(_Strict):
-    python: Annotated[str, _text(100, least=1)]
-    platform: Annotated[str, _text(200)]
-    packages: dict[Name, Version]
-
-
-class _Rerun(_Strict):
-    by: RerunBy
-    how: Annotated[str, _text(1000, least=1)]
-
-
-class _File(_Strict):
-    sha256: Digest
-    bytes: Whole
-
-
-class _Entry(_Strict):
-    layout: Annotated[int, _one_of([SCHEMA])] = Field(alias="schema")
-    id: EntryId
-    title: Annotated[str, _text(120, least=1)]
-    detectors: DetectorNames
-    submitter: Annotated[str, _text(120)]
-    citation: Annotated[str, _text(2000)]
-    url: Url
-    trust: Trust
-    rerun: _Rerun | None
-    split: SplitName
-    split_digest: Digest
-    protocol: Annotated[int, _one_of([PROTOCOL])]
-    plugins: Annotated[list[_Plugin], Field(max_length=100)]
-    environment: _Environment
-    created: Day
-    command: Command
-    caption: Annotated[str, _text(500)]
-    primary: Annotated[list[Row], Field(max_length=100)]
-    files: dict[FileName, _File]
-
-
-class _Metric(_Strict):
-    value: Finite | None
-    low: Finite | None
-    high: Finite | None
-    n: Annotated[int, Field(ge=0, le=MOST_TEST)]
-
-
-class _Counts(_Strict):
-    train: Annotated[int, Field(ge=1, le=LARGEST)]
-    calibration: Annotated[int, Field(ge=1, le=LARGEST)]
-    test: Annotated[int, Field(ge=1, le=MOST_TEST)]
-
-
 class _Provenance(BaseModel):
     """Types that an entry's own statements are compared with; other values must be plain."""
 
@@ -225,40 +164,51 @@ class _Provenance(BaseModel):
     packages: dict[Name, Version] = Field(default={}, max_length=_MOST_ITEMS)
 
 
-class _Record(_Strict):
-    layout: Annotated[int, _one_of([record_format.SCHEMA])] = Field(alias="schema")
-    protocol: Annotated[int, _one_of([PROTOCOL])]
-    detector: DetectorName
-    detector_version: Version
-    plugin: PluginName
-    plugin_source: Digest
-    parameters: Parameters
-    overrides: Parameters
-    inputs: Literal["observations", "observations+actions", ""]
-    alarm: Literal["cusum", "score"]
-    deterministic: bool
-    environment: Annotated[str, _one_of(ENVIRONMENTS)]
-    anomaly: Annotated[str, _one_of(ANOMALIES)]
-    strength: Strength
-    group: Annotated[str, _one_of(GROUPS)]
-    horizon: Annotated[int, Field(ge=1, le=100_000)]
-    seed: Whole
-    split: SplitName
-    split_digest: Digest
-    limit: None
-    status: Status
-    reason: Annotated[str, _text(1000)]
-    metrics: dict[str, _Metric]
-    brief: bool
-    counts: _Counts
-    per_trajectory: dict[str, Pair]
-    scores: ScoreKey
-    seconds_fit: Cost
-    seconds_score: Cost
-    steps_scored: Whole | None
-    peak_rss_mb: Cost
-    provenance: _Provenance
+def _schema(version: int) -> Any:
+    return Annotated[int, _one_of([version]), Field(alias="schema")]
 
+
+_COUNT: Final = Annotated[int, Field(ge=1, le=LARGEST)]
+_PROTOCOL: Final = Annotated[int, _one_of([PROTOCOL])]
+
+# fmt: off
+_ENTRY: Final = strict_model(
+    layout=_schema(SCHEMA), id=EntryId, title=Annotated[str, _text(120, least=1)],
+    detectors=DetectorNames, submitter=Annotated[str, _text(120)],
+    citation=Annotated[str, _text(2000)], url=Url, trust=Trust,
+    rerun=strict_model(by=RerunBy, how=Annotated[str, _text(1000, least=1)]) | None,
+    split=SplitName, split_digest=Digest, protocol=_PROTOCOL,
+    plugins=Annotated[list[strict_model(  # type: ignore[misc]
+        distribution=Name, plugin=Name, version=Version, source_digest=Digest,
+    )], Field(max_length=100)],
+    environment=strict_model(
+        python=Annotated[str, _text(100, least=1)], platform=Annotated[str, _text(200)],
+        packages=dict[Name, Version]),
+    created=Day, command=Command, caption=Annotated[str, _text(500)],
+    primary=Annotated[list[Row], Field(max_length=100)],
+    files=dict[FileName, strict_model(sha256=Digest, bytes=Whole)],  # type: ignore[misc]
+)
+
+_RECORD: Final = strict_model(
+    layout=_schema(record_format.SCHEMA), protocol=_PROTOCOL,
+    detector=DetectorName, detector_version=Version, plugin=PluginName, plugin_source=Digest,
+    parameters=Parameters, overrides=Parameters,
+    inputs=Literal["observations", "observations+actions", ""], alarm=Literal["cusum", "score"],
+    deterministic=bool, environment=Annotated[str, _one_of(ENVIRONMENTS)],
+    anomaly=Annotated[str, _one_of(ANOMALIES)], strength=Strength,
+    group=Annotated[str, _one_of(GROUPS)], horizon=Annotated[int, Field(ge=1, le=100_000)],
+    seed=Whole, split=SplitName, split_digest=Digest, limit=None,
+    status=Status, reason=Annotated[str, _text(1000)],
+    metrics=dict[str, strict_model(  # type: ignore[misc]
+        value=Finite | None, low=Finite | None, high=Finite | None,
+        n=Annotated[int, Field(ge=0, le=MOST_TEST)])],
+    brief=bool, counts=strict_model(
+        train=_COUNT, calibration=_COUNT, test=Annotated[int, Field(ge=1, le=MOST_TEST)]),
+    per_trajectory=dict[str, Pair], scores=ScoreKey,
+    seconds_fit=Cost, seconds_score=Cost, steps_scored=Whole | None, peak_rss_mb=Cost,
+    provenance=_Provenance,
+)
+# fmt: on
 
 _adapter = functools.cache(TypeAdapter)
 
@@ -308,7 +258,7 @@ def _holds_to(model: type[BaseModel], text: str, where: str, findings: Findings)
 def read_info(contents: Mapping[str, bytes], findings: Findings) -> EntryInfo | None:
     """Read ``entry.json``; None when a field is wrong, so that nothing can be compared with it."""
     name, text = find_text(contents, ENTRY, findings)
-    sound = name and _holds_to(_Entry, text, name, findings)
+    sound = name and _holds_to(_ENTRY, text, name, findings)
     return EntryInfo(**parse_json(text)) if sound else None
 
 
@@ -329,7 +279,7 @@ def read_records(contents: Mapping[str, bytes], findings: Findings) -> dict[str,
         if len(line) > MOST_LINE or not line.isprintable():
             expected = f"one record in plain JSON of at most {MOST_LINE} characters"
             findings.refuse(where, "", f"is {shown(line)}, expected {expected}")
-        elif _holds_to(_Record, line, where, findings):
+        elif _holds_to(_RECORD, line, where, findings):
             record = Record.from_json(line, where)
             found[f"{where} ({record.cell})"] = record
     return found
