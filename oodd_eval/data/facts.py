@@ -37,7 +37,8 @@ class EnvironmentInfo:
     `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A discrete action is a
     one-hot row, so `action_dim` is then their number. `policy` is the algorithm of the nominal
     policy, `paper_return` its mean return in the paper's Table 2, `episode_cap` the longest
-    episode in transitions.
+    episode in transitions. `sensors` and `actions` are names and units of the columns of
+    observations and of action rows.
     """
 
     id: str
@@ -49,21 +50,13 @@ class EnvironmentInfo:
     policy: Literal["IQN", "TD3"]
     paper_return: float
     episode_cap: int
+    sensors: tuple[Quantity, ...]
+    actions: tuple[Quantity, ...]
 
     @property
     def discrete(self) -> bool:
         """True when actions are discrete."""
         return self.family == "classic"
-
-    @property
-    def sensors(self) -> tuple[Quantity, ...]:
-        """Names and units of the sensors, in the order of the columns of an observation."""
-        return _quantities()[self.id]["sensors"]
-
-    @property
-    def actions(self) -> tuple[Quantity, ...]:
-        """Names and units of the columns of an action row."""
-        return _quantities()[self.id]["actions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +87,17 @@ class SplitDefinition:
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
+_COLUMNS: Final = json.loads(Path(__file__).with_name("quantities.json").read_text("utf-8"))
+
+
+def _quantities(environment: str) -> Any:
+    """Return what sensors and actions are, by these names."""
+    kinds = _COLUMNS[environment].items()
+    return {kind: tuple(Quantity(*row) for row in rows) for kind, rows in kinds}
+
+
 ENVIRONMENTS: Final = MappingProxyType(
-    {row["id"]: EnvironmentInfo(**row) for row in _TABLES["environment"]}
+    {e["id"]: EnvironmentInfo(**e, **_quantities(e["id"])) for e in _TABLES["environment"]}
 )
 """Environments by id, in the order of the paper's tables."""
 
@@ -124,16 +126,6 @@ BRIEF_TAIL: Final = 20
 
 PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
 """Seed offset of each part within the million seeds of a split's base."""
-
-
-@functools.cache
-def _quantities() -> Mapping[str, Mapping[str, tuple[Quantity, ...]]]:
-    file = Path(__file__).with_name("quantities.json")
-    stored = json.loads(file.read_text(encoding="utf-8"))
-    return {
-        environment: {kind: tuple(Quantity(*row) for row in rows) for kind, rows in kinds.items()}
-        for environment, kinds in stored.items()
-    }
 
 
 @functools.cache

@@ -6,10 +6,11 @@ import hashlib
 import os
 import re
 import shutil
+import sys
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import IO, Any, Final
 
 import psutil
 
@@ -83,6 +84,27 @@ def lock(directory: Path, *, wait: bool = True) -> Iterator[bool]:
         yield held
     finally:
         os.close(descriptor)
+
+
+def flush_streams() -> None:
+    """Write what was printed; foreign code may have closed a stream, or put None in its place."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(ValueError, OSError, AttributeError):
+            stream.flush()
+
+
+@contextlib.contextmanager
+def redirected(file: IO[Any]) -> Iterator[None]:
+    """Send descriptors 1 and 2 into a file, as far as this process has them, then put them back."""
+    flush_streams()
+    with contextlib.ExitStack() as back:
+        with contextlib.suppress(OSError):
+            for descriptor in (1, 2):
+                copy = os.dup(descriptor)
+                back.callback(os.close, copy)
+                back.callback(os.dup2, copy, descriptor)
+                os.dup2(file.fileno(), descriptor)
+        yield
 
 
 def compress(content: bytes) -> bytes:

@@ -144,19 +144,14 @@ def content_digest(group: Mapping[str, Any]) -> str:
         data = group[name]
         little = data.dtype.newbyteorder("<")
         sha.update(f"{name}|{little.str}|{data.shape}|".encode())
-        for block in _blocks(data):
-            plain = np.ascontiguousarray(block.astype(little, copy=False))
-            sha.update(plain.reshape(-1).view(np.uint8).data)
+        # In whole chunks, so that each is decompressed once.
+        row = max(1, int(np.prod(data.shape[1:], dtype=np.int64)) * data.dtype.itemsize)
+        chunk = (getattr(data, "chunks", None) or (1,))[0]
+        step = chunk * max(1, _BLOCK // (row * chunk))
+        for start in range(0, len(data), step):
+            block = np.asarray(data[start : start + step]).astype(little, copy=False)
+            sha.update(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
     return sha.hexdigest()
-
-
-def _blocks(data: Any) -> Iterator[NDArray[Any]]:
-    # In whole chunks, so that each is decompressed once.
-    row = max(1, int(np.prod(data.shape[1:], dtype=np.int64)) * data.dtype.itemsize)
-    chunk = (getattr(data, "chunks", None) or (1,))[0]
-    step = chunk * max(1, _BLOCK // (row * chunk))
-    for start in range(0, len(data), step):
-        yield np.asarray(data[start : start + step])
 
 
 def environment_digest(entry: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
 from oodd_eval.paper.experiments import read_tables
 from oodd_eval.paper.inputs import Returns
 from oodd_eval.results.tables.layout import Table
-from oodd_eval.results.tables.rendering import number
+from oodd_eval.results.tables.rendering import csv_rows
 
 NOT_RUN: Final = "not run"
 RETURN: Final = "return"  # the measure of claims about the policies, not about detectors
@@ -192,19 +192,16 @@ def claims_table(made: Sequence[Ruling]) -> Table:
     return Table("Claims", header, rows, labels=len(header))
 
 
-def claims_csv(made: Sequence[Ruling]) -> list[list[str]]:
-    """Return a line per claim and measure, the header first."""
-    lines = [["claim", "text", "place", "number", "metric", "kind", "region", "value", "low",
-              "high", "environments", "seeds", "verdict", "by_environment"]]  # fmt: skip
-    for c, kind, judged in (
-        (r.claim, kind, j) for r in made for kind, j in (("paper", r.own), ("fair", r.fair)) if j
-    ):
-        e, metric = judged.estimate, judged.metric
-        by = " ".join(f"{name}={verdict}" for name, verdict in judged.by_environment.items())
-        told = [c.id, c.text, c.place, c.number, metric, kind, c.region.describe(c.metric)]
-        counts = [str(e.environments), str(e.seeds)]
-        lines.append([*told, *map(number, e.ends), *counts, judged.verdict, by])
-    return lines
+def claims_csv(made: Sequence[Ruling]) -> str:
+    """Return a line per claim and measure."""
+    return csv_rows([
+        {"claim": r.claim.id, "text": r.claim.text, "place": r.claim.place,
+         "number": r.claim.number, "metric": j.metric, "kind": kind,
+         "region": r.claim.region.describe(r.claim.metric), **j.estimate.columns,
+         "verdict": j.verdict,
+         "by_environment": " ".join(f"{e}={verdict}" for e, verdict in j.by_environment.items())}
+        for r in made for kind, j in (("paper", r.own), ("fair", r.fair)) if j
+    ])  # fmt: skip
 
 
 def _shown(judged: Judgement) -> str:

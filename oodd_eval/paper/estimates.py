@@ -22,6 +22,7 @@ from oodd_eval.paper.inputs import KINDS, Returns
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.tables.board import contribution
+from oodd_eval.results.tables.rendering import number
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,12 @@ class Estimate:
     def ends(self) -> tuple[float, float, float]:
         """The value and both ends of its interval."""
         return self.value, self.low, self.high
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Its texts for CSV."""
+        ends = zip(("value", "low", "high"), map(number, self.ends), strict=True)
+        return {**dict(ends), "environments": str(self.environments), "seeds": str(self.seeds)}
 
     @property
     def partial(self) -> bool:

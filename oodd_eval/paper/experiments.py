@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, Self, TypeVar
+from typing import Any, Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -22,16 +22,14 @@ MEAN: Final = "mean"
 TABLE_2: Final = "table-2"  # returns of the policies, which need no detectors
 
 
-@dataclass(frozen=True, slots=True)
-class Series:
+class Series(NamedTuple):
     """A column of a table or a colour of a figure: one setting, or the mean over several."""
 
     label: str
     settings: tuple[Setting, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Scope:
+class Scope(NamedTuple):
     """A mean over anomalies: an id that is also in CSV files, a title, the anomalies."""
 
     id: str
@@ -39,8 +37,7 @@ class Scope:
     anomalies: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
+class Grid(NamedTuple):
     """The arrangement of panels: width of the figure, height of a panel, who shares an axis."""
 
     axis: str = "rows"

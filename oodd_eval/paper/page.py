@@ -52,7 +52,7 @@ def publish(
     own = reproduction.own(records)
     estimator = Estimator(own)
     made = rulings(estimator, returns)
-    write_changed(directory / "claims.csv", csv_text(claims_csv(made)))
+    write_changed(directory / "claims.csv", claims_csv(made))
     sections = [_of_returns(reproduction, returns)]
     sections += [_of_experiment(reproduction, e, estimator) for e in EXPERIMENTS]
     lines = [line for one in sections for line in _write(directory, one, figures=figures)]

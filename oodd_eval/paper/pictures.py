@@ -8,10 +8,9 @@ import io
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
 from oodd_eval.errors import MissingExtraError
@@ -32,8 +31,7 @@ SHORT: Final = {"calibration": "calibr.", "components": "compon.", "shutdown": "
                 "wind-l2r": "wind →", "wind-r2l": "wind ←", "all": "mean"}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Dots:
+class Dots(NamedTuple):
     """One series of a panel: by category a value, its interval, the paper's digit; NaN: none."""
 
     label: str
@@ -43,8 +41,7 @@ class Dots:
     paper: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+class Panel(NamedTuple):
     """Series over the same categories, a dashed line at `reference`, another before `divide`."""
 
     title: str
@@ -55,8 +52,7 @@ class Panel:
     divide: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
+class Picture(NamedTuple):
     """Panels in rows of some columns, with one legend for all."""
 
     title: str

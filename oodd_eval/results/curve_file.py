@@ -99,7 +99,13 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
             raise _wrong(f"{name}.cell", unit["cell"], "a cell that occurs before")
         seen.add(unit["cell"])
         for part in ("roc", "delay_far"):
-            _check_points(unit[part], f"{name}.{part}")
+            (first_name, first), *others = unit[part].items()
+            for other, values in others:
+                _check_length(values, first, f"{name}.{part}.{other}")
+            for k, (before, value) in enumerate(itertools.pairwise(first), start=1):
+                if value < before:
+                    place = f"{name}.{part}.{first_name}[{k}]"
+                    raise _wrong(place, value, f"below {before} before it")
         _check_example(unit["example"], f"{name}.example")
     return whole
 
@@ -138,16 +144,6 @@ def _layout() -> TypeAdapter[Any]:
     # `schema` is a name that pydantic's models have taken.
     version = Annotated[int, Field(alias="schema")]
     return TypeAdapter(strict_model(version=version, units=conlist(unit)))
-
-
-def _check_points(lists: Mapping[str, Sequence[float]], where: str) -> None:
-    """Check that the lists are equally long and that the first does not fall."""
-    (first_name, first), *others = lists.items()
-    for name, values in others:
-        _check_length(values, first, f"{where}.{name}")
-    for i, (before, value) in enumerate(itertools.pairwise(first), start=1):
-        if value < before:
-            raise _wrong(f"{where}.{first_name}[{i}]", value, f"below {before} before it")
 
 
 def _check_example(example: Mapping[str, Any], where: str) -> None:

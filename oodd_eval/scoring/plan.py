@@ -106,7 +106,12 @@ def make_plan(
     unknown or refused, and a device that no detector has, raises `UsageError`.
     """
     offers = [plugins.offer(name) for name in detectors]
-    given = [{**(parameters or {}), **_placed(offer, device)} for offer in offers]
+    given = [dict(parameters or {}) for _ in offers]
+    for offer, own in zip(offers, given, strict=True) if device is not None else ():
+        if "device" in parameters_of(offer.spec.parameters):
+            if device not in DEVICES:
+                raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
+            own["device"] = device
     if device is not None and offers and not any("device" in own for own in given):
         names = ", ".join(offer.spec.name for offer in offers)
         raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
@@ -155,11 +160,3 @@ def make_unit(
         distribution=offer.distribution, version=offer.version, source=source, inputs=spec.inputs,
         alarm=spec.alarm, deterministic=spec.deterministic, scores_key=scores, fit_key=fit,
     )  # fmt: skip
-
-
-def _placed(offer: Offer, device: str | None) -> dict[str, str]:
-    if device is None or "device" not in parameters_of(offer.spec.parameters):
-        return {}
-    if device not in DEVICES:
-        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
-    return {"device": device}

@@ -9,17 +9,18 @@ import functools
 import inspect
 import math
 import os
-import sys
 import types
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.files import redirected
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.names import check_known
 
@@ -27,26 +28,12 @@ from oodd_eval.names import check_known
 @contextmanager
 def quiet_streams() -> Iterator[None]:
     """Send file descriptors 1 and 2 to the null device: PyBullet prints from C, past Python."""
-    for stream in (sys.stdout, sys.stderr):
-        if stream is not None:
-            stream.flush()
-    try:
-        saved = [(fd, os.dup(fd)) for fd in (1, 2)]
-    except OSError:  # a process without these streams
-        yield
-        return
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for fd, _ in saved:
-            os.dup2(null, fd)
-        yield
-    finally:
-        # C has buffers of its own: their content has to go while the null device is in place.
-        ctypes.CDLL(None).fflush(None)
-        for fd, copy in saved:
-            os.dup2(copy, fd)
-            os.close(copy)
-        os.close(null)
+    with Path(os.devnull).open("wb") as null, redirected(null):
+        try:
+            yield
+        finally:
+            # C has buffers of its own: their content has to go while the null device is in place.
+            ctypes.CDLL(None).fflush(None)
 
 
 try:

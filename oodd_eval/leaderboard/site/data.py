@@ -109,6 +109,7 @@ def _row(
     own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
     if own:
         curves.append(own)
+    in_order = sorted(records, key=lambda r: (_ORDER[r.environment, r.anomaly], r.seed))
     return {
         "id": f"{section.name}/{row!s}", "label": str(row), "detector": row.detector,
         "version": records[0].detector_version, "plugin": records[0].plugin, "horizon": row.horizon,
@@ -117,10 +118,10 @@ def _row(
         **_fields(standing, "trivial", "primary", "inputs", "rank", "alarm_rank", "ties",
                   "state"),
         "wins": _short(standing.wins),
-        "cost": {n: _short(v) for n, v in _fields(standing.cost, "fit", "step", "peak").items()},
+        "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
         "trust": section.trust[row],
         "entries": [_entry(meta, records[0].plugin) for meta in sources],
-        "cells": [_cell(r, names) for r in sorted(records, key=_place)],
+        "cells": [_cell(r, names) for r in in_order],
         "intervals": _intervals(records, names, chosen), "curves": len(curves) - 1 if own else None,
     }  # fmt: skip
 
@@ -129,11 +130,6 @@ def _entry(meta: EntryInfo, plugin: str) -> Json:
     """Return who an entry is from, and the digest of the plug-in's source that it names."""
     digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in meta.plugins[::-1]}
     return _fields(meta, *ENTRY_FIELDS) | {"source_digest": digests.get(plugin, "")}
-
-
-def _place(record: Record) -> tuple[int, int]:
-    """Order of the benchmark: environment, anomaly, seed."""
-    return _ORDER[record.environment, record.anomaly], record.seed
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:

@@ -96,6 +96,9 @@ class Findings:
             yield
         except ResultsError as error:
             self.refuse(where, "", str(error))
+        except UnicodeDecodeError as error:
+            line = error.object[: error.start].count(b"\n") + 1
+            self.refuse(where, "", f"is not UTF-8: {error.reason} in line {line}")
 
 
 def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
@@ -172,19 +175,12 @@ def find_text(contents: Mapping[str, bytes], name: str, findings: Findings) -> t
     """Return a text file's name, which may end in ``.gz``, and its text; both empty without it."""
     for stored in (name, name + GZIP):
         if stored in contents:
+            content = contents[stored]
             with findings.reading(stored):
-                return stored, _decoded(stored, contents[stored])
+                if stored.endswith(GZIP):
+                    content = stored_files.decompress(content, MOST_PLAIN[name])
+                return stored, content.decode()
     return "", ""
-
-
-def _decoded(name: str, content: bytes) -> str:
-    if name.endswith(GZIP):
-        content = stored_files.decompress(content, MOST_PLAIN[name.removesuffix(GZIP)])
-    try:
-        return content.decode()
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise ResultsError(f"is not UTF-8: {error.reason} in line {line}") from None
 
 
 def check_digests(

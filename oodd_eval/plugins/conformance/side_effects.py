@@ -26,6 +26,8 @@ from unittest.mock import patch
 import numpy as np
 import psutil
 
+from oodd_eval.data.files import redirected
+
 _THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
 
 # Set before code is watched, so that setting the usual value is seen as well.
@@ -254,17 +256,12 @@ def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
 @contextlib.contextmanager
 def _captured() -> Iterator[IO[str]]:
     """Send what is printed, by Python and by libraries beneath it, into a file."""
-    with tempfile.TemporaryFile("w+", errors="replace") as file, contextlib.ExitStack() as back:
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                stream.flush()
-        back.enter_context(contextlib.redirect_stdout(file))
-        back.enter_context(contextlib.redirect_stderr(file))
-        for descriptor in (1, 2):
-            copy = os.dup(descriptor)
-            back.callback(os.close, copy)
-            back.callback(os.dup2, copy, descriptor)
-            os.dup2(file.fileno(), descriptor)
+    with (
+        tempfile.TemporaryFile("w+", errors="replace") as file,
+        redirected(file),
+        contextlib.redirect_stdout(file),
+        contextlib.redirect_stderr(file),
+    ):
         yield file
 
 

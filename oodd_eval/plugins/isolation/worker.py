@@ -34,6 +34,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from oodd_eval.data.files import flush_streams
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, TrajectoryError
 from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
@@ -201,7 +202,7 @@ def _saved(detector: Detector, place: str) -> str:
 
 def _fork(channel: Channel, detector: Detector) -> int:
     """Score a group in a fork of this process; return its exit code, negative for a signal."""
-    _flush()  # What is printed but not written yet would be written by every fork.
+    flush_streams()  # What is printed but not written yet would be written by every fork.
     process = os.fork()
     if process == 0:
         code = 1
@@ -280,15 +281,8 @@ def _reported(channel: Channel, work: Callable[[], None]) -> int:
         status = next((s for kind, s in _STATUSES.items() if isinstance(error, kind)), "error")
         channel.send({"status": status, "reason": reason_of(error)})
         code = 1
-    _flush()
+    flush_streams()
     return code
-
-
-def _flush() -> None:
-    for stream in (sys.stdout, sys.stderr):
-        # The detector may have closed a stream, or put None in its place.
-        with suppress(ValueError, OSError, AttributeError):
-            stream.flush()
 
 
 def main(arguments: Sequence[str]) -> NoReturn:

@@ -235,7 +235,10 @@ def compare(
     notes = []
     for conditions in common:
         cells, own = reference.boards[conditions], now.boards[conditions]
-        if outside := _outside(cells, own):
+        # Of these environments, or of these settings and seeds, nothing is there now.
+        here, rows = {c.environment for c in own}, {(c.setting, c.seed) for c in own}
+        there = {c for c in cells if c.environment in here and (c.setting, c.seed) in rows}
+        if outside := cells.keys() - there:
             environments = sorted({cell.environment for cell in outside})
             detectors = sorted({cell.setting.detector for cell in outside})
             notes.append(
@@ -274,14 +277,6 @@ def _require_common(now: RecordSet, reference: RecordSet, common: Sequence[Condi
     else:
         return
     raise NothingInCommonError(f"nothing in common: {why}")
-
-
-def _outside(cells: Iterable[Cell], own: Iterable[Cell]) -> set[Cell]:
-    """Return the cells of environments, or of settings and seeds, of which nothing is there now."""
-    environments = {cell.environment for cell in own}
-    rows = {(cell.setting, cell.seed) for cell in own}
-    there = (c for c in cells if c.environment in environments and (c.setting, c.seed) in rows)
-    return set(cells) - set(there)
 
 
 def _parts(cell: Cell) -> _Place:

@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,8 +24,7 @@ Key = TypeVar("Key")
 SEEDS: Final = 3  # detector seeds that a primary row with randomness needs for a rank
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(NamedTuple):
     """A mean over some cells and its interval, NaN where undefined or not asked for.
 
     `state` is the status of the first failed cell, without which there is a value; `partial` says
@@ -142,8 +141,7 @@ def _mean(records: Iterable[Record], metric: str) -> float:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Cost:
+class Cost(NamedTuple):
     """Mean seconds of a row's fits, microseconds per scored step, and most memory in MB."""
 
     fit: float = NAN

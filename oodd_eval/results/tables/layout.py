@@ -245,10 +245,7 @@ def alarms(ranks: RankedBoard) -> list[Table]:
 
 def cost(ranks: RankedBoard) -> Table:
     """Return seconds per fit, microseconds per scored step and peak memory."""
-    rows = [
-        [*_labels(s), *map(_digits, (s.cost.fit, s.cost.step, s.cost.peak))]
-        for s in ranks.standings
-    ]
+    rows = [[*_labels(one), *map(_digits, one.cost)] for one in ranks.standings]
     header = [*_LABELS, "fit (s)", "score (µs per step)", "peak memory (MB)"]
     return Table("Cost", header, rows, labels=3)
 

@@ -18,6 +18,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import TypeAdapter
+
 from oodd_eval._version import __version__
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import Split, load_split
@@ -25,7 +27,6 @@ from oodd_eval.errors import ExecutorError, MissingExtraError, OoddError, Plugin
 from oodd_eval.plugins.discovery import offer_of
 from oodd_eval.plugins.isolation.supervisor import Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.identity import Setting
 from oodd_eval.scoring.executors import Executor, RunSettings
 from oodd_eval.scoring.keys import source_digest
 from oodd_eval.scoring.plan import Plan, Unit
@@ -153,7 +154,8 @@ def _scored(order: Message, stop: Stop) -> Message:
             f"it has oodd-eval {__version__}, expected {order['version']} as on this side: "
             "install the same version there"
         )
-    unit = _unit(order["unit"])
+    # Read also from JSON, which turns tuples into lists.
+    unit = TypeAdapter(Unit).validate_python(order["unit"])
     plan = Plan(units=(unit,), **order["plan"])
     try:
         offer = offer_of(unit.plugin, unit.setting.detector)
@@ -173,14 +175,6 @@ def _scored(order: Message, stop: Stop) -> Message:
     outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
     file = scored.file
     return {**outcome, "parts": file.parts, "cost": file.cost, "order": file.order}
-
-
-def _unit(plain: Message) -> Unit:
-    """Read a unit back, also from JSON, which turns tuples into lists."""
-    setting = plain["setting"]
-    parameters = tuple((name, text) for name, text in setting["parameters"])
-    read = Setting(setting["detector"], setting["horizon"], parameters)
-    return Unit(**{**plain, "setting": read, "anomalies": tuple(plain["anomalies"])})
 
 
 @functools.lru_cache(maxsize=16)
