@@ -449,7 +449,7 @@ def test_other_splits_follow_from_the_most_data_to_the_least():
 
 def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone(monkeypatch):
     digests = {name: f"{i:02d}" * 32 for i, name in enumerate(("mini", "reduced", "standard"))}
-    monkeypatch.setattr(rendering, "published_digests", lambda: digests)
+    monkeypatch.setattr(leaderboard_build, "published_digests", lambda: digests)
 
     def words(split, digest):
         own = [dataclasses.replace(record("riqn", [0.6] * SEEDS, digest=digest), split=split)]

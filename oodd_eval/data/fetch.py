@@ -17,9 +17,8 @@ import urllib.request
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import quote, urlsplit
 from urllib.request import url2pathname
 
@@ -43,8 +42,7 @@ Source = Callable[[str, Path, int], None]
 """Writes a file of the split, by its plain name, to a path, refusing more than some bytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fetched:
+class Fetched(NamedTuple):
     """A fetched split in its place; `already` is True if it was there before."""
 
     split: Split

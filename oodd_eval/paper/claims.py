@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import NAMES, metric_info
@@ -110,8 +110,7 @@ _WORST_FIRST: Final[tuple[Verdict, ...]] = ("refuted", "negligible", "undecided"
 """Verdicts on one environment that decide a claim about every one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ruling:
+class Ruling(NamedTuple):
     """A claim with its judgements: by the paper's measure and by the fair one, if there is one."""
 
     claim: Claim

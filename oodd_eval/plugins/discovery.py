@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Final
+from typing import Final, NamedTuple
 
 import pluggy
 
@@ -60,8 +60,7 @@ class Offer:
             raise MissingExtraError(f"detector {self.spec.name!r} {reason}")
 
 
-@dataclass(frozen=True, slots=True)
-class Broken:
+class Broken(NamedTuple):
     """A plug-in that is installed and does not work, with the reason."""
 
     plugin: str

@@ -15,9 +15,8 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from oodd_eval.data.files import digests
 
@@ -26,8 +25,7 @@ INDEX: Final = "fitted.json"
 MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
 
 
-@dataclass(frozen=True, slots=True)
-class KeptFit:
+class KeptFit(NamedTuple):
     """A fitted detector that can be loaded: its directory, and the seconds that its fit took."""
 
     path: Path

@@ -362,15 +362,12 @@ def write_reference(records: Iterable[Record], path: Path | str) -> None:
         place = environments.index(r.environment), anomalies.index(r.anomaly)
         return r.split, r.split_digest, *place, str(r.cell)
 
-    lines = [_referenced(record).to_json() + "\n" for record in sorted(records, key=order)]
+    known, lines = ("oodd_eval", "python", "numpy"), []
+    for r in sorted(records, key=order):
+        kept = replace(
+            r, metrics={name: Metric(m.value, n=m.n) for name, m in r.metrics.items()},
+            per_trajectory={}, scores="", seconds_fit=NAN, seconds_score=NAN, steps_scored=None,
+            peak_rss_mb=NAN, provenance={k: v for k, v in r.provenance.items() if k in known},
+        )  # fmt: skip
+        lines.append(kept.to_json() + "\n")
     write_text(Path(path), "".join(lines))
-
-
-def _referenced(record: Record) -> Record:
-    known = ("oodd_eval", "python", "numpy")
-    return replace(
-        record,
-        metrics={name: Metric(metric.value, n=metric.n) for name, metric in record.metrics.items()},
-        per_trajectory={}, scores="", seconds_fit=NAN, seconds_score=NAN, steps_scored=None,
-        peak_rss_mb=NAN, provenance={k: v for k, v in record.provenance.items() if k in known},
-    )  # fmt: skip

@@ -179,8 +179,7 @@ class Standing:
         return len({r.seed for r in self.records})
 
 
-@dataclass(frozen=True, slots=True)
-class RankedBoard:
+class RankedBoard(NamedTuple):
     """A board with its rankings and win rates, by the labels of the ranked rows.
 
     All have the order of the standings: ranked rows by rank and mean, then the others by name.
