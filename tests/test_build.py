@@ -87,14 +87,23 @@ def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
     assert (built / "cartpole.h5").stat().st_mtime_ns == before
 
 
-def test_a_damaged_file_is_built_again(built, tmp_path):
+def test_a_damaged_file_is_built_again_and_what_others_keep_there_stays(built, tmp_path):
     expected = digest(built)
+    with subprocess.Popen(["true"]) as gone:
+        pass
     copy = tmp_path / "small"
     copy.mkdir()
     for file in built.iterdir():
         content = file.read_bytes()
         (copy / file.name).write_bytes(content[:-200] if file.suffix == ".h5" else content)
+    stale = copy / f".cartpole.h5.{gone.pid}"
+    foreign = [copy / "work" / "mine", copy / f".python3.{gone.pid}" / "bin"]
+    for file in (stale, *foreign):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("x")
     build_split(SMALL, copy, jobs=1, **FEW)
+    assert not stale.exists()
+    assert all(file.exists() for file in foreign)
     assert all(check.ok for check in load_split(copy).verify())
     assert digest(copy) == expected
 
@@ -143,7 +152,7 @@ def test_a_killed_build_resumes_and_leaves_no_worker(built, tmp_path, monkeypatc
         time.sleep(0.05)
     assert not any(map(alive, workers))
 
-    finished = len(list((target / "work").glob("*.npz")))
+    finished = len(list((target / build.WORK).glob("*.npz")))
     assert finished >= 1
     assert not (target / "manifest.json").exists()
     monkeypatch.setattr(build, "CHUNK", {"train": 1, "calibration": 1, "test": 1})

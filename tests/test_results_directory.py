@@ -61,8 +61,10 @@ def test_leftovers_of_killed_processes_go_away_and_those_of_living_ones_stay(tmp
         tmp_path / "logs" / f".a-b-0123.txt.{gone.pid}",
     ]
     living = tmp_path / "scores" / f".a-b-0123.h5.{os.getppid()}"
-    foreign = tmp_path / ".gitignore"
-    for file in (*stale, living, foreign):
+    ended = f".mine{gone.pid}.{gone.pid}"  # looks like a temporary name, and is none of ours
+    foreign = [tmp_path / ".gitignore", tmp_path / ended, tmp_path / f".python3.{gone.pid}" / "bin"]
+    foreign[-1].parent.mkdir()
+    for file in (*stale, living, *foreign):
         file.write_text("x")
     fits = [tmp_path / "fitted" / f".abc.{pid}" for pid in (gone.pid, os.getppid())]
     for fit in fits:
@@ -71,5 +73,5 @@ def test_leftovers_of_killed_processes_go_away_and_those_of_living_ones_stay(tmp
     results.prepare()
     assert not [file for file in stale if file.exists()]
     assert living.exists()
-    assert foreign.exists()
+    assert all(file.exists() for file in foreign)
     assert [fit.exists() for fit in fits] == [False, True]

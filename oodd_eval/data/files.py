@@ -47,9 +47,12 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def remove_abandoned(directory: Path) -> None:
-    """Remove what has a temporary name, ``.NAME.PID`` as in `replacing`, of an ended process."""
-    for place in directory.glob(".*"):
+def remove_abandoned(directory: Path, name: str = "*") -> None:
+    """Remove what has a temporary name, ``.NAME.PID`` as in `replacing`, of an ended process.
+
+    Where others may keep files, too, `name` says which of them this program writes.
+    """
+    for place in directory.glob(f".{name}.*"):
         found = re.fullmatch(r"\..+\.(\d{1,9})", place.name)
         if found and not psutil.pid_exists(int(found[1])):
             if place.is_dir():

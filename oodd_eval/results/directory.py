@@ -76,7 +76,9 @@ class ResultsDirectory:
             ) from None
         if (self.path / RECORDS).exists():
             self.records()
-        for directory in (self.path, self.path / "scores", self.path / "logs", self.fits.path):
+        for name in (RECORDS, REPORT):  # users may choose a directory that holds files of theirs
+            files.remove_abandoned(self.path, name)
+        for directory in (self.path / "scores", self.path / "logs", self.fits.path):
             files.remove_abandoned(directory)
 
     def records(self) -> list[Record]:

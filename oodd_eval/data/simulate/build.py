@@ -41,6 +41,7 @@ from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
 
 CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}  # seeds; a test seed is nine episodes
+WORK: Final = ".building"  # the work folder, gone when the split is whole
 MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
 
 PACKAGES: Final = ("oodd-eval", "numpy", "gymnasium", "pybullet", "pybullet-envs-gymnasium")
@@ -85,10 +86,11 @@ def build_split(
     paths = {e: str((policies or {}).get(e, "")) for e in names}
     digests = {e: load_policy(e, paths[e] or None).digest for e in names}
     entries = _kept(definition, directory, digests)
-    work = directory / "work"
+    work = directory / WORK
     work.mkdir(parents=True, exist_ok=True)
-    for folder in (work, directory):
-        remove_abandoned(folder)
+    remove_abandoned(work)
+    for name in ("*.h5", layout.MANIFEST):  # users may keep other files there
+        remove_abandoned(directory, name)
     todo = {e: _chunks(definition, e, paths[e], digests[e]) for e in names if e not in entries}
     further: dict[str, list[Chunk]] = todo
     while any(further.values()):
