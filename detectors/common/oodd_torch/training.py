@@ -19,13 +19,7 @@ from oodd_common.windows import windows
 from torch import Tensor
 
 from oodd_torch.network import Ensemble
-
-BETAS: Final = (0.9, 0.999)
-EPSILON: Final = 1e-8
-
-CLIP: Final = 1.0
-"""Largest norm of one member's gradient."""
-
+from oodd_torch.optimizers import Adam
 
 SAMPLED: Final = 256
 """Quantile levels that the samples of one update are drawn from, one of each equal part of (0, 1).
@@ -83,31 +77,6 @@ def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> T
     size = error.abs()
     huber = torch.where(size <= kappa, 0.5 * error * error, kappa * (size - 0.5 * kappa))
     return torch.abs(tau - (error < 0).to(error.dtype)) * huber / kappa
-
-
-class Adam:
-    """Adam (Kingma & Ba 2015) with a learning rate and a gradient clip per member."""
-
-    def __init__(self, parameters: Sequence[Tensor]) -> None:
-        self.parameters = list(parameters)
-        self.mean = [torch.zeros_like(p) for p in self.parameters]
-        self.square = [torch.zeros_like(p) for p in self.parameters]
-        self.count = 0
-
-    @torch.no_grad()
-    def step(self, rates: Tensor) -> None:
-        """Take one step; `rates` has shape (K,)."""
-        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self.parameters]
-        norm = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()  # (K,)
-        shrink = (CLIP / norm.clamp(min=CLIP))[:, None, None]
-        self.count += 1
-        correction = (1 - BETAS[1] ** self.count) ** 0.5 / (1 - BETAS[0] ** self.count)
-        for p, g, m, v in zip(self.parameters, gradients, self.mean, self.square, strict=True):
-            clipped = g * shrink
-            m.lerp_(clipped, 1 - BETAS[0])
-            v.mul_(BETAS[1]).addcmul_(clipped, clipped, value=1 - BETAS[1])
-            p.sub_(rates[:, None, None] * correction * m / (v.sqrt() + EPSILON))
-            p.grad = None
 
 
 def batches(
