@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -17,13 +17,13 @@ from oodd_common.charts import Floats
 from oodd_common.windows import StorableWindowDetector, windows
 from oodd_torch.device import chosen
 
-from oodd_eval import Trajectory
+from oodd_eval import Explanation, Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
 from oodd_pe.network import Ensemble, train
-from oodd_pe.statistic import Charts, Evidence, Running
+from oodd_pe.statistic import Charts, Evidence, Running, Suspicion
 
 HELD_OUT: Final = 0.15
 """Share of the nominal trajectories from which the charts are learnt; at least one."""
@@ -33,6 +33,14 @@ RIDGE: Final = 1e-6
 
 LIMIT: Final = 10.0
 """Largest size of an input, in standard deviations: beyond it a network has seen nothing."""
+
+
+class _Known(NamedTuple):
+    """What N forecasts may use."""
+
+    window: NDArray[np.float32]  # (N, W, D), newest first
+    actions: Floats | None  # (N, W, A), NaN before the beginning
+    steps: NDArray[np.int64]  # (N,), times of the newest observations
 
 
 class ProbabilisticEnsemble(StorableWindowDetector):
@@ -98,6 +106,19 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             scores[self.horizon :] = self.charts_.statistic(smoothed).max(axis=0)
         return scores
 
+    def explain(self, trajectory: Trajectory) -> Explanation:
+        """Return which sensors the evidence of each row points at, and since when.
+
+        See `oodd_pe.statistic.Suspicion`.
+        """
+        self._must_fit(trajectory)
+        shares = np.full(trajectory.observations.shape, np.nan)
+        onsets = np.full(len(trajectory), -1)
+        if trajectory.transitions >= self.horizon:
+            found = Suspicion(self.charts_, self.horizon)(self._evidence(trajectory, explain=True))
+            shares[self.horizon :], onsets[self.horizon :] = found
+        return Explanation(shares, onsets)
+
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
@@ -110,11 +131,11 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self._running = self._running or Running(self.charts_, accumulate=self.accumulate)
         actions = None
         if self.actions:
-            known = list(self._commands)[self.lag - 1 :]
-            missing = [np.full(len(self.action_scale_.mean), np.nan)] * (self.window - len(known))
-            actions = np.stack([*known, *missing])[None]
-        steps = np.array([t - self.lag])
-        evidence = self._judged(window[None], actions, steps, now[None], self._rows[1][None])
+            commands = list(self._commands)[self.lag - 1 :]
+            actions = np.full((1, self.window, len(self.action_scale_.mean)), np.nan)
+            actions[0, : len(commands)] = commands
+        known = _Known(window[None], actions, np.array([t - self.lag]))
+        evidence = self._judged(known, now[None], self._rows[1][None])
         return float(self.charts_.statistic(self._running(evidence)).max())
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
@@ -143,7 +164,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         # A single episode has no others, and judges itself.
         training = [usable[i] for i in order[held:]] or held_out
 
-        x = np.concatenate([self._inputs(*self._known(t)) for t in training])
+        x = np.concatenate([self._inputs(self._known(t)) for t in training])
         y = np.concatenate([self._changes(*self._seen(t)) for t in training])
         ones = np.concatenate([x, np.ones((len(x), 1))], axis=1)
         gram = ones.T @ ones + RIDGE * len(ones) * np.eye(ones.shape[1])
@@ -168,21 +189,21 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self.charts_.fit([self._evidence(t) for t in held_out])
         return scale
 
-    def _known(self, x: Trajectory) -> tuple[Any, ...]:
-        """Return windows (N, W, D), actions (N, W, A) and times (N,) that forecasts start from."""
+    def _known(self, x: Trajectory) -> _Known:
         steps = np.arange(len(x) - self.horizon)
         actions = None
         if self.actions:
             index = steps[:, None] - np.arange(self.window)
             actions = np.where(index[..., None] >= 0, x.actions[np.maximum(index, 0)], np.nan)
-        return windows(x.observations, steps, self.window), actions, steps
+        return _Known(windows(x.observations, steps, self.window), actions, steps)
 
     def _seen(self, x: Trajectory) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the observations that are judged and those that forecasts start from."""
         return x.observations[self.horizon :], x.observations[: len(x) - self.horizon]
 
-    def _inputs(self, window: Floats, actions: Floats | None, steps: NDArray[np.int64]) -> Floats:
+    def _inputs(self, known: _Known) -> Floats:
         """Return what forecasts use: newest observation, differences, actions, and the start."""
+        window, actions, steps = known
         scale, n = self.observation_scale_, len(window)
         z = np.clip((window - scale.mean) / scale.std, -LIMIT, LIMIT)[:, :, self.varying_]
         parts = [z[:, 0], (z[:, :-1] - z[:, 1:]).reshape(n, -1)]
@@ -190,55 +211,60 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             a = (actions - self.action_scale_.mean) / self.action_scale_.std
             parts.append(np.where(np.isnan(a), 0.0, a).reshape(n, -1))
         # Whether the window reaches beyond the beginning.
-        parts.append((steps < self.window - 1)[:, None])
+        parts.append((steps[:, None] < self.window - 1).astype(np.float64))
         return np.concatenate(parts, axis=1)
 
     def _changes(self, now: NDArray[np.float32], before: NDArray[np.float32]) -> Floats:
         """Return changes of varying sensors, in standard deviations: (N, D)."""
-        change = now.astype(np.float64) - before
-        return (change / self.observation_scale_.std)[:, self.varying_]
+        change = (now.astype(np.float64) - before) / self.observation_scale_.std
+        varying: Floats = change[:, self.varying_]
+        return varying
 
     def _scaled(self, x: Floats) -> Floats:
-        return np.clip(x / self.input_scale_, -LIMIT, LIMIT)
+        scaled: Floats = np.clip(x / self.input_scale_, -LIMIT, LIMIT)
+        return scaled
 
     def _errors(self, x: Floats, y: Floats) -> Floats:
         """Return what the linear forecast leaves, in units of its training error."""
         left: Floats = (y - x @ self.ridge_[:-1] - self.ridge_[-1]) / self.error_scale_
         return left
 
-    def _evidence(self, x: Trajectory) -> Evidence:
-        rows = x.observations
-        window, actions, steps = self._known(x)
-        return self._judged(
-            window, actions, steps, rows[self.horizon :], rows[self.horizon - 1 : -1]
-        )
+    def _evidence(self, x: Trajectory, *, explain: bool = False) -> Evidence:
+        now, before = x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
+        return self._judged(self._known(x), now, before, explain=explain)
 
     @torch.no_grad()
     def _judged(
         self,
-        window: NDArray[np.float32],
-        actions: Floats | None,
-        steps: NDArray[np.int64],
+        known: _Known,
         now: NDArray[np.float32],
         before: NDArray[np.float32],
+        *,
+        explain: bool = False,
     ) -> Evidence:
         """Judge observations ``now`` (N, D); ``before`` are those of the step before."""
-        x = self._inputs(window, actions, steps)
-        y = self._errors(x, self._changes(now, window[:, 0]))
+        x = self._inputs(known)
+        y = self._errors(x, self._changes(now, known.window[:, 0]))
         given, outcome = (
             torch.from_numpy(v).expand(self.parameters.members, -1, -1)
             for v in (self._scaled(x), y)
         )
-        forecast = self.network_(given, outcome)
-        scale = self.observation_scale_
+        network, scale = self.network_, self.observation_scale_
+        forecast = network(given, outcome)
         constant = np.setdiff1d(np.arange(len(scale.mean)), self.varying_)
         moved = (now - scale.mean)[:, constant] / CONSTANT
         changed = np.sign(moved) * np.sqrt(2.0 * np.log1p(moved**2))
         movement = self._changes(now, before)
+        of_sensors = np.zeros((len(now), len(scale.mean) if explain else 0))
+        if explain:
+            alone = forecast.of_sensors(network.row, network.column).mean(0).numpy()
+            of_sensors[:, self.varying_] = alone**2
+            of_sensors[:, constant] = moved**2
         return Evidence(
             np.concatenate([forecast.deviance().mean(0).numpy(), changed], axis=1),
             forecast.log_tail.mean(0).numpy(),
             np.sqrt((movement**2).sum(axis=1) / max(1, movement.shape[1])),
+            of_sensors,
         )
 
     def _saved_with(self) -> dict[str, Any]:
@@ -253,9 +279,9 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         }
 
     def _arrays(self) -> Arrays:
-        scale = {"action_scale": np.stack([self.action_scale_.mean, self.action_scale_.std])}
+        scale = self.action_scale_ if self.actions else FeatureScale(np.zeros(0), np.ones(0))
         return {
-            **(scale if self.actions else {}),
+            "action_scale": np.stack([scale.mean, scale.std]),
             "varying": self.varying_,
             "ridge": self.ridge_,
             "error_scale": self.error_scale_,
@@ -266,11 +292,10 @@ class ProbabilisticEnsemble(StorableWindowDetector):
 
     def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
         self.observation_scale_ = FeatureScale.of(arrays)
-        if self.actions:
-            self.action_scale_ = FeatureScale(*take(arrays, "action_scale", (2, None)))
+        self.action_scale_ = FeatureScale(*take(arrays, "action_scale", (2, None)))
         self.varying_ = take(arrays, "varying", (None,), "i")
         d = len(self.varying_)
-        commands = len(self.action_scale_.mean) if self.actions else 0
+        commands = len(self.action_scale_.mean)
         inputs = self.window * (d + commands) + 1
         self.ridge_ = take(arrays, "ridge", (inputs + 1, d))
         self.error_scale_ = take(arrays, "error_scale", (d,))

@@ -84,6 +84,21 @@ class Forecast(NamedTuple):
         squared = (nu + 1) * torch.log1p(self.residual.square() / nu)
         return torch.sign(self.residual) * squared.sqrt()
 
+    def of_sensors(self, row: Tensor, column: Tensor) -> Tensor:
+        r"""Return what an error of one sensor alone would explain, in standard deviations.
+
+        With the precision :math:`\Lambda = L^\top L`, L = s (I + U), of the errors y - mean, these
+        are :math:`(\Lambda (y - \mu))_d / \sqrt{\Lambda_{dd}}`: by how much their squared length
+        would fall if the reading of sensor d were free. ``row`` and ``column`` place the entries of
+        U. Of shape (M, N, D).
+        """
+        scale = self.log_scale.exp()
+        pulled = scale * self.residual
+        slope = pulled.index_add(-1, column, self.dependence * pulled[..., row])
+        squares = scale.square()
+        squares = squares.index_add(-1, column, self.dependence.square() * squares[..., row])
+        return slope / squares.sqrt()
+
 
 class Ensemble(torch.nn.Module):
     """M independent networks of three hidden layers, trained and evaluated together.
@@ -123,7 +138,7 @@ class Ensemble(torch.nn.Module):
             hidden = hidden + silu(torch.baddbmm(bias, hidden, weights))
         out = torch.baddbmm(self.out_bias, hidden, self.out)
         d = self.sensors
-        mean, scale, tail, dependence = out.split([d, d, d, out.shape[-1] - 3 * d], -1)
+        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[-1] - 3 * d], -1)
         log_scale = LOG_SCALE * torch.tanh(scale / LOG_SCALE)
         log_tail = LOG_TAIL * (1 + torch.tanh(tail))
         error = y - mean

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from oodd_common.charts import Floats, Smoother, distance, whitening
 
 from oodd_eval.plugins.forecasting import CONSTANT
@@ -24,10 +25,13 @@ LARGEST: Final = 36.0
 """Limit of a squared residual in these averages."""
 SMALLEST: Final = 0.05
 """Least scale of a residual."""
+TINY: Final = 1e-12
 ENERGY: Final = 9.0
 """Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
 MOVEMENT: Final = 0.5
 """Share of the median movement below which a step counts as less than one in the sums."""
+REFERENCE: Final = 2.0
+"""Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
 SHRINKAGE: Final = 0.02
 """Least share of the identity in a correlation matrix."""
 
@@ -45,11 +49,15 @@ class Evidence(NamedTuple):
     movement
         How far the sensors moved since the step before: root mean square, in training standard
         deviations, (N,).
+    of_sensors
+        Squared standard deviations that an error of one sensor alone would explain, (N, sensors);
+        without columns where nobody asks which sensor it was.
     """
 
     residuals: Floats
     log_tails: Floats
     movement: Floats
+    of_sensors: Floats
 
 
 class Charts:
@@ -59,8 +67,8 @@ class Charts:
 
     knots_, scales_
         Root mean squares of residuals by the logarithm of the tail, each (D, bins).
-    centre_, energy_
-        Means of the columns, (C - 1,), and of their energy, ().
+    centre_, energy_, spread_
+        Means of the columns, (C - 1,), mean and standard deviation of their energy, each ().
     still_
         Movement from which a step counts fully, ().
     roots_
@@ -87,6 +95,7 @@ class Charts:
         self.centre_, self.energy_ = np.zeros(residuals.shape[1]), np.zeros(())
         columns = np.concatenate([self.columns(e) for e in episodes])
         self.centre_, self.energy_ = columns[:, :-1].mean(axis=0), columns[:, -1].mean()
+        self.spread_ = columns[:, -1].std()
 
         smoothed = [Running(self)(e) for e in episodes]
         pooled = np.concatenate(smoothed, axis=1)
@@ -115,8 +124,7 @@ class Charts:
     def columns(self, evidence: Evidence) -> Floats:
         """Return centred residuals and their energy, (N, C)."""
         u = self.standardized(evidence) - self.centre_
-        d = max(1, len(self.knots_))
-        energy = np.minimum(u[:, : len(self.knots_)] ** 2, ENERGY).sum(axis=1, keepdims=True) / d
+        energy = np.minimum(u**2, ENERGY).mean(axis=1, keepdims=True)
         return np.concatenate([u, energy - self.energy_], axis=1)
 
     def _distances(self, smoothed: Floats) -> Floats:
@@ -146,6 +154,7 @@ SHAPES: Final = {
     "scales": "DB",
     "centre": "R",
     "energy": "",
+    "spread": "",
     "still": "",
     "roots": "WCC",
     "median": "W1",
@@ -169,6 +178,37 @@ class Running:
         # pieces of evidence.
         share = np.minimum(1.0, evidence.movement / max(float(self._charts.still_), CONSTANT))
         return np.concatenate([columns[None], self._smoother(columns * share[:, None])])
+
+
+class Suspicion:
+    """Since when, and by which sensors: the steps of an episode so far.
+
+    The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
+    of two nominal standard deviations. A sensor's share is its part of what errors of single
+    sensors would explain, averaged over the steps since then with their energy as weight.
+    """
+
+    def __init__(self, charts: Charts, first: int) -> None:
+        self._charts, self._now = charts, first
+        self._sum, self._onset = 0.0, first
+        self._weighted: Floats = np.zeros(0)
+
+    def __call__(self, evidence: Evidence) -> tuple[Floats, NDArray[np.int64]]:
+        """Return shares, (N, sensors), and onsets, (N,), of the next N steps."""
+        parts = np.maximum(evidence.of_sensors, TINY)
+        parts = parts / parts.sum(axis=1, keepdims=True)
+        excess = self._charts.columns(evidence)[:, -1]
+        shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
+        for n, (part, more) in enumerate(zip(parts, excess, strict=True)):
+            if self._sum <= 0:
+                self._onset, self._weighted = self._now, np.zeros(len(part))
+            self._sum = max(0.0, self._sum + more - REFERENCE * float(self._charts.spread_))
+            weight = max(more + float(self._charts.energy_), CONSTANT)
+            self._weighted = self._weighted + weight * part
+            shares[n] = self._weighted / self._weighted.sum()
+            onsets[n] = self._onset
+            self._now += 1
+        return shares, onsets
 
 
 def _root(smoothed: Floats, weight: float) -> Floats:
