@@ -50,29 +50,28 @@ def make_pe(name: str = "pe", *, seed: int = 0, horizon: int = 1, **parameters: 
     )
 
 
-_SUMMARIES = {
-    "pe": "probabilistic ensemble, residuals accumulated with their sign",
-    "pe-a": "pe whose forecast uses the commanded actions too",
-    "pe-step": "pe without accumulation, every step judged by itself",
-    "pe-step-a": "pe-a without accumulation, every step judged by itself",
-}
-
-
 @hookimpl
 def oodd_detectors() -> list[DetectorSpec]:
     """Offer the ensemble accumulated and per step, without and with actions."""
     return [
-        DetectorSpec(
-            name=name,
-            factory=partial(make_pe, name),
-            summary=summary,
-            reference="Chua et al. (2018), PETS (the ensemble); Lowry et al. (1992) (the charts)",
-            inputs="observations+actions" if name.endswith("-a") else "observations",
-            alarm="cusum" if "step" in name else "score",
-            parameters=PeParameters,
-            requires=("torch",),
-            extra="oodd-eval[reference]",
-            fit_name="pe-a" if name.endswith("-a") else "pe",
-        )
-        for name, summary in _SUMMARIES.items()
+        _spec(name="pe", summary="probabilistic ensemble, residuals accumulated with their sign"),
+        _spec(name="pe-a", summary="pe whose forecast uses the commanded actions too"),
+        _spec(name="pe-step", summary="pe without accumulation, every step judged by itself"),
+        _spec(name="pe-step-a", summary="pe-a without accumulation, every step judged by itself"),
     ]
+
+
+def _spec(*, name: str, summary: str) -> DetectorSpec:
+    actions = name.endswith("-a")
+    return DetectorSpec(
+        name=name,
+        factory=partial(make_pe, name),
+        summary=summary,
+        reference="Chua et al. (2018), PETS (the ensemble); Lowry et al. (1992) (the charts)",
+        inputs="observations+actions" if actions else "observations",
+        alarm="cusum" if "step" in name else "score",
+        parameters=PeParameters,
+        requires=("torch",),
+        extra="oodd-eval[reference]",
+        fit_name="pe-a" if actions else "pe",
+    )
