@@ -7,7 +7,7 @@ import pytest
 import torch
 from oodd_pe import make_pe
 from oodd_pe.network import Ensemble, train
-from oodd_pe.statistic import Charts, Evidence, Running, Suspicion
+from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 from scipy import stats
 
 from oodd_eval import Trajectory
@@ -196,7 +196,7 @@ def test_running_charts_continue_where_they_ended(charts):
 def test_onset_and_shares_by_hand(charts):
     r = np.zeros((30, 2))
     r[20:, 1] = 6.0
-    shares, onsets = Suspicion(charts, 1)(evidence(30, residuals=r))
+    shares, onsets = Attribution(charts, 1)(evidence(30, residuals=r))
     np.testing.assert_array_equal(onsets[:21], np.arange(1, 22))
     np.testing.assert_array_equal(onsets[20:], 21)  # the first of these rows is that of time 1
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)

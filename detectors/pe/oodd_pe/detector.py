@@ -23,7 +23,7 @@ from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
 from oodd_pe.network import Ensemble, train
-from oodd_pe.statistic import Charts, Evidence, Running, Suspicion
+from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 
 HELD_OUT: Final = 0.15
 """Share of the nominal trajectories from which the charts are learnt; at least one."""
@@ -109,13 +109,15 @@ class ProbabilisticEnsemble(StorableWindowDetector):
     def explain(self, trajectory: Trajectory) -> Explanation:
         """Return which sensors the evidence of each row points at, and since when.
 
-        See `oodd_pe.statistic.Suspicion`.
+        See `oodd_pe.statistic.Attribution`.
         """
         self._must_fit(trajectory)
         shares = np.full(trajectory.observations.shape, np.nan)
         onsets = np.full(len(trajectory), -1)
         if trajectory.transitions >= self.horizon:
-            found = Suspicion(self.charts_, self.horizon)(self._evidence(trajectory, explain=True))
+            found = Attribution(self.charts_, self.horizon)(
+                self._evidence(trajectory, explain=True)
+            )
             shares[self.horizon :], onsets[self.horizon :] = found
         return Explanation(shares, onsets)
 

@@ -35,7 +35,7 @@ A likelihood alone widens the scales of what it could still learn to forecast.
 LOG_SCALE: Final = 12.0
 """Largest size of the logarithm of a scale."""
 LOG_TAIL: Final = math.log(8.0)
-"""Degrees of freedom lie between 1 and 64: 8 times or a share of exp(LOG_TAIL)."""
+"""Half the logarithm of the largest degrees of freedom, 64; the least are 1."""
 
 
 class Forecast(NamedTuple):
@@ -129,7 +129,10 @@ class Ensemble(torch.nn.Module):
         self.out = drawn(width, outputs, 0.1)
         self.out_bias = Parameter(torch.zeros(members, 1, outputs))
         row, column = np.tril_indices(sensors, -1)
-        self.row, self.column = torch.from_numpy(row), torch.from_numpy(column)
+        self.row: Tensor
+        self.column: Tensor
+        self.register_buffer("row", torch.from_numpy(row), persistent=False)
+        self.register_buffer("column", torch.from_numpy(column), persistent=False)
 
     def forward(self, x: Tensor, y: Tensor) -> Forecast:
         """Judge outcomes y, (M, N, D), by inputs x, (M, N, I)."""

@@ -25,7 +25,6 @@ LARGEST: Final = 36.0
 """Limit of a squared residual in these averages."""
 SMALLEST: Final = 0.05
 """Least scale of a residual."""
-TINY: Final = 1e-12
 ENERGY: Final = 9.0
 """Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
 MOVEMENT: Final = 0.5
@@ -180,8 +179,8 @@ class Running:
         return np.concatenate([columns[None], self._smoother(columns * share[:, None])])
 
 
-class Suspicion:
-    """Since when, and by which sensors: the steps of an episode so far.
+class Attribution:
+    """Which sensors the evidence of an episode so far points at, and since when.
 
     The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
     of two nominal standard deviations. A sensor's share is its part of what errors of single
@@ -195,7 +194,7 @@ class Suspicion:
 
     def __call__(self, evidence: Evidence) -> tuple[Floats, NDArray[np.int64]]:
         """Return shares, (N, sensors), and onsets, (N,), of the next N steps."""
-        parts = np.maximum(evidence.of_sensors, TINY)
+        parts = np.maximum(evidence.of_sensors, CONSTANT)
         parts = parts / parts.sum(axis=1, keepdims=True)
         excess = self._charts.columns(evidence)[:, -1]
         shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
