@@ -22,6 +22,8 @@ from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.tables import layout
+from oodd_eval.results.tables.board import ranked
 
 NAN = float("nan")
 SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION
@@ -368,6 +370,18 @@ def test_tables_have_a_section_for_detectors_that_explain(world, capsys):
     assert "Onset error at 5 % by anomaly" in capsys.readouterr().out
     assert main(["list", "metrics"]) == 0
     assert all(name in capsys.readouterr().out for name in [SENSOR_NAMED])
+
+
+def test_a_board_has_the_section_in_the_order_of_its_rows(world):
+    _, found = world
+    ranks = ranked([*found["silent"], *found["tells"]])
+    table = layout.attribution(ranks.board, intervals=True, standings=ranks.standings)
+    assert table.header[:5] == ["rank", "detector", "settings", "sensor named", "onset error"]
+    (row,) = table.rows
+    assert row[1] == "tells"
+    assert "[" in row[3]
+    assert "[" in row[4]
+    assert layout.attribution(ranked(found["silent"]).board) is None
 
 
 # Verification
