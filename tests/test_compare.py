@@ -126,9 +126,9 @@ def test_a_sign_on_the_better_side_is_explained(text, message):
 def test_every_metric_has_its_worse_side():
     falls = {m for m in NAMES if worse_side(m) == "-"}
     neither = {m for m in NAMES if worse_side(m) == "±"}
-    aucs = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired"}
-    assert {m for m in falls if not m.startswith("found")} == aucs
-    assert {m.partition("_at_")[0] for m in falls - aucs} == {"found_within_20", "found_within_100"}
+    own = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired", "sensor_named_at_5pct"}
+    assert {m for m in falls if not m.startswith("found")} == own
+    assert {m.partition("_at_")[0] for m in falls - own} == {"found_within_20", "found_within_100"}
     beside = ("null", "placebo", "threshold")
     assert neither == {m for m in NAMES if any(word in m for word in beside)}
     assert worse_side("of_another_version") == "±"

@@ -101,7 +101,7 @@ class _Work:
     all others. The order of groups, and which prefixes there are, follow from a number drawn from
     the system's randomness, which is stored with the scores. Within a group the order is that of
     the split, so that scores are the same bit for bit. A detector that explains is asked to in the
-    same way, when all is scored: only the anomalous trajectories, and prefixes of these.
+    same way, when all is scored: only the anomalous trajectories, and prefixes of some of these.
     """
 
     def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
@@ -112,8 +112,11 @@ class _Work:
         self._ordered = [*groups(self._lengths), self._probes]
         self._drawn = np.random.default_rng(self._order).permutation(len(self._ordered))
         self._groups = [self._ordered[k] for k in self._drawn]
-        anomalous = ([p for p in group if p.part not in _NOMINAL] for group in self._groups)
-        self._explained = [group for group in anomalous if group]
+        anomalous = {p: n for p, n in self._lengths.items() if p not in _NOMINAL}
+        again = [group for group in self._ordered[:-1] if group[0].part in anomalous]
+        again.append(contract.probes(anomalous, self._order))
+        order = np.random.default_rng([self._order, len(again)]).permutation(len(again))
+        self._explained = [again[k] for k in order]
 
     def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
         """Fit (or load a fit) and score in worker processes."""
