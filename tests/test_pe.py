@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oodd_pe import make_pe
-from oodd_pe.network import Ensemble, train
+from oodd_pe.network import DensityNetworks, train
 from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 from scipy import stats
 
@@ -45,7 +45,7 @@ def fitted():
 @pytest.fixture
 def forecast():
     """What two networks with weights drawn large say of five rows of three sensors."""
-    network = Ensemble(2, 4, 3, 8, seed=3).double()
+    network = DensityNetworks(2, 4, 3, 8, seed=3).double()
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
         network.out.mul_(10)
@@ -102,7 +102,7 @@ def test_training_finds_means_scales_dependence_and_tails():
     x = random.normal(size=(8000, 1))
     first = x[:, 0] + (0.5 + 0.4 * (x[:, 0] > 0)) * random.standard_t(3, size=8000)
     second = 0.8 * first + 0.1 * random.normal(size=8000)
-    network = Ensemble(2, 1, 2, 32, seed=0)
+    network = DensityNetworks(2, 1, 2, 32, seed=0)
     y = np.c_[first, second]
     train(network, x, y, updates=600, batch=256, seed=0, device="cpu")
     network.frozen()
@@ -122,7 +122,7 @@ def test_training_is_the_same_twice_and_differs_by_seed():
     x, y = random.normal(size=(200, 2)), random.normal(size=(200, 1))
 
     def weights(seed):
-        network = Ensemble(2, 2, 1, 8, seed=seed)
+        network = DensityNetworks(2, 2, 1, 8, seed=seed)
         train(network, x, y, updates=5, batch=16, seed=seed, device="cpu")
         return network.out.detach().numpy()
 

@@ -22,7 +22,7 @@ from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
-from oodd_pe.network import Ensemble, train
+from oodd_pe.network import DensityNetworks, train
 from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 
 HELD_OUT: Final = 0.15
@@ -94,7 +94,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self.parameters, self.accumulate = parameters, accumulate
         self.device = chosen(name, parameters.device)
         self.charts_ = Charts(parameters.memories)
-        self.network_: Ensemble
+        self.network_: DensityNetworks
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon."""
@@ -176,7 +176,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         )
         self.input_scale_ = np.maximum(x.std(axis=0), CONSTANT)
         p = self.parameters
-        self.network_ = Ensemble(p.members, x.shape[1], y.shape[1], p.width, self.seed)
+        self.network_ = DensityNetworks(p.members, x.shape[1], y.shape[1], p.width, self.seed)
         if y.shape[1]:
             train(
                 self.network_,
@@ -303,6 +303,6 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self.error_scale_ = take(arrays, "error_scale", (d,))
         self.input_scale_ = take(arrays, "input_scale", (inputs,))
         p = self.parameters
-        self.network_ = Ensemble(p.members, inputs, d, p.width)
+        self.network_ = DensityNetworks(p.members, inputs, d, p.width)
         self.network_.restore(arrays)
         self.charts_.restore(arrays, d, sensors - d)

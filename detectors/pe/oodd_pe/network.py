@@ -100,8 +100,8 @@ class Forecast(NamedTuple):
         return slope / squares.sqrt()
 
 
-class Ensemble(torch.nn.Module):
-    """M independent networks of three hidden layers, trained and evaluated together.
+class DensityNetworks(torch.nn.Module):
+    """M independent networks that forecast densities, trained and evaluated together.
 
     Parameters
     ----------
@@ -165,7 +165,14 @@ class Ensemble(torch.nn.Module):
 
 
 def train(
-    network: Ensemble, x: Floats, y: Floats, *, updates: int, batch: int, seed: int, device: str
+    network: DensityNetworks,
+    x: Floats,
+    y: Floats,
+    *,
+    updates: int,
+    batch: int,
+    seed: int,
+    device: str,
 ) -> None:
     """Maximize the likelihood of outcomes y, (N, D), given inputs x, (N, I), in place.
 
