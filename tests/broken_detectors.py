@@ -67,8 +67,14 @@ class Good:
         self.seen.append(observation)
         if action is not None:
             self.done.append(action)
-        actions = np.array(self.done) if self.done else np.empty((0, 1))
-        return float(self.score(Trajectory(self.seen, actions))[-1])
+        return float(self.score(self.lived())[-1])
+
+    def lived(self):
+        return Trajectory(self.seen, np.array(self.done) if self.done else np.empty((0, 1)))
+
+    def explain_last(self):
+        shares, onsets = self.explain(self.lived())
+        return shares[-1], int(onsets[-1])
 
     def save(self, directory):
         np.savez(directory / "state.npz", std=self.std_)
@@ -549,6 +555,17 @@ class OnsetInTheMiddle(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return shares, np.minimum(onsets, len(x) // 2)
+
+
+@breaks(
+    "explain",
+    "explain_last gives other onset than explain, first at t = 1: expected the row of explain for "
+    "the latest update",
+)
+class LateWithWhy(Good):
+    def explain_last(self):
+        shares, onset = super().explain_last()
+        return shares, max(onset - 1, -1)
 
 
 @breaks(

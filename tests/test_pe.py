@@ -293,3 +293,15 @@ def test_another_width_is_refused(fitted):
 def test_wrong_parameters_are_named(parameter, value):
     with pytest.raises(UsageError, match=rf"parameter '{parameter}' of pe is .*, expected"):
         make_pe("pe", **{parameter: value})
+
+
+def test_a_stream_is_explained_as_the_whole_episode_is(fitted):
+    detector, x = fitted["pe-a"], corrupted(episode(100), 80, 1, 2.0)
+    whole = detector.explain(x)
+    detector.reset()
+    found = []
+    for row in zip(x.observations, [None, *x.actions], strict=True):
+        detector.update(*row)
+        found.append(detector.explain_last())
+    np.testing.assert_allclose([shares for shares, _ in found], whole.shares, atol=1e-6)
+    np.testing.assert_array_equal([onset for _, onset in found], whole.onsets)

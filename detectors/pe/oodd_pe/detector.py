@@ -125,19 +125,29 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         """Begin a new live episode."""
         super().reset()
         self._running: Running | None = None
+        self._attribution: Attribution | None = None
+        self._last: tuple[Floats, int] | None = None
+
+    def explain_last(self) -> tuple[Floats, int]:
+        """Return shares of the sensors, (D,), and the onset that the latest `update` points at."""
+        unknown = np.full(len(self._scale().mean), np.nan)
+        return (unknown, -1) if self._last is None else self._last
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         self._running = self._running or Running(self.charts_, accumulate=self.accumulate)
+        self._attribution = self._attribution or Attribution(self.charts_, self.horizon)
         actions = None
         if self.actions:
             commands = list(self._commands)[self.lag - 1 :]
             actions = np.full((1, self.window, len(self.action_scale_.mean)), np.nan)
             actions[0, : len(commands)] = commands
         known = _Known(window[None], actions, np.array([t - self.lag]))
-        evidence = self._judged(known, now[None], self._rows[1][None])
+        evidence = self._judged(known, now[None], self._rows[1][None], explain=True)
+        shares, onsets = self._attribution(evidence)
+        self._last = shares[0], int(onsets[0])
         return float(self.charts_.statistic(self._running(evidence)).max())
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
@@ -253,7 +263,8 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         )
         network, scale = self.network_, self.observation_scale_
         forecast = network(given, outcome)
-        constant = np.setdiff1d(np.arange(len(scale.mean)), self.varying_)
+        constant = np.ones(len(scale.mean), dtype=bool)
+        constant[self.varying_] = False
         moved = (now - scale.mean)[:, constant] / CONSTANT
         changed = np.sign(moved) * np.sqrt(2.0 * np.log1p(moved**2))
         movement = self._changes(now, before)

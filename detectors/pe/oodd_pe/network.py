@@ -136,8 +136,10 @@ class DensityNetworks(torch.nn.Module):
 
     def forward(self, x: Tensor, y: Tensor) -> Forecast:
         """Judge outcomes y, (M, N, D), by inputs x, (M, N, I)."""
-        hidden = silu(torch.baddbmm(self.biases[0], x, self.weights[0]))
-        for weights, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+        # Lists: a slice of a ParameterList is a module of its own, which takes long to make.
+        (weights, *deeper), (bias, *biases) = list(self.weights), list(self.biases)
+        hidden = silu(torch.baddbmm(bias, x, weights))
+        for weights, bias in zip(deeper, biases, strict=True):
             hidden = hidden + silu(torch.baddbmm(bias, hidden, weights))
         out = torch.baddbmm(self.out_bias, hidden, self.out)
         d = self.sensors

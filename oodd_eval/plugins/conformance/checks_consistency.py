@@ -161,7 +161,7 @@ def check_streaming(trial: Trial) -> None:
 
 
 def check_explain(trial: Trial) -> None:
-    """Shares of explain add up to 1, onsets are not ahead, and a prefix gets the same of both."""
+    """Shares of explain add up to 1, onsets are not ahead; prefixes and streams get the same."""
     if not explains(trial.fitted()):
         raise CheckSkipped("has no explain")
     trajectory = noisy_from(trial.nominal(1)[0], trial.rows // 3)
@@ -177,6 +177,34 @@ def check_explain(trial: Trial) -> None:
             if differs.mean() > FLIPPED:
                 first = f"the first {n} of {len(trajectory)} observations alone have other {what}"
                 raise CheckFailedError(f"{first}: explain may use nothing after a row's time")
+    if hasattr(trial.fitted(), "explain_last"):
+        _must_explain_last(trial, trajectory, contract.Explanation(whole, onsets))
+
+
+def _must_explain_last(
+    trial: Trial, trajectory: Trajectory, expected: contract.Explanation
+) -> None:
+    """Raise `CheckFailedError` unless explain_last gives the rows of explain after each update."""
+    detector: Any = offered(trial.fitted(), "reset", "update")
+    rows = []
+    with doing("update and explain_last"):
+        detector.reset()
+        for row in zip(trajectory.observations, [None, *trajectory.actions], strict=True):
+            detector.update(*row)
+            rows.append(detector.explain_last())
+        shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
+    near = {"rtol": 0.0, "atol": contract.PROBE_TOLERANCE, "equal_nan": True}
+    for what, same in (
+        ("shares", np.isclose(shares, expected.shares, **near).all(axis=1)),
+        ("onset", onsets == expected.onsets),
+    ):
+        # Rounding may turn a few, as with prefixes.
+        if (~same).mean() > FLIPPED:
+            t = int(same.argmin())
+            raise CheckFailedError(
+                f"explain_last gives other {what} than explain, first at t = {t}: expected the "
+                "row of explain for the latest update"
+            )
 
 
 def _explanation(trial: Trial, trajectory: Trajectory) -> contract.Explanation:
