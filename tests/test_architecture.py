@@ -39,6 +39,8 @@ def test_the_core_imports_no_heavy_library_and_no_detector():
 
     def forbidden(path):
         simulators = set() if "simulate" in path.parts else SIMULATORS
+        if path == ROOT / "oodd_eval" / "live" / "wrappers.py":
+            simulators = SIMULATORS - {"gymnasium"}
         return {*imported(path)} & (HEAVY | own | simulators)
 
     assert not wrong(CORE, forbidden)

@@ -193,11 +193,8 @@ def _must_explain_last(
             detector.update(*row)
             rows.append(detector.explain_last())
         shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
-    near = {"rtol": 0.0, "atol": contract.PROBE_TOLERANCE, "equal_nan": True}
-    for what, same in (
-        ("shares", np.isclose(shares, expected.shares, **near).all(axis=1)),
-        ("onset", onsets == expected.onsets),
-    ):
+    near = np.isclose(shares, expected.shares, 0, contract.PROBE_TOLERANCE, equal_nan=True)
+    for what, same in (("shares", near.all(axis=1)), ("onset", onsets == expected.onsets)):
         # Rounding may turn a few, as with prefixes.
         if (~same).mean() > FLIPPED:
             t = int(same.argmin())

@@ -1,0 +1,23 @@
+"""Beside a running robot: a watchdog around any detector, for loops, Gymnasium and terminals.
+
+The names below are imported when first used: only the wrappers need gymnasium.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from oodd_eval.live.terminal import TerminalMonitor
+    from oodd_eval.live.watchdog import Reading, Watchdog
+    from oodd_eval.live.wrappers import VectorWatchdogWrapper, WatchdogWrapper
+
+__all__ = ["Reading", "TerminalMonitor", "VectorWatchdogWrapper", "Watchdog", "WatchdogWrapper"]
+
+_HOMES = {"Reading": "watchdog", "TerminalMonitor": "terminal", "Watchdog": "watchdog",
+          "VectorWatchdogWrapper": "wrappers", "WatchdogWrapper": "wrappers"}  # fmt: skip
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

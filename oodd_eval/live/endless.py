@@ -1,0 +1,91 @@
+"""Thresholds for operation without end: how seldom a false alarm is, in hours.
+
+Nominal operation without end alarms some day. Its statistic exceeds a high threshold in bursts,
+rarer than episodes are long; what is promised is the mean time between them.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+FEWEST: Final = 20
+"""Nominal episodes that a tail can be estimated from."""
+TAIL: Final = 0.25
+"""Share of the episodes, those with the largest statistics, that the tail is estimated from."""
+_NORMAL: Final = 1.96  # a 95 % interval of a normal distribution
+
+
+@dataclass(frozen=True, slots=True)
+class RunLength:
+    """A promised mean time between false alarms.
+
+    Attributes
+    ----------
+    hours
+        The promise.
+    low, high
+        95 % interval of what a threshold from so few episodes may really give, in hours.
+    observed
+        Nominal operation that it was estimated from, in hours. A promise beyond it rests on the
+        shape of the tail.
+    """
+
+    hours: float
+    low: float
+    high: float
+    observed: float
+
+    @classmethod
+    def fit(
+        cls, largest: Floats, rows: int, hours: float, rate: float
+    ) -> "tuple[float, RunLength]":
+        """Return the threshold that nominal operation exceeds once in so many hours, with that.
+
+        The k largest statistics of n episodes exceed the largest of the others by amounts that
+        are taken for exponential, as those of accumulated sums are far out. With their mean b the
+        threshold u + b x is exceeded by a share k / n e^-x of the episodes.
+
+        Parameters
+        ----------
+        largest : float64 array of shape (n,)
+            The largest statistic of each nominal episode; at least 20.
+        rows
+            Observations in all of these episodes together.
+        hours, rate
+            Mean time between false alarms, and observations in a second.
+
+        Examples
+        --------
+        >>> largest = np.random.default_rng(0).exponential(size=400)
+        >>> threshold, promise = RunLength.fit(largest, 400 * 500, hours=10, rate=50)
+        >>> round(threshold, 1), round(promise.low, 1), round(promise.high, 1)
+        (8.3, 2.6, 38.3)
+        """
+        n, observed = len(largest), rows / rate / 3600
+        if n < FEWEST:
+            raise UsageError(
+                f"a mean time between false alarms needs {FEWEST} nominal episodes for the "
+                f"threshold, got {n}: record more, or cut long ones"
+            )
+        k = max(FEWEST // 2, round(TAIL * n))
+        ordered = np.sort(largest)
+        above, start = ordered[n - k :], float(ordered[n - k - 1])
+        # Episodes among n that are to alarm, as many as promises fit into what was observed.
+        expected = observed / hours
+        x = math.log(k / expected)
+        if x <= 0:
+            raise UsageError(
+                f"{hours:g} h between false alarms is less than {observed / k:.3g} h, which is "
+                f"what {n} episodes of {observed:.3g} h in all are cut for: promise more"
+            )
+        # Relative errors of the share k / n, and of the mean of k exponential amounts.
+        error = math.exp(_NORMAL * math.sqrt((1 - k / n + x**2) / k))
+        promise = cls(hours, hours / error, hours * error, observed)
+        return start + x * float((above - start).mean()), promise

@@ -1,0 +1,126 @@
+"""Detectors of watchdogs: made by name or given, and fed row by row even if they do not stream."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import UsageError
+from oodd_eval.metrics.alarms import AlarmKind
+from oodd_eval.plugins.contract import (
+    Detector,
+    ExplainingDetector,
+    StreamingDetector,
+    StreamingExplainer,
+    make_detector,
+)
+from oodd_eval.plugins.discovery import discover
+
+Row = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A detector, with what it takes to make it again.
+
+    `name` is empty for an instance that was given; `alarm` is the statistic of its alarms, and
+    `actions` tells whether it is shown actions.
+    """
+
+    detector: Detector
+    name: str
+    alarm: AlarmKind
+    actions: bool
+    seed: int
+    horizon: int
+    parameters: Mapping[str, Any]
+
+    @classmethod
+    def make(
+        cls, detector: str | Detector, statistic: str | None, seed: int, horizon: int,
+        parameters: Mapping[str, Any],
+    ) -> Self:  # fmt: skip
+        """Make the detector of that name, or take an instance."""
+        if statistic not in {None, "cusum", "score"}:
+            raise UsageError(f"statistic={statistic!r}, expected 'cusum' or 'score'")
+        kind = cast("AlarmKind | None", statistic)
+        if isinstance(detector, str):
+            offer = discover().offer(detector)
+            offer.require()
+            spec = offer.spec
+            made = make_detector(spec.factory, seed=seed, horizon=horizon, parameters=parameters)
+            actions = spec.inputs == "observations+actions"
+            return cls(made, spec.name, kind or spec.alarm, actions, seed, horizon, parameters)
+        if not isinstance(detector, Detector):
+            expected = "a name or an object with the methods fit(nominal) and score(trajectory)"
+            raise UsageError(f"detector is {type(detector).__name__}, expected {expected}")
+        return cls(detector, "", kind or "cusum", True, seed, horizon, parameters)
+
+    def shown(self, trajectory: Trajectory) -> Trajectory:
+        """Return an episode as the detector may see it."""
+        return trajectory if self.actions else trajectory.without_actions()
+
+    def told(self) -> dict[str, Any]:
+        """Return what `of` reads: JSON values."""
+        return {
+            "name": self.name, "statistic": self.alarm, "seed": self.seed,
+            "horizon": self.horizon, "parameters": dict(self.parameters),
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any], detector: Detector | None) -> Self:
+        """Make a saved detector again, not fitted; `detector` is it where it has no name."""
+        if not told["name"] and detector is None:
+            raise UsageError(
+                "this watchdog was fitted with an instance: load(directory, detector) needs one "
+                "with the same parameters"
+            )
+        return cls.make(
+            detector or told["name"], told["statistic"], int(told["seed"]), int(told["horizon"]),
+            told["parameters"],
+        )  # fmt: skip
+
+
+def streaming(detector: Detector) -> StreamingDetector:
+    """Return a detector that takes one observation at a time; warn where that is slow."""
+    if isinstance(detector, StreamingDetector):
+        return detector
+    warnings.warn(
+        f"{type(detector).__name__} has no update: at every row it scores the whole episode so far,"
+        " which takes longer and longer until reset",
+        stacklevel=4,
+    )
+    explains = isinstance(detector, ExplainingDetector)
+    return _ExplainedPrefixes(detector) if explains else _Prefixes(detector)
+
+
+class _Prefixes:
+    """A detector that scores whole episodes, fed row by row."""
+
+    def __init__(self, detector: Any) -> None:
+        self._detector = detector
+        self.fit, self.score = detector.fit, detector.score
+        self.reset()
+
+    def reset(self) -> None:
+        self._observations: list[Row] = []
+        self._actions: list[Row] = []
+
+    def update(self, observation: Row, action: Row | None = None) -> float:
+        self._observations.append(observation)
+        if action is not None:
+            self._actions.append(action)
+        self._sofar = Trajectory(self._observations, self._actions or None)
+        return float(self._detector.score(self._sofar)[-1])
+
+
+class _ExplainedPrefixes(_Prefixes, StreamingExplainer):
+    """The same, of a detector that explains."""
+
+    def explain_last(self) -> tuple[NDArray[np.float64], int]:
+        shares, onsets = self._detector.explain(self._sofar)
+        return shares[-1], int(onsets[-1])

@@ -1,0 +1,222 @@
+"""What comes from the sensors: readings that are missing, no numbers, frozen or repeated.
+
+Such readings are evidence by themselves and nothing that a detector can judge. They are counted,
+and in their place the detector is handed the last good reading.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import TrajectoryError
+from oodd_eval.plugins.forecasting import FeatureScale
+from oodd_eval.plugins.state import Arrays, take
+
+Floats = NDArray[np.float64]
+
+OBSERVATION: Final = "observation"
+"""Name of what is at fault when all sensors are missing or repeated at once."""
+ACTION: Final = "action"
+"""Name of what is at fault when no usable action came."""
+
+MISSING: Final = 3.0
+"""Unusable readings of a sensor that are no alarm yet."""
+FORGOTTEN: Final = 0.05
+"""What a good reading takes off a count: faults that come and go are counted, too."""
+FAR: Final = 1e6
+"""Training standard deviations beyond which a reading is no measurement but a broken number."""
+CONSTANT: Final = 0.5
+"""Share of an episode that a sensor stands still for, from which on standing still is normal."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamLimits:
+    """What D sensors and A actions do in nominal episodes; arrays of float64.
+
+    Attributes
+    ----------
+    mean, std
+        Of the sensors, (D,).
+    still
+        Longest run of readings that equal the one before, (D,); infinite for sensors that may
+        stand still for as long as they like: contacts, constants.
+    repeated
+        Largest count of whole observations equal to the one before, ().
+    rest
+        Mean action, (A,), in place of an action that never came.
+    """
+
+    mean: Floats
+    std: Floats
+    still: Floats
+    repeated: Floats
+    rest: Floats
+
+    @classmethod
+    def fit(cls, nominal: Iterable[Trajectory]) -> "StreamLimits":
+        """Learn from nominal trajectories."""
+        episodes = list(nominal)
+        scale = FeatureScale.fit(episodes)
+        equal = [x.observations[1:] == x.observations[:-1] for x in episodes]
+        longest = np.stack([_longest_runs(e) for e in equal])
+        lengths = np.array([max(1, len(e)) for e in equal])[:, None]
+        constant = (longest >= CONSTANT * lengths).any(axis=0)
+        moving = np.array(~constant)
+        whole = [_repeats(e, moving) for e in equal]
+        runs = [_longest_runs(e[~w]) for e, w in zip(equal, whole, strict=True)]
+        still = np.where(constant, np.inf, np.max(runs, axis=0))
+        repeated = max(map(_largest_count, whole))
+        rest = np.concatenate([x.actions for x in episodes]).mean(axis=0, dtype=np.float64)
+        return cls(scale.mean, scale.std, still, np.array(repeated), rest)
+
+    def arrays(self) -> Arrays:
+        """Return what `of` reads: finite, with -1 for infinite."""
+        found = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        return {name: np.where(np.isinf(a), -1.0, a) for name, a in found.items()}
+
+    @classmethod
+    def of(cls, arrays: Arrays) -> "StreamLimits":
+        """Return the limits among saved arrays; `FittedStateError` where there are none."""
+        mean = take(arrays, "mean", (None,))
+        still = take(arrays, "still", mean.shape)
+        return cls(
+            mean, take(arrays, "std", mean.shape), np.where(still < 0, np.inf, still),
+            take(arrays, "repeated", ()), take(arrays, "rest", (None,)),
+        )  # fmt: skip
+
+    def faulty(self, trajectory: Trajectory) -> bool:
+        """Tell whether an episode raises an alarm of the stream."""
+        stream = Stream(self)
+        rows = zip(trajectory.observations, [None, *trajectory.actions], strict=True)
+        return any(stream.take(*row) and stream.faults for row in rows)
+
+
+class Stream:
+    """Counts of faults in one episode so far.
+
+    Attributes
+    ----------
+    faults
+        What is beyond its limit: ``"missing"``, ``"frozen"`` or ``"repeated"`` by the number of a
+        sensor, `OBSERVATION` or `ACTION`.
+    suspects
+        Rows since when a sensor does what it never did in nominal episodes, by its number: below
+        the limit, but where it would be found if there is an alarm.
+    """
+
+    def __init__(self, limits: StreamLimits) -> None:
+        self.limits = limits
+        self._moving = np.isfinite(limits.still)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        limits = self.limits
+        self.faults: dict[int | str, str] = {}
+        self.suspects: dict[int, int] = {}
+        self._t = -1
+        self._good = limits.mean.astype(np.float32)
+        self._action = limits.rest.astype(np.float32)
+        # Infinite before the first good reading, which equals no other.
+        self._last = np.full(len(limits.mean), np.inf, np.float32)
+        self._runs, self._missing = np.zeros((2, len(limits.mean)))
+        self._repeated = self._silent = self._idle = 0.0
+        self._since = np.zeros(len(limits.mean), np.int64)
+
+    def take(
+        self, observation: ArrayLike | None, action: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Take the next row; return finite values for a detector: (D,), and (A,) or None."""
+        self._t += 1
+        row = self._read("observation", observation, len(self._good))
+        near = np.abs(row - self.limits.mean) <= FAR * self.limits.std  # False for NaN, too
+        equal = near & (row == self._last)
+        self._good = np.where(near, row, self._good)
+        self._last = np.where(near, row, self._last)
+        silent = len(near) > 1 and not near.any()
+        repeated = bool(_repeats((equal | ~near)[None], self._moving)[0]) and not silent
+        self._silent = _counted(self._silent, silent)
+        self._repeated = _counted(self._repeated, repeated)
+        # What all sensors do at once is no fault of any.
+        if not silent and not repeated:
+            self._runs = np.where(equal, self._runs + 1, np.where(near, 0.0, self._runs))
+        if not silent:
+            fewer = np.maximum(self._missing - FORGOTTEN, 0.0)
+            self._missing = np.where(near, fewer, self._missing + 1)
+        command = self._command(action)
+        self._judge()
+        return self._good, command
+
+    def _command(self, action: ArrayLike | None) -> NDArray[np.float32] | None:
+        if not self._t or not len(self._action):
+            return None
+        found = self._read("action", action, len(self._action))
+        usable = bool(np.isfinite(found).all())
+        self._idle = _counted(self._idle, not usable)
+        self._action = found if usable else self._action
+        return self._action
+
+    def _read(self, what: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
+        """Return values as float32, NaN for what is missing."""
+        if values is None:
+            return np.full(width, np.nan, np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.asarray(values, dtype=np.float64).astype(np.float32)
+        if found.shape != (width,):
+            raise TrajectoryError(
+                f"the watchdog was given an {what} of shape {found.shape}, expected ({width},) as "
+                "in its nominal trajectories: hand over NaN for what is missing, None for all"
+            )
+        return found
+
+    def _judge(self) -> None:
+        """Compare the counts with their limits."""
+        limits = self.limits
+        odd = (self._missing > 0) | (self._runs > limits.still)
+        self._since = np.where(odd, self._since, self._t + 1)
+        whole: dict[int | str, str] = {}
+        if self._silent > MISSING:
+            whole[OBSERVATION] = "missing"
+        elif self._repeated > 2 * limits.repeated + 1:
+            whole[OBSERVATION] = "repeated"
+        if self._idle > MISSING:
+            whole[ACTION] = "missing"
+        self.suspects, self.faults = {}, whole
+        if not odd.any():
+            return
+        self.suspects = {int(d): int(self._since[d]) for d in np.flatnonzero(odd)}
+        lost, frozen = self._missing > MISSING, self._runs > 2 * limits.still + 3
+        sensors: dict[int | str, str] = {int(d): "missing" if lost[d] else "frozen"
+                   for d in np.flatnonzero(lost | frozen)}  # fmt: skip
+        self.faults = {**sensors, **whole}
+
+
+def _repeats(equal: NDArray[np.bool_], moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the rows, (T,), in which all of several moving sensors equal the row before."""
+    several = moving.sum() > 1
+    found: NDArray[np.bool_] = equal[:, moving].all(axis=1) & several
+    return found
+
+
+def _counted(count: float, happened: bool) -> float:
+    return count + 1 if happened else max(count - FORGOTTEN, 0.0)
+
+
+def _longest_runs(equal: NDArray[np.bool_]) -> Floats:
+    """Return the longest run of True in each column, (D,), of an array (T, D)."""
+    total = np.cumsum(equal, axis=0)
+    before = np.maximum.accumulate(np.where(equal, 0, total), axis=0)
+    longest: Floats = (total - before).max(axis=0, initial=0).astype(np.float64)
+    return longest
+
+
+def _largest_count(happened: NDArray[np.bool_]) -> float:
+    count = largest = 0.0
+    for one in happened.tolist():
+        count = _counted(count, one)
+        largest = max(largest, count)
+    return largest

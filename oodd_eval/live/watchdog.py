@@ -1,0 +1,384 @@
+"""A detector with its alarm beside a running robot: one call for each observation."""
+
+import copy
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import FittedStateError, UsageError
+from oodd_eval.live.endless import RunLength
+from oodd_eval.live.made import Made, streaming
+from oodd_eval.live.stream import ACTION, OBSERVATION, Stream, StreamLimits
+from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, quantile_rank
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.plugins.contract import Detector, StorableDetector
+from oodd_eval.plugins.state import load_state, save_state
+
+KIND: Final = "watchdog/1"
+FILE: Final = "watchdog.json"
+DETECTOR: Final = "detector"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What a `Watchdog` says of one row.
+
+    Attributes
+    ----------
+    t
+        The row, counted from 0 at the latest ``reset``.
+    score, statistic, threshold
+        Of the detector, NaN where undefined; what is compared with the threshold.
+    alarm
+        Whether there is an alarm.
+    sensors
+        Share of each sensor in the evidence, by name, the largest first; empty where nothing is
+        known.
+    onset
+        The row with which the anomaly would have begun, as seen now; None where nothing is known.
+    faults
+        Sensors whose readings are no measurements, by name: ``"missing"`` or ``"frozen"``; for all
+        at once ``{"observation": "missing"}`` or ``{"observation": "repeated"}``.
+    """
+
+    t: int
+    score: float
+    statistic: float
+    threshold: float
+    alarm: bool
+    sensors: dict[str, float]
+    onset: int | None
+    faults: dict[str, str]
+
+    def __eq__(self, other: object) -> bool:
+        # Tuples take a NaN, which is always this one, for equal to itself.
+        return isinstance(other, Reading) and astuple(self) == astuple(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def sensor(self) -> str:
+        """The sensor that is named first; empty where none is."""
+        return next(iter(self.sensors), "")
+
+    def __str__(self) -> str:
+        """Return one line: the state, what is at fault, since when."""
+        told = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
+        told += [f"{name} {fault}" for name, fault in self.faults.items()]
+        if self.sensor and self.sensor not in self.faults:
+            told.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
+        if self.onset is not None:
+            told.append(f"since row {self.onset}")
+        return ", ".join(told)
+
+
+class Watchdog:
+    """A fitted detector with a threshold, fed one observation at a time; made by `fit` or `load`.
+
+    An alarm is raised when the statistic of the scores exceeds the threshold, or when the readings
+    of a sensor are no measurements any more. Nothing that a sensor sends is an exception.
+
+    Attributes
+    ----------
+    promise
+        How rare false alarms are, in words.
+    run_length
+        The promised mean time between false alarms with its interval; None with an ``alpha``.
+    raised
+        The reading that raised the present alarm; None without one.
+    """
+
+    def __init__(
+        self, made: Made, rule: GuaranteedAlarm, limits: StreamLimits, sensors: Sequence[str], *,
+        alpha: float, run_length: RunLength | None, latch: bool, hold_off: int,
+    ) -> None:  # fmt: skip
+        self._made, self.rule, self._limits, self.sensors = made, rule, limits, list(sensors)
+        self.alpha, self.run_length = alpha, run_length
+        self.latch, self.hold_off = latch, hold_off
+        self._live = streaming(made.detector)
+        self._explain_last = getattr(self._live, "explain_last", None)
+        self._monitor, self._stream = Monitor(rule), Stream(limits)
+        self.reset()
+
+    @classmethod
+    def fit(
+        cls, detector: str | Detector, train: Sequence[Trajectory],
+        calibration: Sequence[Trajectory], alpha: float = 0.05, *,
+        hours: float | None = None, rate: float | None = None,
+        sensors: Sequence[Any] | None = None, latch: bool = True, hold_off: int = 0,
+        statistic: str | None = None, seed: int = 0, horizon: int = 1,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> Self:  # fmt: skip
+        """Fit a detector on nominal episodes and find its threshold on others.
+
+        Parameters
+        ----------
+        detector
+            Name of an installed detector, or an unfitted one. Without ``update`` it scores the
+            whole episode so far at every row, which a warning says.
+        train, calibration
+            Nominal episodes to fit on, and others, in an order that has nothing to do with what
+            happened, for the threshold.
+        alpha
+            Largest share of nominal episodes with an alarm.
+        hours, rate
+            For operation without end, in place of alpha: mean time between false alarms, and
+            observations in a second.
+        sensors
+            Names, or quantities with names as those of a split; default "sensor 0" and so on.
+        latch
+            Whether an alarm stays until `acknowledge`, and not only as long as its cause.
+        hold_off
+            Rows after the end of an alarm in which no new one is raised.
+        statistic
+            ``"cusum"`` or ``"score"``: see `GuaranteedAlarm`. Default what a named detector
+            declares, else the CUSUM.
+        seed, horizon, parameters
+            For the factory of a named detector.
+
+        Returns
+        -------
+        Watchdog
+
+        Raises
+        ------
+        UsageError
+            When the calibration episodes are too few for the promise, or an argument is wrong.
+        """
+        made = Made.make(detector, statistic, seed, horizon, parameters or {})
+        training, others = list(train), list(calibration)
+        if hours is not None and not (hours > 0 and rate is not None and rate > 0):
+            raise UsageError(
+                f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
+                "in hours and in observations per second, above 0"
+            )
+        if hours is None:
+            _must_suffice(len(others), alpha, halves=made.alarm == "cusum")
+        names = [str(getattr(s, "name", s)) for s in sensors or ()]
+        width = training[0].observation_dim if training else 0
+        if sensors is not None and (len(names) != width or len({*names}) != width):
+            raise UsageError(f"{len(names)} names of sensors {names}, expected {width}, all unlike")
+        made.detector.fit([made.shown(x) for x in training])
+        # Without a guarantee to keep exact, the limits may know what the threshold is from.
+        limits = StreamLimits.fit(training if hours is None else training + others)
+        scores = [np.asarray(made.detector.score(made.shown(x)), np.float64) for x in others]
+        run_length = None
+        if hours is None:
+            faulty = [limits.faulty(x) for x in others]
+            # An episode with a fault alarms at any threshold. Those that standardize stay.
+            scores = [np.array([np.inf]) if f and (made.alarm == "score" or i % 2) else s
+                      for i, (f, s) in enumerate(zip(faulty, scores, strict=True))]  # fmt: skip
+            rule = GuaranteedAlarm.fit(scores, alpha, made.alarm)
+        else:
+            unbounded = GuaranteedAlarm(
+                Standardization.fit(scores) if made.alarm == "cusum" else None, math.inf
+            )
+            # One after the other: what a sum has reached at the end of one goes on in the next.
+            joined = unbounded.statistic(np.concatenate(scores))
+            ends = np.cumsum([len(s) for s in scores])
+            largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
+            threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate or 0))
+            rule = replace(unbounded, threshold=threshold)
+        return cls(
+            made, rule, limits, names or [f"sensor {d}" for d in range(width)], alpha=alpha,
+            run_length=run_length, latch=latch, hold_off=hold_off,
+        )  # fmt: skip
+
+    @property
+    def promise(self) -> str:
+        """How rare false alarms are, in words."""
+        if (r := self.run_length) is None:
+            return f"at most {self.alpha:.3g} of nominal episodes raise an alarm"
+        interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
+        beyond = "" if r.hours <= r.observed else ", by the shape of the tail"
+        return (
+            f"a false alarm every {r.hours:g} h on average ({interval}, from {r.observed:.3g} h of "
+            f"nominal operation{beyond})"
+        )
+
+    def reset(self) -> None:
+        """Begin a new episode, without an alarm."""
+        self._live.reset()
+        self._monitor.reset()
+        self._stream.reset()
+        self._t = -1
+        self._causes: frozenset[str] = frozenset()
+        self._known = self._causes
+        self._held = 0
+        self.raised: Reading | None = None
+
+    def acknowledge(self) -> None:
+        """Take note of the alarm: it ends, and what caused it raises no other until it was gone.
+
+        A sum of scores starts again.
+        """
+        self.raised = None
+        self._known, self._held = self._causes, self.hold_off
+        if self.rule.standardization is not None:
+            self._monitor.reset()
+
+    def update(
+        self, observation: ArrayLike | Mapping[str, float] | None, action: ArrayLike | None = None
+    ) -> Reading:
+        """Judge the next row.
+
+        Parameters
+        ----------
+        observation : array of shape (D,), mapping or None
+            The newest readings, or readings by sensor. NaN, infinite or absent: no reading came
+            from that sensor in time; None: from none.
+        action : array of shape (A,), optional
+            Commanded since the row before; None at the first row.
+
+        Returns
+        -------
+        Reading
+
+        Raises
+        ------
+        TrajectoryError
+            For an array of another length, which is a mistake of the caller and no fault.
+        """
+        self._t += 1
+        if isinstance(observation, Mapping):
+            observation = [observation.get(name, math.nan) for name in self.sensors]
+        row, command = self._stream.take(observation, action)
+        score = float(self._live.update(row, command if self._made.actions else None))
+        above = self._monitor.update(score)
+        faults = {str(d): fault for d, fault in self._stream.faults.items()
+                  if d != ACTION or self._made.actions}  # fmt: skip
+        self._causes = frozenset(faults) | ({"statistic"} if above else set())
+        self._known &= self._causes
+        new = bool(self._causes - self._known) and not self._held
+        self._held = max(0, self._held - 1)
+        if self.raised and not self.latch and not new:
+            self.raised, self._held = None, self.hold_off
+        sensors, onset = self._blamed()
+        reading = Reading(
+            self._t, math.nan if math.isnan(score) else score, self._monitor.statistic,
+            self.rule.threshold, bool(new or self.raised), sensors, onset,
+            {self._name(d): fault for d, fault in self._stream.faults.items() if str(d) in faults},
+        )  # fmt: skip
+        if new and not self.raised:
+            self.raised = reading
+        return reading
+
+    def _blamed(self) -> tuple[dict[str, float], int | None]:
+        """Return shares by sensor and the onset: from faults where there are any."""
+        if suspects := self._stream.suspects:
+            # Those beyond their limit before those that are only odd.
+            first = [d for d in suspects if d in self._stream.faults] or list(suspects)
+            return {self._name(d): 1 / len(first) for d in first}, min(suspects.values())
+        if OBSERVATION in self._stream.faults or self._explain_last is None:
+            return {}, None
+        shares, onset = self._explain_last()
+        if onset < 0:
+            return {}, None
+        order = np.argsort(-shares, kind="stable").tolist()
+        return {self.sensors[d]: float(shares[d]) for d in order}, int(onset)
+
+    def _name(self, number: int | str) -> str:
+        return number if isinstance(number, str) else self.sensors[number]
+
+    def copy(self) -> Self:
+        """Return another watchdog with the same fit, for another robot, at the beginning."""
+        other = copy.deepcopy(self)
+        other.reset()
+        return other
+
+    def save(self, directory: str | Path) -> None:
+        """Write everything into a new or empty directory, as JSON and plain arrays.
+
+        Parameters
+        ----------
+        directory
+            Where to; the detector's own files go into a directory ``detector`` in it.
+
+        Raises
+        ------
+        UsageError
+            When the detector cannot be saved, or the directory is not empty.
+        """
+        place = Path(directory)
+        if not isinstance(self._made.detector, StorableDetector):
+            what = f"{type(self._made.detector).__name__} has no save and load"
+            raise UsageError(f"{what}: fit the watchdog anew where it is needed")
+        if place.exists() and any(place.iterdir()):
+            raise UsageError(f"{str(place)!r} is not empty: save into a new directory")
+        (place / DETECTOR).mkdir(parents=True)
+        self._made.detector.save(place / DETECTOR)
+        save_state(place, kind=KIND, settings={}, arrays=self._limits.arrays())
+        nominal = self.rule.standardization
+        told = {
+            "made": self._made.told(), "sensors": self.sensors, "alpha": self.alpha,
+            "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
+            "standardization": nominal and [nominal.mean, nominal.std],
+            "run_length": self.run_length and list(astuple(self.run_length)),
+            "latch": self.latch, "hold_off": self.hold_off,
+        }  # fmt: skip
+        (place / FILE).write_text(json.dumps(told, indent=1), encoding="utf-8")
+
+    @classmethod
+    def load(cls, directory: str | Path, detector: Detector | None = None) -> Self:
+        """Return the watchdog that `save` wrote.
+
+        Parameters
+        ----------
+        directory
+            Where it was saved.
+        detector
+            An instance with the parameters of the saved one, where that had no name.
+
+        Returns
+        -------
+        Watchdog
+
+        Raises
+        ------
+        FittedStateError
+            When the files are missing or damaged.
+        """
+        place = Path(directory)
+        limits = StreamLimits.of(load_state(place, kind=KIND, settings={}))
+        try:
+            told = json.loads((place / FILE).read_text(encoding="utf-8"))
+            made = Made.of(told["made"], detector)
+            nominal, threshold = told["standardization"], told["threshold"]
+            rule = GuaranteedAlarm(
+                None if nominal is None else Standardization(*map(float, nominal)),
+                math.inf if threshold is None else float(threshold),
+            )
+            length = told["run_length"]
+            run_length = None if length is None else RunLength(*map(float, length))
+            names = [str(name) for name in told["sensors"]]
+            rest = {"alpha": float(told["alpha"]), "latch": bool(told["latch"]),
+                    "hold_off": int(told["hold_off"])}  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            what = f"{str(place / FILE)!r} cannot be read as a saved watchdog"
+            raise FittedStateError(f"{what}: {type(error).__name__}: {error}") from None
+        if not isinstance(made.detector, StorableDetector) or len(names) != len(limits.mean):
+            raise FittedStateError(f"{str(place)!r} does not fit {type(made.detector).__name__}")
+        made.detector.load(place / DETECTOR)
+        return cls(made, rule, limits, names, run_length=run_length, **rest)  # type: ignore[arg-type]
+
+
+def _must_suffice(episodes: int, alpha: float, *, halves: bool) -> None:
+    """Raise `UsageError` unless so many calibration episodes can promise alpha."""
+    if not 0 < alpha < 1:
+        raise UsageError(f"alpha={alpha!r}, expected a share of episodes between 0 and 1")
+    n = episodes // 2 if halves else episodes
+    if quantile_rank(n, alpha) > n:
+        least = math.ceil(1 / alpha - 1e-9) - 1
+        raise UsageError(
+            f"alpha={alpha!r} takes {2 * least if halves else least} calibration episodes, got "
+            f"{episodes}: record more, or promise less"
+        )
