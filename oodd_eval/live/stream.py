@@ -125,6 +125,7 @@ class Stream:
         self._last = np.full(len(limits.mean), np.inf, np.float32)
         self._runs, self._missing = np.zeros((2, len(limits.mean)))
         self._repeated = self._silent = self._idle = 0.0
+        self._quiet = True
         self._since = np.zeros(len(limits.mean), np.int64)
 
     def take(
@@ -134,11 +135,15 @@ class Stream:
         self._t += 1
         row = self._read("observation", observation, len(self._good))
         near = np.abs(row - self.limits.mean) <= FAR * self.limits.std  # False for NaN, too
-        equal = near & (row == self._last)
+        equal = near & self._moving & (row == self._last)
+        command = self._command(action)
+        if self._quiet and near.all() and not equal.any():
+            self._good = self._last = row
+            return row, command
         self._good = np.where(near, row, self._good)
         self._last = np.where(near, row, self._last)
         silent = len(near) > 1 and not near.any()
-        repeated = bool(_repeats((equal | ~near)[None], self._moving)[0]) and not silent
+        repeated = not silent and bool(_repeats((equal | ~near)[None], self._moving)[0])
         self._silent = _counted(self._silent, silent)
         self._repeated = _counted(self._repeated, repeated)
         # What all sensors do at once is no fault of any.
@@ -147,7 +152,6 @@ class Stream:
         if not silent:
             fewer = np.maximum(self._missing - FORGOTTEN, 0.0)
             self._missing = np.where(near, fewer, self._missing + 1)
-        command = self._command(action)
         self._judge()
         return self._good, command
 
@@ -157,6 +161,7 @@ class Stream:
         found = self._read("action", action, len(self._action))
         usable = bool(np.isfinite(found).all())
         self._idle = _counted(self._idle, not usable)
+        self._quiet = self._quiet and not self._idle
         self._action = found if usable else self._action
         return self._action
 
@@ -176,6 +181,8 @@ class Stream:
     def _judge(self) -> None:
         """Compare the counts with their limits."""
         limits = self.limits
+        counts = self._repeated, self._silent, self._idle, *self._runs, *self._missing
+        self._quiet = not any(counts)
         odd = (self._missing > 0) | (self._runs > limits.still)
         self._since = np.where(odd, self._since, self._t + 1)
         whole: dict[int | str, str] = {}

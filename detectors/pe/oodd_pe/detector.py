@@ -146,9 +146,10 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             actions[0, : len(commands)] = commands
         known = _Known(window[None], actions, np.array([t - self.lag]))
         evidence = self._judged(known, now[None], self._rows[1][None], explain=True)
-        shares, onsets = self._attribution(evidence)
+        columns = self.charts_.columns(evidence)
+        shares, onsets = self._attribution(evidence, columns)
         self._last = shares[0], int(onsets[0])
-        return float(self.charts_.statistic(self._running(evidence)).max())
+        return float(self.charts_.statistic(self._running(evidence, columns)).max())
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         usable = [x for x in nominal if x.transitions >= self.horizon]
@@ -245,7 +246,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         now, before = x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
         return self._judged(self._known(x), now, before, explain=explain)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def _judged(
         self,
         known: _Known,

@@ -168,9 +168,12 @@ class Running:
         self._charts = charts
         self._smoother = Smoother(charts.memories, len(charts.centre_) + 1) if accumulate else None
 
-    def __call__(self, evidence: Evidence) -> Floats:
-        """Return the columns of the next N steps, and their sums: (W, N, C)."""
-        columns = self._charts.columns(evidence)
+    def __call__(self, evidence: Evidence, columns: Floats | None = None) -> Floats:
+        """Return the columns of the next N steps, and their sums: (W, N, C).
+
+        `columns` are those of the evidence where they are known already.
+        """
+        columns = self._charts.columns(evidence) if columns is None else columns
         if self._smoother is None:
             return columns[None]
         # A robot that stands still repeats one error: a hundred such steps are not a hundred
@@ -192,11 +195,17 @@ class Attribution:
         self._sum, self._onset = 0.0, first
         self._weighted: Floats = np.zeros(0)
 
-    def __call__(self, evidence: Evidence) -> tuple[Floats, NDArray[np.int64]]:
-        """Return shares, (N, sensors), and onsets, (N,), of the next N steps."""
+    def __call__(
+        self, evidence: Evidence, columns: Floats | None = None
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """Return shares, (N, sensors), and onsets, (N,), of the next N steps.
+
+        `columns` are those of the evidence where they are known already.
+        """
+        columns = self._charts.columns(evidence) if columns is None else columns
         parts = np.maximum(evidence.of_sensors, CONSTANT)
         parts = parts / parts.sum(axis=1, keepdims=True)
-        excess = self._charts.columns(evidence)[:, -1]
+        excess = columns[:, -1]
         shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
         for n, (part, more) in enumerate(zip(parts, excess, strict=True)):
             if self._sum <= 0:
