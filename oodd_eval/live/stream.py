@@ -32,6 +32,8 @@ FAR: Final = 1e6
 CONSTANT: Final = 0.5
 """Share of an episode that a sensor stands still for, from which on standing still is normal."""
 
+NEVER: Final = np.iinfo(np.int64).max
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamLimits:
@@ -126,7 +128,7 @@ class Stream:
         self._runs, self._missing = np.zeros((2, len(limits.mean)))
         self._repeated = self._silent = self._idle = 0.0
         self._quiet = True
-        self._since = np.zeros(len(limits.mean), np.int64)
+        self._since = np.full(len(limits.mean), NEVER)
 
     def take(
         self, observation: ArrayLike | None, action: ArrayLike | None = None
@@ -184,7 +186,7 @@ class Stream:
         counts = self._repeated, self._silent, self._idle, *self._runs, *self._missing
         self._quiet = not any(counts)
         odd = (self._missing > 0) | (self._runs > limits.still)
-        self._since = np.where(odd, self._since, self._t + 1)
+        self._since = np.where(odd, np.minimum(self._since, self._t), NEVER)
         whole: dict[int | str, str] = {}
         if self._silent > MISSING:
             whole[OBSERVATION] = "missing"

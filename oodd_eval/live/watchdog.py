@@ -362,6 +362,8 @@ class Watchdog:
             names = [str(name) for name in told["sensors"]]
             rest = {"alpha": float(told["alpha"]), "latch": bool(told["latch"]),
                     "hold_off": int(told["hold_off"])}  # fmt: skip
+        except UsageError:
+            raise
         except (OSError, ValueError, KeyError, TypeError) as error:
             what = f"{str(place / FILE)!r} cannot be read as a saved watchdog"
             raise FittedStateError(f"{what}: {type(error).__name__}: {error}") from None

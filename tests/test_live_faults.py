@@ -1,0 +1,137 @@
+"""Faults in the stream of a robot's sensors: no exception, an alarm soon, the right name."""
+
+import numpy as np
+import pytest
+from helpers_live import FAULTS, SENSOR_FAULTS, first_alarm, rows_of, walk, with_fault
+
+from oodd_eval import Trajectory, load_split
+from oodd_eval.live import Watchdog
+from oodd_eval.live.stream import Stream, StreamLimits
+
+TRAIN = [walk(seed, contact=True) for seed in range(20)]
+
+
+@pytest.fixture
+def stream():
+    return Stream(StreamLimits.fit(TRAIN))
+
+
+def taken(stream, *observations):
+    return [stream.take(o, [0.0])[0] for o in observations]
+
+
+def row(i, *broken, value=np.nan):
+    o = np.array([i, i, 0.0]) * 0.01 + [0.1, 0.2, 0.0]
+    o[list(broken)] = value
+    return o
+
+
+def test_limits_are_what_sensors_do_in_nominal_episodes(stream):
+    limits = stream.limits
+    assert np.isinf(limits.still[2])
+    assert limits.still[:2].tolist() == [0, 0]
+    again = StreamLimits.of(limits.arrays())
+    for name in ("mean", "std", "still", "repeated", "rest"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(limits, name))
+
+
+def test_runs_are_counted_as_they_are_long():
+    o = np.arange(40.0).reshape(20, 2)
+    o[5:9, 0] = 3.0
+    limits = StreamLimits.fit([Trajectory(o)])
+    assert limits.still.tolist() == [3, 0]
+    o[10:13] = o[9]
+    assert StreamLimits.fit([Trajectory(o)]).repeated == 3.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e300])
+def test_what_is_no_measurement_is_the_last_good_one_for_the_detector(stream, value):
+    first, *rest = taken(stream, row(0), *[row(i, 1, value=value) for i in range(1, 5)])
+    assert all(o[1] == first[1] for o in rest)
+    assert rest[-1][0] == np.float32(0.14)
+    assert stream.faults == {1: "missing"}
+    assert stream.suspects == {1: 1}
+
+
+def test_before_the_first_good_reading_it_is_the_mean(stream):
+    (found,) = taken(stream, None)
+    np.testing.assert_allclose(found, stream.limits.mean, rtol=1e-6)
+
+
+def test_one_missing_reading_is_suspect_and_no_fault_and_soon_forgotten(stream):
+    taken(stream, row(0), row(1, 0))
+    assert stream.suspects == {0: 1}
+    assert stream.faults == {}
+    taken(stream, *map(row, range(2, 30)))
+    assert stream.suspects == {}
+
+
+def test_a_frozen_sensor_is_a_fault_and_a_contact_is_none(stream):
+    taken(stream, *[row(i, 0, value=0.5) for i in range(9)])
+    assert stream.faults == {0: "frozen"}
+
+
+def test_what_all_sensors_do_is_a_fault_of_none(stream):
+    taken(stream, *[row(0)] * 6)
+    assert (stream.faults, stream.suspects) == ({"observation": "repeated"}, {})
+    stream.reset()
+    taken(stream, row(0), *[None] * 6)
+    assert (stream.faults, stream.suspects) == ({"observation": "missing"}, {})
+
+
+def test_an_action_that_does_not_come_is_the_last_one_and_a_fault(stream):
+    assert stream.take(row(0))[1] is None
+    assert stream.take(row(1), [0.7])[1] == np.float32(0.7)
+    for i in range(2, 7):
+        assert stream.take(row(i), None if i % 2 else [np.nan])[1] == np.float32(0.7)
+    assert stream.faults == {"action": "missing"}
+
+
+def test_a_single_sensor_is_its_own_fault():
+    stream = Stream(StreamLimits.fit([Trajectory(np.arange(50.0)[:, None])]))
+    taken(stream, [1.0], *[[np.nan]] * 5)
+    assert stream.faults == {0: "missing"}
+
+
+def test_readings_come_by_name_too():
+    watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1, sensors=["x", "y", "contact"])
+    for i in range(6):
+        reading = watchdog.update({"x": 0.01 * i, "contact": 0.0}, [0.0])
+    assert reading.faults == {"y": "missing"}
+    assert reading.sensors == {"y": 1.0}
+    assert str(reading) == "row 5: alarm, y missing, since row 0"
+    # An acknowledged fault stays silent while it lasts; another one does not.
+    watchdog.acknowledge()
+    assert not watchdog.update({"x": 0.07, "contact": 0.0}, [0.0]).alarm
+    readings = [watchdog.update({"contact": 0.0, "x": np.nan}, [0.0]) for _ in range(4)]
+    assert readings[-1].alarm
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    data = load_split("mini").environment("cartpole")
+    watchdog = Watchdog.fit(
+        "pe-a", data.train, data.calibration, sensors=data.sensors,
+        parameters={"updates": 300, "width": 32},
+    )  # fmt: skip
+    return watchdog, list(data.twins)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_fault_raises_an_alarm_within_20_rows_with_its_sensor_first(cartpole, kind):
+    watchdog, episodes = cartpole
+    rng, found, named = np.random.default_rng(1), [], []
+    for x in episodes:
+        at = int(rng.integers(30, len(x) - 25))
+        rows, sensors = with_fault(kind, x, at, range(4), rng)
+        reading = first_alarm(watchdog, rows[: at + 20])
+        found.append(reading is not None and reading.t >= at)
+        if reading and kind in SENSOR_FAULTS:
+            named.append(reading.sensor in {watchdog.sensors[d] for d in sensors})
+    assert np.mean(found) >= 0.9
+    assert np.mean(named or [1]) >= 0.9
+
+
+def test_the_same_episodes_without_a_fault_are_quiet(cartpole):
+    watchdog, episodes = cartpole
+    assert sum(first_alarm(watchdog, rows_of(x)) is not None for x in episodes) <= 1
