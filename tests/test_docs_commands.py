@@ -70,6 +70,10 @@ KNOWN = dict(
                 Rule(r"--horizon 1,10 --seed 0,1", "two fits show what four do", "--seed 0,1"),
             ),
         ),
+        page(
+            "docs/how-to/live.md",
+            rules=(Rule(r"(\w+_\w+\.py)", "fits in no time", r"\1 --detector mewma"),),
+        ),
         page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
         page(
             "docs/submitting.md",

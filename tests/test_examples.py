@@ -4,8 +4,11 @@ import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from PIL import Image
+
+from oodd_eval import load_split
+from oodd_eval.live import Watchdog
 
 pytest.importorskip("gymnasium", reason="needs the extra sim")
 EXAMPLE = Path(__file__).parents[1] / "examples" / "live_alarm.py"
@@ -16,14 +19,46 @@ def example():
     return SimpleNamespace(**runpy.run_path(str(EXAMPLE), run_name="live_alarm"))
 
 
-def test_a_live_loop_raises_an_alarm_after_the_onset_only(example, tmp_path, capsys):
-    pytest.importorskip("matplotlib", reason="needs the extra plots")
-    plot = tmp_path / "alarm.png"
-    options = ["--detector", "mewma", "--fit", str(tmp_path / "fit")]
-    nominal, anomalous = example.main([*options, "--plot", str(plot)])
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A watchdog as the example keeps one, of a small ensemble."""
+    data, place = (
+        load_split("mini").environment("cartpole"),
+        tmp_path_factory.mktemp("kept") / "fit",
+    )
+    small = {"updates": 200, "width": 32}
+    Watchdog.fit(
+        "pe-a", data.train, data.calibration, 0.1, sensors=data.sensors, parameters=small
+    ).save(place)
+    return str(place)
+
+
+def test_a_live_loop_raises_an_alarm_after_the_onset_only(example, kept, capsys):
+    nominal, anomalous = example.main(["--fit", kept, "--monitor"])
     assert nominal.alarms == []
-    assert min(anomalous.alarms) > 150
-    assert "steps after the onset" in capsys.readouterr().out
+    assert 150 <= min(anomalous.alarms) < 170
+    told = capsys.readouterr().out
+    assert "steps after the onset; " in told
+    assert anomalous.readings[-1].alarm
+    # The kept watchdog gives the same readings again.
+    assert example.main(["--fit", kept])[1].readings == anomalous.readings
+
+
+def test_the_robot_is_drawn_and_filmed_with_its_scores_and_sensors(
+    example, kept, tmp_path, monkeypatch
+):
+    pytest.importorskip("matplotlib", reason="needs the extra plots")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    plot, film = tmp_path / "alarm.png", tmp_path / "alarm.gif"
+    short = ["--steps", "40", "--onset", "20"]
+    _, seen = example.main(["--fit", kept, *short, "--plot", str(plot), "--gif", str(film)])
+    assert len(seen.frames) == len(seen.readings)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    # The kept fit gives the same scores as the first one.
-    assert np.array_equal(example.main(options)[1].scores, anomalous.scores, equal_nan=True)
+    with Image.open(film) as frames:
+        assert frames.n_frames > 5
+
+
+def test_what_was_fitted_is_kept(example, tmp_path):
+    one = example.prepare("mewma", 0.1, tmp_path / "fit")
+    other = example.prepare("any", 0.5, tmp_path / "fit")
+    assert (other.rule, other.sensors) == (one.rule, one.sensors)

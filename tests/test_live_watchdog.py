@@ -83,7 +83,9 @@ def test_fresh_nominal_episodes_stay_within_alpha():
         calibration = [walk(seed) for seed in range(1000 * draw, 1000 * draw + 40)]
         watchdog = Watchdog.fit("mewma-a", TRAIN, calibration, 0.1)
         fresh = [walk(seed) for seed in range(20_000 + 30 * draw, 20_030 + 30 * draw)]
-        alarms += [first_alarm(watchdog, rows_of(x)) is not None for x in fresh]
+        scores = map(watchdog._made.detector.score, fresh)
+        alarms += [watchdog.rule.first(s) is not None for s in scores]
+        assert sum(map(watchdog._limits.faulty, fresh)) == 0
     assert 0.03 < np.mean(alarms) < 0.15
 
 

@@ -15,10 +15,10 @@ from oodd_eval.plugins.contract import (
     Detector,
     ExplainingDetector,
     StreamingDetector,
-    StreamingExplainer,
     make_detector,
 )
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.explanations import StreamingExplainer
 
 Row = NDArray[np.float32]
 

@@ -70,7 +70,7 @@ class Detector(Protocol):
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
     - ``save(directory)`` and ``load(directory)``: see `StorableDetector`;
     - ``explain(trajectory)``: see `ExplainingDetector`;
-    - ``explain_last()``: see `StreamingExplainer`.
+    - ``explain_last()``: see `oodd_eval.plugins.explanations.StreamingExplainer`.
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
@@ -181,22 +181,6 @@ class ExplainingDetector(Detector, Protocol):
 
         It is asked of fitted detectors, for episodes that they may not have scored. The one sensor
         with the largest share at a row is named for it.
-        """
-
-
-@runtime_checkable
-class StreamingExplainer(StreamingDetector, Protocol):
-    """A detector that tells beside a robot, too, which sensors its scores are from."""
-
-    def explain_last(self) -> tuple[NDArray[np.float64], int]:
-        """Return what the score of the latest `update` is due to: that row of ``explain``.
-
-        Returns
-        -------
-        shares : float64 array of shape (D,)
-            Share of each sensor, with the sum 1; NaN where the score is undefined.
-        onset : int
-            The row since the latest ``reset`` with which an anomaly would have begun, or -1.
         """
 
 

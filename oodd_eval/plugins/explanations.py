@@ -1,20 +1,42 @@
 """Explanations: the checks that they honour the contract, and what the harness keeps of them."""
 
 from collections.abc import Sequence
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import TOLERANCE, ExplainingDetector, Explanation, Scores
+from oodd_eval.plugins.contract import (
+    TOLERANCE,
+    ExplainingDetector,
+    Explanation,
+    Scores,
+    StreamingDetector,
+)
 
 Named: TypeAlias = NDArray[np.int32]
 """What is kept of an explanation, shape (2, T + 1): sensors named first and onsets, or -1."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
+
+
+@runtime_checkable
+class StreamingExplainer(StreamingDetector, Protocol):
+    """A detector that tells beside a robot, too, which sensors its scores are from."""
+
+    def explain_last(self) -> tuple[NDArray[np.float64], int]:
+        """Return what the score of the latest `update` is due to: that row of ``explain``.
+
+        Returns
+        -------
+        shares : float64 array of shape (D,)
+            Share of each sensor, with the sum 1; NaN where the score is undefined.
+        onset : int
+            The row since the latest ``reset`` with which an anomaly would have begun, or -1.
+        """
 
 
 def explains(detector: object) -> bool:
