@@ -2,15 +2,19 @@
 
 from typing import Any, Final
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Discrete
-from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import MissingExtraError, UsageError
 from oodd_eval.live.watchdog import Watchdog
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Discrete
+    from gymnasium.utils import RecordConstructorArgs
+    from gymnasium.vector import AutoresetMode
+except ImportError as error:
+    raise MissingExtraError(f"wrappers need {error.name}: pip install 'oodd-eval[sim]'") from error
 
 KEY: Final = "oodd"
 """Where a reading stands in the info of a step."""
