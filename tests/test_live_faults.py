@@ -31,7 +31,7 @@ def test_limits_are_what_sensors_do_in_nominal_episodes(stream):
     assert np.isinf(limits.still[2])
     assert limits.still[:2].tolist() == [0, 0]
     again = StreamLimits.of(limits.arrays())
-    for name in ("mean", "std", "still", "repeated", "rest"):
+    for name in ("mean", "std", "low", "high", "still", "repeated", "rest"):
         np.testing.assert_array_equal(getattr(again, name), getattr(limits, name))
 
 
@@ -69,6 +69,14 @@ def test_one_missing_reading_is_suspect_and_no_fault_and_soon_forgotten(stream):
 def test_a_frozen_sensor_is_a_fault_and_a_contact_is_none(stream):
     taken(stream, *[row(i, 0, value=0.5) for i in range(9)])
     assert stream.faults == {0: "frozen"}
+
+
+def test_readings_beyond_those_of_training_are_a_fault_after_a_few(stream):
+    far = stream.limits.high[0] + 0.1
+    found = taken(stream, row(0), *[row(i, 0, value=far + 0.01 * i) for i in range(1, 5)])
+    assert stream.faults == {0: "out of range"}
+    # They are measurements, though, and the detector sees them.
+    assert found[-1][0] == np.float32(far + 0.04)
 
 
 def test_what_all_sensors_do_is_a_fault_of_none(stream):

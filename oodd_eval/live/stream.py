@@ -29,6 +29,8 @@ FORGOTTEN: Final = 0.05
 """What a good reading takes off a count: faults that come and go are counted, too."""
 FAR: Final = 1e6
 """Training standard deviations beyond which a reading is no measurement but a broken number."""
+MARGIN: Final = 0.25
+"""Share of its range in training by which a reading may leave it."""
 CONSTANT: Final = 0.5
 """Share of an episode that a sensor stands still for, from which on standing still is normal."""
 
@@ -43,6 +45,8 @@ class StreamLimits:
     ----------
     mean, std
         Of the sensors, (D,).
+    low, high
+        Of the range of readings with a margin, (D,); infinite for constants.
     still
         Longest run of readings that equal the one before, (D,); infinite for sensors that may
         stand still for as long as they like: contacts, constants.
@@ -54,6 +58,8 @@ class StreamLimits:
 
     mean: Floats
     std: Floats
+    low: Floats
+    high: Floats
     still: Floats
     repeated: Floats
     rest: Floats
@@ -73,22 +79,26 @@ class StreamLimits:
         still = np.where(constant, np.inf, np.max(runs, axis=0))
         repeated = max(map(_largest_count, whole))
         rest = np.concatenate([x.actions for x in episodes]).mean(axis=0, dtype=np.float64)
-        return cls(scale.mean, scale.std, still, np.array(repeated), rest)
+        low = np.min([x.observations.min(axis=0) for x in episodes], axis=0).astype(np.float64)
+        high = np.max([x.observations.max(axis=0) for x in episodes], axis=0)
+        margin = np.where(high > low, MARGIN * (high - low), np.inf)
+        return cls(
+            scale.mean, scale.std, low - margin, high + margin, still, np.array(repeated), rest
+        )
 
     def arrays(self) -> Arrays:
-        """Return what `of` reads: finite, with -1 for infinite."""
+        """Return what `of` reads, which is finite."""
         found = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        return {name: np.where(np.isinf(a), -1.0, a) for name, a in found.items()}
+        return {name: np.nan_to_num(a) for name, a in found.items()}
 
     @classmethod
     def of(cls, arrays: Arrays) -> "StreamLimits":
         """Return the limits among saved arrays; `FittedStateError` where there are none."""
         mean = take(arrays, "mean", (None,))
-        still = take(arrays, "still", mean.shape)
-        return cls(
-            mean, take(arrays, "std", mean.shape), np.where(still < 0, np.inf, still),
-            take(arrays, "repeated", ()), take(arrays, "rest", (None,)),
-        )  # fmt: skip
+        vectors = [take(arrays, name, mean.shape) for name in ("std", "low", "high", "still")]
+        largest = np.finfo(np.float64).max  # what an infinity was written as
+        endless = [np.where(np.abs(v) == largest, np.copysign(np.inf, v), v) for v in vectors]
+        return cls(mean, *endless, take(arrays, "repeated", ()), take(arrays, "rest", (None,)))
 
     def faulty(self, trajectory: Trajectory) -> bool:
         """Tell whether an episode raises an alarm of the stream."""
@@ -103,8 +113,8 @@ class Stream:
     Attributes
     ----------
     faults
-        What is beyond its limit: ``"missing"``, ``"frozen"`` or ``"repeated"`` by the number of a
-        sensor, `OBSERVATION` or `ACTION`.
+        What is beyond its limit: ``"missing"``, ``"frozen"``, ``"out of range"`` or ``"repeated"``
+        by the number of a sensor, `OBSERVATION` or `ACTION`.
     suspects
         Rows since when a sensor does what it never did in nominal episodes, by its number: below
         the limit, but where it would be found if there is an alarm.
@@ -125,7 +135,7 @@ class Stream:
         self._action = limits.rest.astype(np.float32)
         # Infinite before the first good reading, which equals no other.
         self._last = np.full(len(limits.mean), np.inf, np.float32)
-        self._runs, self._missing = np.zeros((2, len(limits.mean)))
+        self._runs, self._missing, self._beyond = np.zeros((3, len(limits.mean)))
         self._repeated = self._silent = self._idle = 0.0
         self._quiet = True
         self._since = np.full(len(limits.mean), NEVER)
@@ -139,9 +149,11 @@ class Stream:
         near = np.abs(row - self.limits.mean) <= FAR * self.limits.std  # False for NaN, too
         equal = near & self._moving & (row == self._last)
         command = self._command(action)
-        if self._quiet and near.all() and not equal.any():
+        beyond = near & ((row < self.limits.low) | (row > self.limits.high))
+        if self._quiet and near.all() and not (equal | beyond).any():
             self._good = self._last = row
             return row, command
+        self._beyond = np.where(beyond, self._beyond + 1, np.maximum(self._beyond - FORGOTTEN, 0))
         self._good = np.where(near, row, self._good)
         self._last = np.where(near, row, self._last)
         silent = len(near) > 1 and not near.any()
@@ -183,9 +195,17 @@ class Stream:
     def _judge(self) -> None:
         """Compare the counts with their limits."""
         limits = self.limits
-        counts = self._repeated, self._silent, self._idle, *self._runs, *self._missing
+        counts = (
+            self._repeated,
+            self._silent,
+            self._idle,
+            *self._runs,
+            *self._missing,
+            *self._beyond,
+        )
         self._quiet = not any(counts)
-        odd = (self._missing > 0) | (self._runs > limits.still)
+        wild = self._beyond > MISSING
+        odd = (self._missing > 0) | (self._runs > limits.still) | wild
         self._since = np.where(odd, np.minimum(self._since, self._t), NEVER)
         whole: dict[int | str, str] = {}
         if self._silent > MISSING:
@@ -199,8 +219,10 @@ class Stream:
             return
         self.suspects = {int(d): int(self._since[d]) for d in np.flatnonzero(odd)}
         lost, frozen = self._missing > MISSING, self._runs > 2 * limits.still + 3
-        sensors: dict[int | str, str] = {int(d): "missing" if lost[d] else "frozen"
-                   for d in np.flatnonzero(lost | frozen)}  # fmt: skip
+        sensors: dict[int | str, str] = {
+            int(d): "missing" if lost[d] else "frozen" if frozen[d] else "out of range"
+            for d in np.flatnonzero(lost | frozen | wild)
+        }
         self.faults = {**sensors, **whole}
 
 

@@ -46,8 +46,8 @@ class Reading:
     onset
         The row with which the anomaly would have begun, as seen now; None where nothing is known.
     faults
-        Sensors whose readings are no measurements, by name: ``"missing"`` or ``"frozen"``; for all
-        at once ``{"observation": "missing"}`` or ``{"observation": "repeated"}``.
+        Sensors with a fault, by name: ``"missing"``, ``"frozen"`` or ``"out of range"``; for all at
+        once ``{"observation": "missing"}`` or ``{"observation": "repeated"}``.
     """
 
     t: int
