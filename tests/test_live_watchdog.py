@@ -14,6 +14,7 @@ from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
 
 TRAIN = [walk(seed) for seed in range(30)]
+WIDE = [*TRAIN, Trajectory(np.linspace(-100, 100, 120)[:, None].repeat(3, 1), np.zeros((119, 1)))]
 CALIBRATION = [walk(seed) for seed in range(100, 140)]
 NAMES = ["x", "y", "z"]
 
@@ -68,7 +69,7 @@ def test_scores_and_alarms_are_those_of_the_benchmark(name):
     detector.fit([shown(x) for x in TRAIN])
     rule = GuaranteedAlarm.fit([detector.score(shown(x)) for x in CALIBRATION], 0.1, spec.alarm)
     assert watchdog.rule == rule
-    x = walk(7, push=0.5)
+    x = walk(7, push=0.2)
     watchdog.reset()
     found = np.array([watchdog.update(*row).score for row in rows_of(x)])
     np.testing.assert_allclose(found, detector.score(shown(x)), atol=1e-5)
@@ -108,7 +109,7 @@ def test_a_push_is_an_alarm_from_then_on(watchdog):
 
 
 def test_an_alarm_stays_until_it_is_acknowledged_or_the_episode_ends():
-    watchdog = Watchdog.fit(LiveSize(), TRAIN, CALIBRATION, statistic="score")
+    watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION, statistic="score")
     zero = lambda i: np.full(3, 0.001 * i)  # noqa: E731
     alarms = [watchdog.update(o, [0.0]).alarm for o in (zero(0), *big(2), zero(1), zero(2))]
     assert alarms == [False, True, True, True, True]
@@ -127,7 +128,7 @@ def test_an_alarm_stays_until_it_is_acknowledged_or_the_episode_ends():
 
 def test_without_a_latch_an_alarm_lasts_as_long_as_its_cause_and_is_held_off_then():
     watchdog = Watchdog.fit(
-        LiveSize(), TRAIN, CALIBRATION, statistic="score", latch=False, hold_off=3
+        LiveSize(), WIDE, CALIBRATION, statistic="score", latch=False, hold_off=3
     )
     loud, quiet = big(20), [np.full(3, 0.001 * i) for i in range(20)]
     order = [quiet, loud, loud, quiet, loud, loud, loud, loud]
@@ -136,7 +137,7 @@ def test_without_a_latch_an_alarm_lasts_as_long_as_its_cause_and_is_held_off_the
 
 
 def test_a_sum_starts_again_when_its_alarm_is_acknowledged():
-    watchdog = Watchdog.fit(LiveSize(), TRAIN, CALIBRATION)
+    watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.update(np.zeros(3))
     loud = big(30)
     assert watchdog.update(loud[0], [0.0]).alarm
@@ -200,7 +201,7 @@ def test_what_cannot_be_promised_is_said_when_fitting(arguments, message):
 def test_a_detector_of_whole_episodes_works_slowly_and_says_so():
     with pytest.warns(UserWarning, match="Size has no update: at every row it scores the whole"):
         watchdog = Watchdog.fit(Size(), TRAIN, CALIBRATION, statistic="score")
-    live = Watchdog.fit(LiveSize(), TRAIN, CALIBRATION, statistic="score")
+    live = Watchdog.fit(LiveSize(), WIDE, CALIBRATION, statistic="score")
     assert watchdog.rule == live.rule
     for row in rows_of(walk(3)):
         assert watchdog.update(*row).score == pytest.approx(live.update(*row).score)
@@ -221,7 +222,7 @@ def test_a_detector_of_whole_episodes_explains_its_alarm():
 
 
 def test_detectors_are_shown_actions_if_they_look_at_them():
-    watchdog = Watchdog.fit(LiveSize(), TRAIN, CALIBRATION)
+    watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.update(np.zeros(3))
     assert watchdog._made.detector.action is None
     watchdog.update(np.zeros(3), [0.5])
@@ -245,7 +246,7 @@ def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
 
 
 def test_an_instance_is_loaded_into_another(tmp_path):
-    watchdog = Watchdog.fit(LiveSize(), TRAIN, CALIBRATION)
+    watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.save(tmp_path / "kept")
     with pytest.raises(UsageError, match=r"load\(directory, detector\) needs one"):
         Watchdog.load(tmp_path / "kept")

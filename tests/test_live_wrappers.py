@@ -113,7 +113,7 @@ def test_a_terminal_shows_statistic_threshold_and_sensors(fitted):
     with TerminalMonitor("cart", console) as monitor:
         console.print(monitor.picture())
         for i in range(80):
-            reading = watchdog.update([0.001 * i, np.nan, 0.002 * i, 0.003 * i], [1, 0])
+            reading = watchdog.update([1e-4 * i, np.nan, 2e-4 * i, 3e-4 * i], [1, 0])
             monitor.update(reading)
         console.print(monitor.picture())
     shown = console.file.getvalue()

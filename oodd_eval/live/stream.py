@@ -97,8 +97,11 @@ class StreamLimits:
         mean = take(arrays, "mean", (None,))
         vectors = [take(arrays, name, mean.shape) for name in ("std", "low", "high", "still")]
         largest = np.finfo(np.float64).max  # what an infinity was written as
-        endless = [np.where(np.abs(v) == largest, np.copysign(np.inf, v), v) for v in vectors]
-        return cls(mean, *endless, take(arrays, "repeated", ()), take(arrays, "rest", (None,)))
+        std, low, high, still = (
+            np.where(np.abs(v) == largest, np.copysign(np.inf, v), v) for v in vectors
+        )
+        rest = take(arrays, "rest", (None,))
+        return cls(mean, std, low, high, still, take(arrays, "repeated", ()), rest)
 
     def faulty(self, trajectory: Trajectory) -> bool:
         """Tell whether an episode raises an alarm of the stream."""
