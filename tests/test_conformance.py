@@ -16,13 +16,14 @@ ADAPTERS = [
 ]
 """Some of those that are made of any class of a library."""
 
-NETWORK = {"updates": 3, "members": 2, "chunk": 20}
+NETWORK = {"updates": 3, "members": 2}
 QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
 SMALL = {
     "rf": {"members": 2, "trees": 2},
     "rf-ewma": {"members": 2, "trees": 2},
     "riqn": QUANTILES,
     "riqn-ms": QUANTILES,
+    "riqn-r": QUANTILES,
     "n-riqn": QUANTILES,
     "npn": NETWORK,
     "sklearn:IsolationForest": {"n_estimators": 10},
@@ -71,5 +72,5 @@ def must_conform(name, horizon, parameters):
 def test_no_plugin_is_left_out():
     assert not PLUGINS.broken
     assert {"random", "persistence", "clock", "comb", "range", "mahalanobis", "rf", "rf-ewma",
-            "riqn", "riqn-ms", "n-riqn", "npn", "mewma",
+            "riqn", "riqn-ms", "riqn-r", "n-riqn", "npn", "mewma",
             "mewma-a"} <= set(PLUGINS.offers)  # fmt: skip
