@@ -1,6 +1,6 @@
 """How far training goes: matched AUC and held-out loss against the number of updates.
 
-``python benchmarks/riqn_updates.py [--split mini] [--env all] [--updates 225,450,900,1800]``, one
+``python benchmarks/riqn_updates.py [--split mini] [--env all] [--updates 250,800,2500]``, one
 core. One fit per environment and number of updates, detector seed 0, Δ = 1. The loss is that on the
 nominal trajectories that training does not see, as a multiple of the loss after the most updates:
 1.02 is two per cent above it. Matched AUC (%) is the mean over the eight anomalies, for the paper's
@@ -51,7 +51,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--split", default="mini", metavar="NAME")
     parser.add_argument("--env", default="all", metavar="NAMES")
-    parser.add_argument("--updates", default="225,450,900,1800", metavar="NUMBERS")
+    parser.add_argument("--updates", default="250,800,2500", metavar="NUMBERS")
     options = parser.parse_args()
     torch.set_num_threads(1)
     split = load_split(options.split)

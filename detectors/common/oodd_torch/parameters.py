@@ -10,7 +10,7 @@ class NetworkParameters:
     """Parameters of every detector of this family; subclasses add their own."""
 
     members: int = parameter(5, low=1, help="networks in the ensemble, e")
-    updates: int = parameter(3000, low=1, help="gradient steps of each member")
+    updates: int = parameter(2500, low=1, help="gradient steps of each member")
     batch: int = parameter(32, low=1, help="pieces of episodes in a batch")
     chunk: int = parameter(10, low=1, help="steps of a piece, through which gradients flow")
     scheduled_sampling: float = parameter(
