@@ -14,15 +14,16 @@ if TYPE_CHECKING:
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
-    from oodd_eval.plugins.contract import Detector, DetectorSpec
+    from oodd_eval.plugins.contract import Detector, DetectorSpec, Explanation
     from oodd_eval.testing import check_detector
 
-__all__ = ["Detector", "DetectorSpec", "Trajectory", "__version__", "check_detector", "evaluate",
-           "hookimpl", "load_split"]  # fmt: skip
+__all__ = ["Detector", "DetectorSpec", "Explanation", "Trajectory", "__version__",
+           "check_detector", "evaluate", "hookimpl", "load_split"]  # fmt: skip
 
 _HOMES = {"Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
-          "Trajectory": "data.trajectory", "check_detector": "testing", "evaluate": "api",
-          "hookimpl": "plugins", "load_split": "data.split"}  # fmt: skip
+          "Explanation": "plugins.contract", "Trajectory": "data.trajectory",
+          "check_detector": "testing", "evaluate": "api", "hookimpl": "plugins",
+          "load_split": "data.split"}  # fmt: skip
 
 
 def __getattr__(name: str) -> object:

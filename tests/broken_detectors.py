@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from oodd_eval import DetectorSpec, Trajectory
+from oodd_eval import DetectorSpec, Explanation, Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError
 from oodd_eval.plugins.parameters import declared_by
 
@@ -49,6 +49,16 @@ class Good:
 
     def score_many(self, trajectories):
         return [self.score(x) for x in trajectories]
+
+    def explain(self, x):
+        """Shares of the last changes of all sensors, and an onset a row ago."""
+        undefined, h = np.isnan(self.score(x)), self.horizon
+        change = np.ones((len(x), x.observation_dim))
+        change[h:] = np.abs(np.diff(x.observations, n=1, axis=0))[h - 1 :] / self.std_ + 1e-9
+        shares = change / change.sum(axis=1, keepdims=True)
+        shares[undefined] = np.nan
+        onsets = np.where(undefined, -1, np.maximum(np.arange(len(x)) - 1, 0))
+        return Explanation(shares, onsets)
 
     def reset(self):
         self.seen, self.done = [], []
@@ -454,6 +464,91 @@ class LooksAhead(Good):
 class KnowsTheLength(Good):
     def score(self, x):
         return super().score(x) if len(x) > 1 else np.zeros(1)
+
+
+@breaks("explain", "explain returned NoneType, expected shares and onsets")
+class ExplainsNothing(Good):
+    def explain(self, x): ...
+
+
+@breaks(
+    "explain",
+    "explain returned shares as float64 of shape (81,), expected float64 of shape (81, 3)",
+)
+class SharesOfOne(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return shares[:, 0], onsets
+
+
+@breaks(
+    "explain",
+    "explain returned onsets as float64 of shape (81,), expected int64 of shape (81,)",
+)
+class OnsetsInBetween(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return shares, onsets - 0.5
+
+
+@breaks("explain", "explain raised ZeroDivisionError: division by zero (broken_detectors.py:<n>)")
+class DoubtsItself(Good):
+    def explain(self, x):
+        return 1 / 0
+
+
+@breaks(
+    "explain",
+    "explain gives the shares <...> at t = 1: parts of 1, or NaN alone where it is undefined",
+)
+class SharesInPercent(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return 100 * shares, onsets
+
+
+@breaks(
+    "explain",
+    "explain gives the onset <n> at t = 1: a row from 0 to t, or -1 where the shares are NaN",
+)
+class OnsetsAhead(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return shares, np.where(onsets < 0, onsets, onsets + 2)
+
+
+@breaks(
+    "explain",
+    "explain gives the onset 0 at t = 0, where the score is nan: expected -1, and shares of NaN, "
+    "where it is NaN only",
+)
+class ExplainsTheUndefined(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return np.where(np.isnan(shares), 1 / shares.shape[1], shares), np.maximum(onsets, 0)
+
+
+@breaks(
+    "explain",
+    "the first 2 of 81 observations alone have other shares: explain may use nothing after a row's "
+    "time",
+)
+class SharesOfTheWhole(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        mean = np.nanmean(shares, axis=0) if len(x) > self.horizon else 1 / shares.shape[1]
+        return np.where(np.isnan(shares), np.nan, mean), onsets
+
+
+@breaks(
+    "explain",
+    "the first <n> of 81 observations alone have other onsets: explain may use nothing after a "
+    "row's time",
+)
+class OnsetInTheMiddle(Good):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return shares, np.minimum(onsets, len(x) // 2)
 
 
 @breaks(

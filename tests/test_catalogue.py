@@ -8,6 +8,7 @@ import pytest
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import (
     ALARM_RANKING,
+    ATTRIBUTION,
     GUARANTEED,
     HEADLINE,
     LEVELS,
@@ -21,7 +22,7 @@ from oodd_eval.metrics.catalogue import (
 
 
 def test_every_name_has_facts_and_every_null_is_a_metric():
-    assert len(set(NAMES)) == len(NAMES) == 12 + 3 * 14
+    assert len(set(NAMES)) == len(NAMES) == 12 + 3 * 14 + 2
     for name in NAMES:
         info = metric_info(name)
         assert info.name == name
@@ -36,8 +37,10 @@ def test_the_names_of_a_level_are_those_of_its_metrics_their_nulls_and_the_thres
     expected = ["false_episodes", *(n for name in own for n in (name, f"{name}_null"))]
     assert list(GUARANTEED) == expected
     assert {n for n in NAMES if n.endswith("_at_5pct")} == {
-        f"{name}_at_5pct" for name in [*expected, "threshold"]
+        f"{name}_at_5pct" for name in [*expected, "threshold", "sensor_named", "onset_error"]
     }
+    assert list(ATTRIBUTION) == ["sensor_named_at_5pct", "onset_error_at_5pct"]
+    assert [n for n in NAMES if metric_info(n).median] == ["onset_error_at_5pct"]
 
 
 def test_the_suffix_of_a_level_is_understood():
@@ -53,7 +56,18 @@ def test_the_suffix_of_a_level_is_understood():
 
 
 @pytest.mark.parametrize(
-    "name", ["auc_mached", "auc_at_1pct", "far_at_5pct", "missed_at_2pct", "threshold", "", "early"]
+    "name",
+    [
+        "auc_mached",
+        "auc_at_1pct",
+        "far_at_5pct",
+        "missed_at_2pct",
+        "threshold",
+        "",
+        "early",
+        "sensor_named_at_1pct",
+        "onset_error",
+    ],
 )
 def test_other_names_are_refused(name):
     with pytest.raises(UnknownNameError, match="unknown metric"):
@@ -63,7 +77,8 @@ def test_other_names_are_refused(name):
 def test_better_sides():
     better = {side: {n for n in NAMES if metric_info(n).better == side} for side in ("higher", "")}
     found = {n for n in NAMES if n.startswith("found") and "null" not in n}
-    assert better["higher"] == {"auc", "auc_matched", "auc_unpaired", "auc_smoothed"} | found
+    assert better["higher"] == {"auc", "auc_matched", "auc_unpaired", "auc_smoothed",
+                                "sensor_named_at_5pct"} | found  # fmt: skip
     beside = {n for n in NAMES if "null" in n or n.startswith(("auc_placebo", "threshold"))}
     assert better[""] == beside
 
@@ -73,7 +88,7 @@ def test_kinds_of_intervals():
     assert {n for n in NAMES if kinds[n] == "exact"} == {f"false_episodes_{s}" for s in LEVELS}
     assert {n for n in NAMES if not kinds[n]} == {f"threshold_{s}" for s in LEVELS}
     assert {split_name(n)[0] for n in NAMES if kinds[n] == "mean"} == {
-        "delay", "delay_null", "delay_censored", "delay_censored_null",
+        "delay", "delay_null", "delay_censored", "delay_censored_null", "onset_error",
     }  # fmt: skip
 
 
@@ -99,5 +114,6 @@ def test_the_documented_metrics_are_those_of_the_catalogue():
         *(n for n in METRICS if n.startswith("auc")),
         *own,
         "threshold",
+        *(split_name(name)[0] for name in ATTRIBUTION),
         *(n for n in METRICS if not n.startswith("auc")),
     ]

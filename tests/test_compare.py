@@ -126,9 +126,9 @@ def test_a_sign_on_the_better_side_is_explained(text, message):
 def test_every_metric_has_its_worse_side():
     falls = {m for m in NAMES if worse_side(m) == "-"}
     neither = {m for m in NAMES if worse_side(m) == "±"}
-    aucs = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired"}
-    assert {m for m in falls if not m.startswith("found")} == aucs
-    assert {m.partition("_at_")[0] for m in falls - aucs} == {"found_within_20", "found_within_100"}
+    own = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired", "sensor_named_at_5pct"}
+    assert {m for m in falls if not m.startswith("found")} == own
+    assert {m.partition("_at_")[0] for m in falls - own} == {"found_within_20", "found_within_100"}
     beside = ("null", "placebo", "threshold")
     assert neither == {m for m in NAMES if any(word in m for word in beside)}
     assert worse_side("of_another_version") == "±"
@@ -628,8 +628,8 @@ def own_check():
 def test_the_check_of_this_project_parses_and_is_two_sided():
     runs = [o for o in own_check() if o.command == "run"]
     comparisons = [o for o in own_check() if o.command == "compare"]
-    assert [o.detector for o in runs] == ["rf", "riqn,npn"]
-    assert len(comparisons) == 2
+    assert [o.detector for o in runs] == ["rf", "riqn,npn,pe-a"]
+    assert len(comparisons) == 3
     for options in comparisons:
         assert options.two_sided
         assert [parse_tolerance(t) for t in options.fail]
@@ -641,33 +641,44 @@ def test_the_check_of_this_project_is_sound_shell():
     subprocess.run([bash, "-n", ROOT / ".ci/run"], check=True)
 
 
-REFERENCE = ROOT / "leaderboard/reference/mini.jsonl"
+REFERENCES = {
+    "mini.jsonl": ("paper-mini", ("riqn", "npn", "rf")),
+    "pe.jsonl": ("pe-mini", ("pe-a",)),
+}
+"""Files of reference scores, the entries that they are from, and the detectors in them."""
 
 
-def test_the_reference_of_this_project_is_of_the_split_that_ships():
-    reference = read_record_set(REFERENCE)
-    ((conditions, cells),) = reference.boards.items()
+def reference(name):
+    return ROOT / "leaderboard/reference" / name
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_the_references_of_this_project_are_of_the_split_that_ships(name):
+    found = read_record_set(reference(name))
+    ((conditions, cells),) = found.boards.items()
     assert conditions == Conditions("mini", load_split("mini").digest, PROTOCOL, None)
-    assert all(r.ok for r in reference.records)
+    assert all(r.ok for r in found.records)
     whole = {
         f"mini/{e}/{a}::{detector}[h=1,seed=0]"
         for e in ENVIRONMENTS
         for a in ANOMALIES
-        for detector in ("riqn", "npn", "rf")
+        for detector in REFERENCES[name][1]
     }
     assert whole == set(map(str, cells))
 
 
-def test_the_reference_of_this_project_is_of_the_committed_records(tmp_path):
-    of_default = expression(" or ".join(f"::{d}[h=1,seed=0]" for d in ("riqn", "npn", "rf")))
-    records = read_record_set(ROOT / "leaderboard/results/paper-mini").records
+@pytest.mark.parametrize("name", REFERENCES)
+def test_the_references_of_this_project_are_of_the_committed_records(name, tmp_path):
+    entry, detectors = REFERENCES[name]
+    of_default = expression(" or ".join(f"::{d}[h=1,seed=0]" for d in detectors))
+    records = read_record_set(ROOT / "leaderboard/results" / entry).records
     write_reference([r for r in records if of_default(str(r.cell))], tmp_path / "r.jsonl")
-    assert REFERENCE.read_bytes() == (tmp_path / "r.jsonl").read_bytes()
+    assert reference(name).read_bytes() == (tmp_path / "r.jsonl").read_bytes()
 
 
 def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
     """One compared and not run is missing, which fails; one run and not compared is unchecked."""
-    cells = [str(r.cell) for r in read_record_set(REFERENCE).records]
+    cells = [str(r.cell) for name in REFERENCES for r in read_record_set(reference(name)).records]
     ran = set()
     for options in own_check():
         if options.command == "run":

@@ -17,6 +17,7 @@ ADAPTERS = [
 """Some of those that are made of any class of a library."""
 
 NETWORK = {"updates": 3, "members": 2}
+ENSEMBLE = {"updates": 20, "width": 16}
 QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
 SMALL = {
     "rf": {"members": 2, "trees": 2},
@@ -26,6 +27,10 @@ SMALL = {
     "riqn-r": QUANTILES,
     "n-riqn": QUANTILES,
     "npn": NETWORK,
+    "pe": ENSEMBLE,
+    "pe-a": ENSEMBLE,
+    "pe-step": ENSEMBLE,
+    "pe-step-a": ENSEMBLE,
     "sklearn:IsolationForest": {"n_estimators": 10},
 }
 """What makes a slow detector quick enough to be tried."""
@@ -72,5 +77,5 @@ def must_conform(name, horizon, parameters):
 def test_no_plugin_is_left_out():
     assert not PLUGINS.broken
     assert {"random", "persistence", "clock", "comb", "range", "mahalanobis", "rf", "rf-ewma",
-            "riqn", "riqn-ms", "riqn-r", "n-riqn", "npn", "mewma",
-            "mewma-a"} <= set(PLUGINS.offers)  # fmt: skip
+            "riqn", "riqn-ms", "riqn-r", "n-riqn", "npn", "mewma", "mewma-a",
+            "pe", "pe-a", "pe-step", "pe-step-a"} <= set(PLUGINS.offers)  # fmt: skip

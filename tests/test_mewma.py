@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
+from oodd_common.charts import distance, product, smooth, whitening
 from oodd_mewma import make_mewma, make_mewma_a
-from oodd_mewma.chart import distance, smooth, whitening
-from oodd_mewma.forecast import Moments, product, regressors
+from oodd_mewma.forecast import Moments, regressors
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError

@@ -90,7 +90,7 @@ def readme_pyproject():
     return re.search(r"```toml\n(.*?)```", (ROOT / "detectors/README.md").read_text(), re.DOTALL)[1]
 
 
-@pytest.mark.parametrize("name", ["rf", "riqn", "npn", "mewma", "adapters"])
+@pytest.mark.parametrize("name", ["rf", "riqn", "npn", "mewma", "pe", "adapters"])
 def test_each_detector_directory_lifts_out(name, tmp_path):
     project, target = tmp_path / "project", tmp_path / "target"
     project.mkdir()

@@ -6,6 +6,7 @@ import os
 import re
 import textwrap
 import time
+from concurrent.futures import Future
 from types import SimpleNamespace
 
 import h5py
@@ -412,7 +413,10 @@ def test_a_worker_is_told_no_names(tiny_split, tmp_path):
     anomalous = data.anomalous("iid")
     with (tmp_path / "sent").open("wb") as file:
         chunks = [list(anomalous), list(data.twins)]
-        _send(_child(os.dup(file.fileno())), request, data.train, chunks)
+        explains = Future()
+        explains.set_result(True)
+        child = _child(os.dup(file.fileno()))
+        _send(child, request, data.train, chunks, chunks[:1], explains)
     sent = (tmp_path / "sent").read_bytes()
     assert anomalous[0].observations.tobytes() in sent
     for word in ("cartpole", "iid", "nominal", "calib", "test", "onset", "anom", "tiny"):
@@ -427,7 +431,7 @@ def test_an_error_of_reading_data_is_kept_for_the_caller():
 
     reading, writing = os.pipe()
     with pytest.raises(OSError, match="disk gone"):
-        _send(_child(writing), {"train": 0}, broken(), [])
+        _send(_child(writing), {"train": 0}, broken(), [], [], Future())
     os.close(reading)
 
 

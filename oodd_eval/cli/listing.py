@@ -9,7 +9,7 @@ from tabulate import tabulate
 from oodd_eval.cli import Parser
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS
+from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
 from oodd_eval.plugins.discovery import Plugins, discover
 
 Rows = Iterable[tuple[str, ...]]
@@ -78,3 +78,4 @@ def _metrics() -> Rows:
         at = f"guaranteed alarms, in at most {100 * level:g} % of nominal episodes"
         yield f"..._{suffix}", f"{', '.join(GUARANTEED)}: {at}"
         yield f"threshold_{suffix}", "the threshold of their statistic"
+    yield from ((name, metric_info(name).summary) for name in ATTRIBUTION)

@@ -120,8 +120,9 @@ class TerminalReporter:
         """Print the tables of every board among some records."""
         for board in boards(records):
             self.table(layout.separability(board, intervals=self.intervals))
-            if alarms := layout.guaranteed(board, intervals=self.intervals):
-                self.table(alarms)
+            for make in (layout.guaranteed, layout.attribution):
+                if table := make(board, intervals=self.intervals):
+                    self.table(table)
             groups = [group for group in GROUPS if board.in_group(group)]
             for h, group in product(board.horizons, groups):
                 self.table(layout.anomaly_groups(board, h, [group], intervals=self.intervals))

@@ -111,6 +111,7 @@ def _section(section: LeaderboardSection) -> str:
     rendered = [
         layout.separability(board),
         *layout.alarms(ranks),
+        layout.attribution(board, intervals=True, standings=ranks.standings),
         layout.cost(ranks),
         *_as_in_the_paper(board),
         layout.all_metrics(board),

@@ -7,7 +7,7 @@ scores and however they depend on one another within an episode.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -193,6 +193,40 @@ def _from_effect(
     values = {"early": early, "delay": delays, "missed": missed, "delay_censored": censored}
     values |= {f"found_within_{k}": found for k, found in within.items()}
     return {name: mean_of(own) for name, own in values.items()}
+
+
+def attribution_contributions(
+    anomalous: Sequence[Floats], explained: Sequence[NDArray[np.int32]],
+    corrupted: Sequence[Collection[int]], effects: Sequence[int], rule: GuaranteedAlarm,
+) -> dict[str, Contribution]:  # fmt: skip
+    """Return what explanations of one cell are worth, in the order of the catalogue.
+
+    An explanation is taken at the row of an episode's first alarm; without one, or where that
+    precedes the effect, both metrics are undefined.
+
+    Parameters
+    ----------
+    anomalous
+        Scores of the n anomalous trajectories.
+    explained
+        For each, of shape (2, rows): the sensor that is named first at a row, and the onset.
+    corrupted
+        For each, the sensors that the anomaly corrupts: none where it is not of the sensors, which
+        leaves ``sensor_named`` undefined.
+    effects
+        The first row of each trajectory that differs from its twin.
+    rule
+        Made by `GuaranteedAlarm.fit`.
+    """
+    named, errors = np.full((2, len(anomalous)), np.nan)
+    for i, (scores, effect) in enumerate(zip(anomalous, effects, strict=True)):
+        first = rule.first(scores)
+        if first is not None and first >= effect:
+            sensor, onset = explained[i][:, first].tolist()
+            errors[i] = abs(onset - effect)
+            if corrupted[i]:
+                named[i] = sensor in corrupted[i]
+    return {"sensor_named": mean_of(named), "onset_error": mean_of(errors, median=True)}
 
 
 class Monitor:

@@ -27,6 +27,8 @@ FAR_START: Final = 20  # first row that ``far`` counts: horizons and warm-ups en
 class Contribution:
     """A ratio of sums: numerators and denominators of n test trajectories, 0 / 0 if undefined.
 
+    Where it is a `median`, denominators are 1, and the value is the median of the numerators.
+
     Examples
     --------
     >>> rate = Contribution(np.array([1.0, 2.0, 0.0]), np.array([10.0, 30.0, 0.0]))
@@ -36,10 +38,13 @@ class Contribution:
 
     numerator: Floats
     denominator: Floats
+    median: bool = False
 
     @property
     def value(self) -> float:
-        """Sum of numerators over sum of denominators; NaN when the latter is 0."""
+        """Sum of numerators over sum of denominators, or median; NaN when the latter is 0."""
+        if self.median and self.n:
+            return float(np.median(self.numerator[self.denominator > 0]))
         total = float(self.denominator.sum())
         return float(self.numerator.sum()) / total if total else float("nan")
 
@@ -49,11 +54,11 @@ class Contribution:
         return int(np.count_nonzero(self.denominator))
 
 
-def mean_of(values: Sequence[float] | Floats) -> Contribution:
-    """Contributions of a mean over the values that are not NaN."""
+def mean_of(values: Sequence[float] | Floats, *, median: bool = False) -> Contribution:
+    """Contributions of a mean, or median, over the values that are not NaN."""
     array = np.asarray(values, dtype=np.float64)
     defined = ~np.isnan(array)
-    return Contribution(np.where(defined, array, 0.0), defined.astype(np.float64))
+    return Contribution(np.where(defined, array, 0.0), defined.astype(np.float64), median)
 
 
 def auc(positives: Floats, negatives: Floats) -> float:

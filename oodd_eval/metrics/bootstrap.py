@@ -57,12 +57,26 @@ def shared_weights(environment: str, n: int) -> Weights:
 
 def resampled(contribution: Contribution, weights: Weights) -> Samples:
     """Return a metric in every resample; NaN where its denominator is 0."""
+    if contribution.median:
+        return _medians(contribution, weights)
     numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
     if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
         return numerator / len(contribution.denominator)
     denominator = np.einsum("rn,n->r", weights, contribution.denominator)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(denominator > 0, numerator / denominator, np.nan)
+
+
+def _medians(contribution: Contribution, weights: Weights) -> Samples:
+    """Return the median in every resample: the mean of the two middle ones among even numbers."""
+    chosen = np.flatnonzero(contribution.denominator)
+    chosen = chosen[np.argsort(contribution.numerator[chosen], kind="stable")]
+    drawn = np.cumsum(weights[:, chosen], axis=1)
+    total = drawn[:, -1:] if chosen.size else np.zeros((len(weights), 1))
+    # The k-th of all that are drawn, from 0, is the first with more than k up to it.
+    low, high = ((drawn <= k).sum(axis=1) for k in ((total - 1) // 2, total // 2))
+    ordered = np.append(contribution.numerator[chosen], np.nan)  # with none drawn, k is beyond
+    return np.asarray((ordered[low] + ordered[high]) / 2)
 
 
 @dataclass(frozen=True, slots=True)

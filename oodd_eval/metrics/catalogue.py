@@ -42,7 +42,8 @@ class MetricInfo:
     Its unit is ``"percent"`` for a share that is printed in percent, ``"steps"`` for observation
     rows, ``"rate"`` for a plain number, such as alarms per step. `better` is empty where a metric
     describes a benchmark or a setting, `null` is the metric that says what chance or false alarms
-    alone give, and `level` is the level of guaranteed alarms, such as ``"5 %"``.
+    alone give, and `level` is the level of guaranteed alarms, such as ``"5 %"``. A cell's value is
+    a mean over trajectories, unless it is a `median`.
     """
 
     name: str
@@ -52,6 +53,7 @@ class MetricInfo:
     better: Better = ""
     null: str = ""
     level: str = ""
+    median: bool = False
 
     @property
     def interval(self) -> IntervalKind:
@@ -81,7 +83,14 @@ _BY_LEVEL: Final = {row["name"]: MetricInfo(**row) for row in _TABLES["alarm"]}
 GUARANTEED: Final = tuple(name for name in _BY_LEVEL if name != "threshold")
 """Metrics of guaranteed alarms, which have a suffix for each level."""
 
-NAMES: Final = (*METRICS, *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL))
+_EXPLAINED: Final = {row["name"]: MetricInfo(**row) for row in _TABLES["attribution"]}
+
+ATTRIBUTION: Final = tuple(f"{name}_{HEADLINE}" for name in _EXPLAINED)
+"""Metrics of detectors that explain, at the headline level alone."""
+
+NAMES: Final = (
+    *METRICS, *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL), *ATTRIBUTION,
+)  # fmt: skip
 """Every metric that a record can have."""
 
 
@@ -96,7 +105,7 @@ def metric_info(name: str) -> MetricInfo:
     if name in METRICS:
         return METRICS[name]
     base, suffix = split_name(name)
-    info = _BY_LEVEL[base]
+    info = _BY_LEVEL.get(base) or _EXPLAINED[base]
     level = f"{100 * LEVELS[suffix]:g} %"
     return replace(
         info,

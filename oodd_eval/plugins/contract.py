@@ -14,7 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeAlias,
+    runtime_checkable,
+)  # fmt: skip
 
 from oodd_eval.errors import ContractError
 
@@ -59,7 +68,8 @@ class Detector(Protocol):
       at once, where batching is faster;
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
-    - ``save(directory)`` and ``load(directory)``: see `StorableDetector`.
+    - ``save(directory)`` and ``load(directory)``: see `StorableDetector`;
+    - ``explain(trajectory)``: see `ExplainingDetector`.
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
@@ -141,6 +151,35 @@ class StorableDetector(Detector, Protocol):
         ------
         FittedStateError
             For other files.
+        """
+
+
+class Explanation(NamedTuple):
+    """What a detector makes responsible for each score of one episode with T transitions.
+
+    Attributes
+    ----------
+    shares : float64 array of shape (T + 1, D)
+        Share of each sensor in the evidence of each row: not negative, with the sum 1. Equal shares
+        where there is no evidence; a row of NaN where the score is undefined.
+    onsets : int64 array of shape (T + 1,)
+        The row, at most t, with which an anomaly would have begun as seen at row t; -1 where the
+        score is undefined.
+    """
+
+    shares: NDArray[np.float64]
+    onsets: NDArray[np.int64]
+
+
+@runtime_checkable
+class ExplainingDetector(Detector, Protocol):
+    """A detector that tells which sensors its scores are from, and since when."""
+
+    def explain(self, trajectory: Trajectory) -> Explanation:
+        """Return what the scores of an episode are due to; as causal as `score`.
+
+        It is asked of fitted detectors, for episodes that they may not have scored. The one sensor
+        with the largest share at a row is named for it.
         """
 
 

@@ -14,9 +14,9 @@ Every file is whole or absent, see `oodd_eval.data.files`.
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import h5py
 import numpy as np
@@ -35,6 +35,9 @@ WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next 
 
 ORDER_BITS: Final = 53  # random bits of the order of groups: a float64 keeps them exactly
 
+EXPLAINED: Final = ("sensors", "onsets")
+"""Datasets of explanations beside ``scores``: by row, the sensor named first, and the onset."""
+
 
 @dataclass(frozen=True, slots=True)
 class ScoreFile:
@@ -43,12 +46,22 @@ class ScoreFile:
     `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit, and
     ``steps_scored``, the number of observations that ``seconds_score`` is for. `order` is the seed
     of the order in which groups were scored; each part keeps its own where parts of several runs
-    lie in one file.
+    lie in one file. `explained` are explanations by part, int32 arrays of shape (2, rows) with the
+    sensors named first and the onsets, of anomalous parts and detectors that explain only.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
     order: int | None = None
+    explained: dict[str, list[NDArray[np.int32]]] = field(default_factory=dict)
+
+
+class _StoredPart(NamedTuple):
+    """One part of a score file: scores, order and explanations, None where it has none."""
+
+    sequences: list[NDArray[np.float64]]
+    order: float | None
+    explained: list[NDArray[np.int32]] | None
 
 
 class ResultsDirectory:
@@ -112,19 +125,22 @@ class ResultsDirectory:
 
     def write_scores(self, key: str, scores: ScoreFile) -> None:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
-        own = {part: (sequences, scores.order) for part, sequences in scores.parts.items()}
-        parts = {**self._all_parts(key), **own}
+        parts = self._all_parts(key)
+        for part, sequences in scores.parts.items():
+            parts[part] = _StoredPart(sequences, scores.order, scores.explained.get(part))
         place = self.path / "scores" / f"{key}.h5"
         with files.replacing(place) as path, h5py.File(path, "w") as file:
             file.attrs.update(scores.cost)
-            for part, (sequences, order) in sorted(parts.items()):
-                group = file.create_group(part)
+            for part in sorted(parts):
+                group, (sequences, order, explained) = file.create_group(part), parts[part]
                 if order is not None:
                     group.attrs["order"] = float(order)
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
-                group.create_dataset(
-                    "scores", data=np.concatenate(sequences), compression="gzip", shuffle=True
-                )
+                columns = {"scores": np.concatenate(sequences)}
+                if explained is not None:
+                    columns |= zip(EXPLAINED, np.concatenate(explained, axis=1), strict=True)
+                for name, data in columns.items():
+                    group.create_dataset(name, data=data, compression="gzip", shuffle=True)
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
         """Read a unit's scores; None when the file is absent, damaged, lacks a part or misfits.
@@ -133,26 +149,29 @@ class ResultsDirectory:
         """
         try:
             with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:
-                parts = {}
+                parts, explained = {}, {}
                 for part, expected in lengths.items():
                     flat, offsets = file[part]["scores"][:], file[part]["offsets"][:]
                     if np.diff(offsets).tolist() != list(expected) or len(flat) != offsets[-1]:
                         return None
                     parts[part] = np.split(flat.astype(np.float64, copy=False), offsets[1:-1])
+                    if own := _explained(file[part]):
+                        explained[part] = own
                 cost = {name: float(value) for name, value in file.attrs.items()}
         except (OSError, KeyError, ValueError):
             return None
-        return ScoreFile(parts, cost)
+        return ScoreFile(parts, cost, explained=explained)
 
-    def _all_parts(self, key: str) -> dict[str, tuple[list[NDArray[np.float64]], float | None]]:
-        """Return the scores of all parts, each with the order in which groups were scored."""
-        parts: dict[str, tuple[list[NDArray[np.float64]], float | None]] = {}
+    def _all_parts(self, key: str) -> dict[str, _StoredPart]:
+        """Return all parts, each with the order in which groups were scored."""
+        parts: dict[str, _StoredPart] = {}
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
                 sequences = np.split(item["scores"][:], item["offsets"][1:-1])
                 # Files of earlier versions have one order for all parts.
-                parts[name] = sequences, item.attrs.get("order", item.file.attrs.get("order"))
+                order = item.attrs.get("order", item.file.attrs.get("order"))
+                parts[name] = _StoredPart(sequences, order, _explained(item))
 
         try:
             with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:
@@ -160,6 +179,16 @@ class ResultsDirectory:
         except (OSError, KeyError, ValueError):
             return {}
         return parts
+
+
+def _explained(part: h5py.Group) -> list[NDArray[np.int32]] | None:
+    """Return the explanations of a part, which detectors without ``explain`` do not have."""
+    if not all(name in part for name in EXPLAINED):
+        return None
+    columns = np.array([part[name][:] for name in EXPLAINED], dtype=np.int32)
+    if columns.shape[1] != part["offsets"][-1]:
+        raise ValueError("explanations of another number of rows than scores")
+    return np.split(columns, part["offsets"][1:-1], axis=1)
 
 
 class RecordWriter:

@@ -1,8 +1,11 @@
 """From the scores of a cell to its metrics with intervals, and to its record."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
 from oodd_eval.data.split import Split
@@ -11,7 +14,7 @@ from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import GUARANTEED, metric_info
+from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -42,8 +45,9 @@ class Rules:
 def cell_metrics(
     anomalous: Sequence[Scores], twins: Sequence[Scores], onsets: Sequence[int],
     effects: Sequence[int], rules: Rules, *, environment: str,
+    explained: Sequence[NDArray[np.int32]] = (), corrupted: Sequence[Collection[int]] = (),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:  # fmt: skip
-    """Compute all metrics of one cell with their intervals."""
+    """Compute all metrics of one cell with their intervals; attribution where it is explained."""
     found = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
     thresholds = {}
     for suffix, rule in rules.guaranteed.items():
@@ -52,6 +56,9 @@ def cell_metrics(
         # JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
         finite = math.isfinite(rule.threshold)
         thresholds[f"threshold_{suffix}"] = Metric(rule.threshold if finite else NAN)
+    if explained and (headline := rules.guaranteed.get(HEADLINE)):
+        own = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
+        found |= {f"{name}_{HEADLINE}": contribution for name, contribution in own.items()}
     metrics = {name: metric_of(name, c, environment) for name, c in found.items()}
     return metrics | thresholds, found
 
@@ -80,9 +87,12 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
     anomalous, known = scores.parts[f"test/{record.anomaly}"], data.anomalous(record.anomaly)
     starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
+    explained = scores.explained.get(f"test/{record.anomaly}", [])
     metrics, contributions = cell_metrics(
-        anomalous, scores.parts[TWINS], starts, effects, rules, environment=record.environment
-    )
+        anomalous, scores.parts[TWINS], starts, effects, rules, environment=record.environment,
+        explained=explained,
+        corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
+    )  # fmt: skip
     per_trajectory = {
         name: (c.numerator.tolist(), c.denominator.tolist()) for name, c in contributions.items()
     }

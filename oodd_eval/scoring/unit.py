@@ -10,18 +10,27 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.parts import TWINS, EnvironmentData, TrajectorySet, lengths_of, parts_of
+from oodd_eval.data.parts import (
+    CALIBRATION,
+    TWINS,
+    EnvironmentData,
+    TrajectorySet,
+    lengths_of,
+    parts_of,
+)
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins import contract
+from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Probe, Scores
 from oodd_eval.plugins.discovery import Offer, printable
+from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Stop, run_isolated
 from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory, ScoreFile
 from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
+_NOMINAL: Final = (CALIBRATION, TWINS)
 COSTS: Final = ("seconds_fit", "seconds_score", "peak_rss_mb")
 
 
@@ -91,7 +100,8 @@ class _Work:
     test seeds, the twins, one anomaly, or prefixes of other trajectories. It is scored apart from
     all others. The order of groups, and which prefixes there are, follow from a number drawn from
     the system's randomness, which is stored with the scores. Within a group the order is that of
-    the split, so that scores are the same bit for bit.
+    the split, so that scores are the same bit for bit. A detector that explains is asked to in the
+    same way, when all is scored: only the anomalous trajectories, and prefixes of some of these.
     """
 
     def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
@@ -102,6 +112,11 @@ class _Work:
         self._ordered = [*groups(self._lengths), self._probes]
         self._drawn = np.random.default_rng(self._order).permutation(len(self._ordered))
         self._groups = [self._ordered[k] for k in self._drawn]
+        anomalous = {p: n for p, n in self._lengths.items() if p not in _NOMINAL}
+        again = [group for group in self._ordered[:-1] if group[0].part in anomalous]
+        again.append(contract.probes(anomalous, self._order))
+        order = np.random.default_rng([self._order, len(again)]).permutation(len(again))
+        self._explained = [again[k] for k in order]
 
     def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
         """Fit (or load a fit) and score in worker processes."""
@@ -113,8 +128,8 @@ class _Work:
             "train": train, "load": load, "save": save,
         }  # fmt: skip
         nominal = map(self._shown, islice(data.train, train))
-        parts = map(self._members, self._groups)
-        return run_isolated(request, nominal, parts, limits=limits, stop=stop)
+        parts, again = (map(self._members, g) for g in (self._groups, self._explained))
+        return run_isolated(request, nominal, parts, again, limits=limits, stop=stop)
 
     def checked(self, outcome: Outcome) -> Scored:
         """Check every score sequence of a worker and put them in their places."""
@@ -126,13 +141,15 @@ class _Work:
             return Scored("invalid", wrong, log=outcome.log)
         try:
             parts = self._placed([[*islice(returned, n)] for n in sizes], outcome.warm_up)
+            explained = self._explanations(outcome.explained, parts)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
         # Prefixes, a few percent more, are others in every run, and records shall be the same.
         steps = sum(map(sum, self._lengths.values()))
         cost = {name: getattr(outcome, name) for name in COSTS}
         known = {name: value for name, value in cost.items() if value is not None}
-        return Scored(file=ScoreFile(parts, {**known, "steps_scored": steps}, self._order))
+        cost = {**known, "steps_scored": steps}
+        return Scored(file=ScoreFile(parts, cost, self._order, explained))
 
     def in_process(self) -> Scored:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
@@ -145,7 +162,11 @@ class _Work:
         shown = ([*self._members(group)] for group in self._groups)
         returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in shown]
         parts = self._placed(returned, getattr(detector, "warm_up", 0))
-        return Scored(file=ScoreFile(parts, {}, self._order))
+        again = self._explained if explanations.explains(detector) else ()
+        chunks = ([*self._members(group)] for group in again)
+        copies = ((copy.deepcopy(detector), chunk) for chunk in chunks)
+        explained = [one for pair in copies for one in explanations.explain_chunk(*pair)]
+        return Scored(file=ScoreFile(parts, {}, self._order, self._explanations(explained, parts)))
 
     def _members(self, group: Sequence[Probe]) -> Iterator[Trajectory]:
         return (self._shown(self._sets[p.part][p.index][: p.rows]) for p in group)
@@ -173,6 +194,26 @@ class _Work:
                 else:
                     parts[part][i] = found
         return parts
+
+    def _explanations(
+        self, returned: Sequence[object], parts: Mapping[str, Sequence[Scores]]
+    ) -> dict[str, list[Named]]:
+        """Check explanations, if there are any; raise `ContractError`, or return them by part."""
+        wanted = [probe for group in self._explained for probe in group]
+        if returned and len(returned) != len(wanted):
+            raise ContractError(f"{len(returned)} explanations came back, expected {len(wanted)}")
+        given = {(p.rows < len(parts[p.part][p.index]), p.part, p.index): (p.rows, one)
+                 for p, one in zip(wanted, returned, strict=False)}  # fmt: skip
+        found: dict[str, list[Named]] = {}
+        for cut, part, i in sorted(given):  # whole ones before those that are cut
+            rows, one = given[cut, part, i]
+            own, where = found.setdefault(part, []), f"{self._job.unit.environment}/{part}[{i}]"
+            scores, whole = parts[part][i][:rows], own[i] if cut else None
+            checked = explanations.check_named(
+                one, scores, len(self._job.data.sensors), where, whole
+            )
+            own += [] if cut else [checked]
+        return found
 
 
 def _with_kept_fit(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import NotFittedError
+from oodd_eval.errors import NotFittedError, TrajectoryError
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import checked, parameter
@@ -85,6 +85,8 @@ class WindowDetector(ABC):
         Observations that a judgement looks at, W.
     lag
         Steps from the newest of them to the observation that is judged; default the horizon.
+    actions
+        Whether judgements look at the commanded actions, too. Then `_learn` sets `action_scale_`.
 
     Raises
     ------
@@ -93,12 +95,21 @@ class WindowDetector(ABC):
     """
 
     def __init__(
-        self, name: str, *, seed: int, horizon: int, window: int = 1, lag: int | None = None
+        self,
+        name: str,
+        *,
+        seed: int,
+        horizon: int,
+        window: int = 1,
+        lag: int | None = None,
+        actions: bool = False,
     ) -> None:
         checked(_Given, name, {"seed": seed, "horizon": horizon})
         self.name, self.seed, self.horizon = name, seed, horizon
         self.window, self.lag = window, horizon if lag is None else lag
+        self.actions = actions
         self.scale_: FeatureScale | None = None
+        self.action_scale_: FeatureScale
         self.reset()
 
     def fit(self, nominal: Sequence[Trajectory]) -> Self:
@@ -122,14 +133,19 @@ class WindowDetector(ABC):
     def reset(self) -> None:
         """Begin a new live episode."""
         self._rows: deque[NDArray[Any]] = deque(maxlen=self.window + self.lag)
+        self._commands: deque[Row] = deque(maxlen=self.window + self.lag - 1)
         self._now = 0
 
-    def update(self, observation: Row, action: Row | None = None) -> float:  # noqa: ARG002
+    def update(self, observation: Row, action: Row | None = None) -> float:
         """Return the score of the next observation of a live episode, NaN for t < lag.
 
-        Raises as `score` does, and `TrajectoryError` for values that are not finite.
+        A detector that looks at actions needs the one commanded since the previous observation from
+        the second observation on. Raises as `score` does, and `TrajectoryError` for values that are
+        not finite or an action that is missing.
         """
         row = self._row(observation)
+        if self.actions and self._now:
+            self._commands.appendleft(self._command(action))
         if not self._rows:
             self._rows.extend([row] * (self.window + self.lag))
         self._rows.appendleft(row)
@@ -150,6 +166,32 @@ class WindowDetector(ABC):
                 "trajectories"
             )
         return self.scale_
+
+    def _command(self, action: Row | None) -> Row:
+        """Return an action as it is, (A,)."""
+        width = len(self.action_scale_.mean)
+        found = np.asarray(np.nan if action is None else action, dtype=np.float32)
+        if found.shape != (width,) or not np.isfinite(found).all():
+            raise TrajectoryError(
+                f"detector {self.name!r} was given an action {action}, expected {width} finite "
+                "numbers"
+            )
+        return found
+
+    def _widths(self, x: Trajectory) -> tuple[int, int]:
+        """Return the numbers of sensors and of action columns that judgements look at."""
+        return x.observation_dim, x.action_dim if self.actions else 0
+
+    def _must_fit(self, trajectory: Trajectory) -> None:
+        """Raise `TrajectoryError` for other numbers of sensors or action columns than in `fit`."""
+        sensors = len(self._scale().mean)
+        fitted = (sensors, len(self.action_scale_.mean) if self.actions else 0)
+        if (found := self._widths(trajectory)) != fitted:
+            raise TrajectoryError(
+                f"detector {self.name!r} was fitted on (sensors, action columns) {fitted} "
+                f"and asked to score a trajectory of {found}: score trajectories of the "
+                "environment that it was fitted on"
+            )
 
     @abstractmethod
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:

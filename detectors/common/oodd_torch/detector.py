@@ -19,9 +19,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError, UsageError
+from oodd_eval.errors import FittedStateError
 from oodd_eval.plugins.forecasting import FeatureScale, anomaly_scores
 from oodd_eval.plugins.state import Arrays, take
+from oodd_torch.device import chosen
 from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.parameters import NetworkParameters
@@ -122,15 +123,7 @@ class NetworkDetector(StorableWindowDetector):
             # A forecast of the next observation is never made from a forecast.
             scheduled_sampling=parameters.scheduled_sampling if horizon > 1 else 0.0,
         )
-        found = torch.cuda.is_available()
-        if parameters.device == "cuda" and not found:
-            raise UsageError(
-                f"parameter 'device' of {name} is 'cuda', expected auto or cpu, since torch finds "
-                "no CUDA device here"
-            )
-        self.device = ("cuda" if found else "cpu") if parameters.device == "auto" else (
-            parameters.device
-        )  # fmt: skip
+        self.device = chosen(name, parameters.device)
         self.network_: Ensemble
         self.history_: list[list[float]]
         self.residual_: NDArray[np.float32]

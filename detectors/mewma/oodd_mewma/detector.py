@@ -6,7 +6,6 @@ memories. The score is how far the most unusual of these sums lies from where no
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
@@ -15,6 +14,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_common.charts import Floats, Smoother, distance, product, smooth, whitening
 from oodd_common.windows import StorableWindowDetector
 
 from oodd_eval import Trajectory
@@ -22,8 +22,7 @@ from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_mewma import MewmaParameters
-from oodd_mewma.chart import Floats, Smoother, distance, smooth, whitening
-from oodd_mewma.forecast import Moments, product, regressors
+from oodd_mewma.forecast import Moments, regressors
 
 FOLDS: Final = 5
 """Parts of the nominal trajectories, each judged by what was learnt from the others."""
@@ -73,20 +72,13 @@ class MewmaDetector(StorableWindowDetector):
     def __init__(
         self, name: str, parameters: MewmaParameters, *, seed: int, horizon: int, actions: bool
     ) -> None:
-        super().__init__(name, seed=seed, horizon=horizon, window=parameters.order)
-        self.parameters, self.actions = parameters, actions
+        super().__init__(name, seed=seed, horizon=horizon, window=parameters.order, actions=actions)
+        self.parameters = parameters
         self._first = horizon + parameters.order - 1  # first time that has all its regressors
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon."""
-        self._scale()
-        fitted = (len(self.observation_scale_.mean), len(self.action_scale_.mean))
-        if (found := self._widths(trajectory)) != fitted:
-            raise TrajectoryError(
-                f"detector {self.name!r} was fitted on (sensors, action columns) {fitted} "
-                f"and asked to score a trajectory of {found}: score trajectories of the "
-                "environment that it was fitted on"
-            )
+        self._must_fit(trajectory)
         scores = np.full(len(trajectory), np.nan)
         scores[self.horizon :] = 0.0
         if trajectory.transitions >= self._first:
@@ -98,28 +90,7 @@ class MewmaDetector(StorableWindowDetector):
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
-        self._commands: deque[NDArray[Any]] = deque(maxlen=self.window + self.lag - 1)
         self._smoother: Smoother | None = None
-
-    def update(
-        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
-    ) -> float:
-        """Return the score of the next observation of a live episode, NaN for t < horizon.
-
-        `mewma-a` needs the action commanded since the previous observation from the second
-        observation on, and raises `TrajectoryError` without it.
-        """
-        self._scale()
-        if self.actions and self._now:
-            width = len(self.action_scale_.mean)
-            found = np.asarray(np.nan if action is None else action, dtype=np.float32)
-            if found.shape != (width,) or not np.isfinite(found).all():
-                raise TrajectoryError(
-                    f"detector {self.name!r} was given an action {action}, expected {width} "
-                    "finite numbers"
-                )
-            self._commands.appendleft(found)
-        return super().update(observation)
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
@@ -189,10 +160,6 @@ class MewmaDetector(StorableWindowDetector):
         self.distance_mean_ = pooled.mean(axis=1, keepdims=True)
         self.distance_std_ = _positive(pooled.std(axis=1, keepdims=True))
         return self.observation_scale_
-
-    def _widths(self, x: Trajectory) -> tuple[int, int]:
-        """Return the numbers of sensors and of action columns that the forecast looks at."""
-        return x.observation_dim, x.action_dim if self.actions else 0
 
     def _targets(self, x: Trajectory) -> Floats:
         return _standard(x.observations[self._first :], self.observation_scale_)

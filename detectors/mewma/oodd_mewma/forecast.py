@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-
-BLOCK: Final = 64
-"""Rows that are multiplied by a matrix at once."""
 
 
 def regressors(observations: Floats, actions: Floats | None, *, order: int, horizon: int) -> Floats:
@@ -63,18 +59,3 @@ class Moments:
         penalty = np.full(len(self.gram), ridge * self.gram[-1, -1])
         penalty[-1] = 0.0
         return np.asarray(np.linalg.solve(self.gram + np.diag(penalty), self.cross), np.float64)
-
-
-def product(rows: Floats, matrix: Floats) -> Floats:
-    """Return ``rows @ matrix`` such that the bits of a row do not depend on how many follow it.
-
-    A matrix product picks its order of summation by the shapes. Blocks of one fixed shape, the last
-    one filled up with zeros, make the scores of a prefix the prefix of the scores exactly.
-
-    From (N, K) and (K, M) to (N, M).
-    """
-    n = len(rows)
-    blocks = np.zeros((-(-n // BLOCK), BLOCK, rows.shape[1]))
-    blocks.reshape(-1, rows.shape[1])[:n] = rows
-    multiplied: Floats = np.matmul(blocks, matrix).reshape(-1, matrix.shape[1])[:n]
-    return multiplied

@@ -12,7 +12,7 @@ from typing import Any, Final
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
 from oodd_eval.leaderboard.entry import EntryInfo
 from oodd_eval.leaderboard.sections import LeaderboardSection
-from oodd_eval.metrics import bootstrap
+from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell
 from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
@@ -80,7 +80,7 @@ def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Jso
     found = {name for r in board.records for name in r.metrics}
     # The plain ones stand there even where every cell of the board has failed.
     by_level = [f"{m}_{suffix}" for suffix in LEVELS for m in (*GUARANTEED, "threshold")]
-    names = [*METRICS, *(name for name in by_level if name in found)]
+    names = [*METRICS, *(name for name in (*by_level, *catalogue.ATTRIBUTION) if name in found)]
     have = {(r.environment, r.anomaly) for r in board.records}
     chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
     return {

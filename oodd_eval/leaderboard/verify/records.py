@@ -21,6 +21,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.leaderboard.entry import EntryInfo, place_of
 from oodd_eval.leaderboard.verify.files import Findings, plain, shown
 from oodd_eval.leaderboard.verify.terms import Sums, Wrong, delays_of, wrong_terms
+from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS, split_name
@@ -104,6 +105,8 @@ def _is_complete(where: str, record: Record, findings: Findings) -> bool:
     levels = offered_levels(record.counts["calibration"], record.alarm)
     sums = {*METRICS, *(f"{name}_{suffix}" for suffix in levels for name in GUARANTEED)}
     single = {f"threshold_{suffix}" for suffix in levels}
+    if catalogue.HEADLINE in levels and not record.metrics.keys().isdisjoint(catalogue.ATTRIBUTION):
+        sums |= {*catalogue.ATTRIBUTION}  # of a detector that explains
     for part, expected in (("metrics", sums | single), ("per_trajectory", sums)):
         present = getattr(record, part).keys()
         for name in sorted(expected - present):
@@ -187,6 +190,9 @@ def _agreements(record: Record) -> Iterator[tuple[str, Any, Any, str]]:
     for name in of_twins:
         terms = record.per_trajectory.get(name)
         yield f"per_trajectory.{name}", fit, terms, "both are of the same fit on the same twins"
+    for name in catalogue.ATTRIBUTION:
+        reason = "a detector explains all of its alarms or none"
+        yield f"metrics.{name} is there", record.detector, name in record.metrics, reason
     for name in (n for n in record.metrics if n.startswith("threshold")):
         value = repr(record.value(name))
         yield f"metrics.{name}.value", fit, value, "both are of the same fit"

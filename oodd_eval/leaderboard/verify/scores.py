@@ -27,7 +27,7 @@ from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, compl
 from oodd_eval.leaderboard.verify.records import Records, compare_metrics, same
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
-from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory
+from oodd_eval.results.directory import EXPLAINED, ORDER_BITS, ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -40,6 +40,7 @@ PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES
 ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}  # curves have three digits and five decimals
 
 _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
+_EXPLAINED: Final = dict.fromkeys(EXPLAINED, np.dtype(np.int32))  # of anomalous parts, if at all
 _FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
 
 Json = dict[str, Any]
@@ -47,7 +48,7 @@ Complaints = Iterator[tuple[str, str]]  # places in a file and what is wrong wit
 
 _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
     (lambda d, _: isinstance(d, h5py.Dataset), "a dataset"),
-    (lambda d, dtype: d.dtype == dtype, "float64 scores and int64 offsets"),
+    (lambda d, dtype: d.dtype == dtype, "float64 scores, int64 offsets and int32 explanations"),
     (lambda d, _: d.shape is not None and d.ndim == 1 and d.size, "one dimension and not empty"),
     (lambda d, _: d.size <= MOST_VALUES, f"at most {MOST_VALUES} values"),
     (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
@@ -136,7 +137,9 @@ def _attributes(group: h5py.Group, names: Collection[str] = ()) -> Complaints:
 def _part(group: h5py.Group, part: str, horizon: int) -> Complaints:
     items: dict[str, Any] = {}
     found = list(_children(group, f"{part}/", items))
-    expected = {f"{part}/{key}": dtype for key, dtype in _DTYPES.items()}
+    explains = part not in (CALIBRATION, TWINS) and not group.keys().isdisjoint(_EXPLAINED)
+    dtypes = _DTYPES | _EXPLAINED if explains else _DTYPES
+    expected = {f"{part}/{key}": dtype for key, dtype in dtypes.items()}
     found += [(plain(n), "is no dataset of this format") for n in sorted(items.keys() - expected)]
     for name, dtype in expected.items():
         item = items.get(name)
@@ -149,6 +152,10 @@ def _part(group: h5py.Group, part: str, horizon: int) -> Complaints:
     if offsets[0] != 0 or (np.diff(offsets) < 1).any() or offsets[-1] != len(scores):
         yield f"{part}/offsets", f"do not rise from 0 to {len(scores)}, the number of scores"
         return
+    for name in (name for name in EXPLAINED if explains):
+        values = items[f"{part}/{name}"][:]
+        if len(values) != len(scores) or ((values < 0) != np.isnan(scores)).any():
+            yield f"{part}/{name}", "is not of all rows with a score, and negative for the others"
     most = max(horizon, MAX_WARM_UP)
     for i, sequence in enumerate(np.split(scores, offsets[1:-1])):
         undefined = np.isnan(sequence)

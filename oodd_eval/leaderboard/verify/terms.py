@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS
 
@@ -17,11 +18,12 @@ Wrong = Iterator[tuple[str, Mask, str]]
 """Metrics, the trajectories in which they are wrong, and what is expected instead."""
 
 _RATES: Final = {"far", "far_twin"}
-_MEANS: Final = ({*METRICS} | {*GUARANTEED}) - _RATES
+_MEANS: Final = {*METRICS, *GUARANTEED, *catalogue.ATTRIBUTION} - _RATES
 _AUCS: Final = {name for name in METRICS if name.startswith("auc")}
 _SHARES: Final = {
-    name for name in _MEANS if name.startswith(("missed", "early", "found", "false_episodes"))
-}
+    name for name in _MEANS
+    if name.startswith(("missed", "early", "found", "false_episodes", "sensor_named"))
+}  # fmt: skip
 _STEPS: Final = _MEANS - _AUCS - _SHARES
 
 _TERMS: Final[tuple[tuple[set[str], Callable[[Any, Any], Mask], str], ...]] = (
@@ -48,7 +50,9 @@ def delays_of(own: Sums) -> list[tuple[str, str, str]]:
 
 def wrong_terms(own: Sums) -> Wrong:
     """Yield every rule for single trajectories that the terms of a record break or keep."""
-    for suffix, names in (("", METRICS), *((f"_{level}", GUARANTEED) for level in _levels(own))):
+    explained = [name for name in catalogue.ATTRIBUTION if name in own]
+    plain = (*METRICS, *explained)
+    for suffix, names in (("", plain), *((f"_{level}", GUARANTEED) for level in _levels(own))):
         for kind in names:
             terms = own[kind + suffix]
             for kinds, mask, expected in _TERMS:
@@ -62,6 +66,9 @@ def wrong_terms(own: Sums) -> Wrong:
             yield from _first_alarms(own, missed, delay)
     for suffix in _levels(own):
         yield from _twins(own, suffix)
+    for name in explained:
+        wrong = own[name].denominator > own[f"delay_{catalogue.HEADLINE}"].denominator
+        yield name, wrong, f"undefined where delay_{catalogue.HEADLINE} is"
     for larger, smaller in zip(_levels(own), _levels(own)[1:], strict=False):
         for kind in ("false_episodes", "early"):
             name = f"{kind}_{smaller}"

@@ -10,6 +10,8 @@ from typing import IO, Any
 import numpy as np
 
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError
+from oodd_eval.plugins import contract
 from oodd_eval.plugins.conformance.side_effects import seeded_generators
 from oodd_eval.plugins.conformance.trial import (
     SENSORS,
@@ -23,6 +25,7 @@ from oodd_eval.plugins.conformance.trial import (
     offered,
 )  # fmt: skip
 from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector
+from oodd_eval.plugins.explanations import FLIPPED, checked_explanation, explains
 
 _PICKLE_SUFFIXES = frozenset({".pkl", ".pickle", ".joblib", ".dill"})
 
@@ -155,6 +158,35 @@ def check_streaming(trial: Trial) -> None:
             found = np.array(list(scores), dtype=np.float64)
         what = "update differs from score of the whole episode"
         must_equal(found, whole, what, tolerance=TOLERANCE)
+
+
+def check_explain(trial: Trial) -> None:
+    """Shares of explain add up to 1, onsets are not ahead, and a prefix gets the same of both."""
+    if not explains(trial.fitted()):
+        raise CheckSkipped("has no explain")
+    trajectory = noisy_from(trial.nominal(1)[0], trial.rows // 3)
+    scores, (whole, onsets) = trial.scores(trajectory), _explanation(trial, trajectory)
+    if (wrong := np.isnan(scores) != (onsets < 0)).any():
+        t = int(wrong.argmax())
+        message = f"explain gives the onset {onsets[t]} at t = {t}, where the score is {scores[t]}"
+        raise CheckFailedError(f"{message}: expected -1, and shares of NaN, where it is NaN only")
+    for n in _rows(trial):
+        shares, found = _explanation(trial, trajectory[:n])
+        same = np.isclose(shares, whole[:n], 0, contract.PROBE_TOLERANCE, equal_nan=True)
+        for what, differs in (("shares", ~same), ("onsets", found != onsets[:n])):
+            if differs.mean() > FLIPPED:
+                first = f"the first {n} of {len(trajectory)} observations alone have other {what}"
+                raise CheckFailedError(f"{first}: explain may use nothing after a row's time")
+
+
+def _explanation(trial: Trial, trajectory: Trajectory) -> contract.Explanation:
+    detector: Any = trial.fitted()
+    with doing("explain"):
+        returned = detector.explain(trajectory)
+    try:
+        return checked_explanation(returned, trajectory)
+    except ContractError as error:
+        raise CheckFailedError(str(error)) from None
 
 
 def _rows(trial: Trial) -> tuple[int, ...]:

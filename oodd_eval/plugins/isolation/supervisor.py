@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -55,14 +55,15 @@ class Limits:
 class Outcome:
     """Scores of a fit, or the way in which it failed.
 
-    `status` is as in a record, with a reason of one line unless ok. `scores` and `warm_up` are the
-    detector's own, not checked. Costs are None when the worker ended before they were known. `log`
-    is the end of the detector's output.
+    `status` is as in a record, with a reason of one line unless ok. `scores`, `warm_up` and what is
+    kept of explanations, if it has `explained`, are the detector's own, not checked. Costs are None
+    when the worker ended before they were known. `log` is the end of the detector's output.
     """
 
     status: str = "ok"
     reason: str = ""
     scores: list[object] = field(default_factory=list)
+    explained: list[object] = field(default_factory=list)
     warm_up: object = 0
     seconds_fit: float | None = None
     seconds_score: float | None = None
@@ -220,9 +221,12 @@ class Child:
 
 def run_isolated(
     request: Mapping[str, Any], train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]], *, limits: Limits, stop: Stop,
+    groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]] = (), *,
+    limits: Limits, stop: Stop,
 ) -> Outcome:  # fmt: skip
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
+
+    A detector that explains is asked to explain the groups `explained` in the same way, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed`` and ``horizon``, and
     the number of trajectories to ``train`` on. ``load`` is the directory of a kept fit, which
@@ -235,9 +239,10 @@ def run_isolated(
     child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
     # From another thread, so that neither side can deadlock on a full pipe.
     with ThreadPoolExecutor(1) as pool:
-        sent = pool.submit(_send, child, request, train, groups)
+        explains: Future[bool] = Future()
+        sent = pool.submit(_send, child, request, train, groups, explained, explains)
         try:
-            _converse(child, outcome)
+            _converse(child, outcome, explains)
         except GivenUpError as error:
             outcome.status, outcome.reason = error.status, error.reason
         except (ChannelGarbledError, KeyError, TypeError, ValueError):
@@ -249,6 +254,8 @@ def run_isolated(
             if not child.wait_for_exit(seconds=5.0):
                 outcome.reason = f"the worker closed its pipe while {doing}, without a result"
         finally:
+            if not explains.done():
+                explains.set_result(False)
             outcome.log = child.end()
     sent.result()
     if outcome.status == "error" and not outcome.reason:
@@ -260,9 +267,10 @@ def run_isolated(
     return outcome
 
 
-def _converse(child: Child, outcome: Outcome) -> None:
+def _converse(child: Child, outcome: Outcome, explains: "Future[bool]") -> None:
     """Receive the worker's messages into `outcome` until the last one."""
     channel, seconds, peak = child.channel, 0.0, 0.0
+    arrays = {"array": outcome.scores, "explanation": outcome.explained}
     while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
@@ -270,6 +278,7 @@ def _converse(child: Child, outcome: Outcome) -> None:
         if outcome.seconds_fit is None:
             outcome.warm_up = message["warm_up"]
             outcome.seconds_fit = float(message["seconds_fit"])
+            explains.set_result(bool(message["explains"]))
         elif "pid" in message:
             child.watch(message["pid"], forked=message["forked"])
         elif "peak_rss_mb" in message:
@@ -278,8 +287,8 @@ def _converse(child: Child, outcome: Outcome) -> None:
                 seconds, peak = seconds + float(message["seconds_score"]), max(peak, held)
             else:
                 outcome.seconds_score, outcome.peak_rss_mb = seconds, child.together([peak, held])
-        elif message["type"] == "array":
-            outcome.scores.append(channel.receive_array())
+        elif message["type"] in arrays:
+            arrays[message["type"]].append(channel.receive_array())
         else:
             wrong = f"score returned {message['type']}, expected a numpy array of float64"
             raise GivenUpError("invalid", wrong)
@@ -287,7 +296,8 @@ def _converse(child: Child, outcome: Outcome) -> None:
 
 def _send(
     child: Child, request: Mapping[str, Any], train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]],
+    groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]],
+    explains: "Future[bool]",
 ) -> None:  # fmt: skip
     channel = child.channel
     try:
@@ -295,17 +305,24 @@ def _send(
         for trajectory in train:
             channel.send_trajectory(trajectory)
         for group in groups:
-            channel.send({"group": True})
-            for chunk in _chunks(group):
-                channel.send({"score": len(chunk)})
-                for trajectory in chunk:
-                    channel.send_trajectory(trajectory)
-            channel.send({"score": 0})
+            _send_group(channel, group, explain=False)
+        # Last, as only what comes again is anomalous: no process that scores is told so.
+        for group in explained if explains.result() else ():
+            _send_group(channel, group, explain=True)
         channel.send({"group": False})
     except BrokenPipeError:
         pass  # The worker ended; the receiving side finds out why.
     finally:
         os.close(child.sending)
+
+
+def _send_group(channel: Channel, group: Iterable[Trajectory], *, explain: bool) -> None:
+    channel.send({"group": True})
+    for chunk in _chunks(group):
+        channel.send({"score": len(chunk), "explain": explain})
+        for trajectory in chunk:
+            channel.send_trajectory(trajectory)
+    channel.send({"score": 0})
 
 
 def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:

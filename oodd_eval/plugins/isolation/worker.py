@@ -7,7 +7,8 @@ Each group is scored by a fork of the fitted process, which ends with it. So not
 detector remembers of a group reaches the next one, and two episodes with the same seed, which agree
 bit for bit before the onset, never meet. A process with further threads cannot be forked safely (a
 GPU starts some), and further processes would be shared by all groups: the fit is saved, and loaded
-by a fresh process for each group. Files and shared memory are not watched.
+by a fresh process for each group. Files and shared memory are not watched. When all is scored, some
+groups come once more to a detector that explains, each in a process of its own as before.
 
 Messages have descriptors of their own, so that nothing that a detector prints gets between them.
 """
@@ -39,6 +40,7 @@ from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, TrajectoryError
 from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
 from oodd_eval.plugins.discovery import describe, offer_of
+from oodd_eval.plugins.explanations import explain_chunk, explains
 from oodd_eval.plugins.isolation import Channel
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
@@ -131,7 +133,8 @@ def serve(channel: Channel, descriptors: Sequence[str]) -> None:
             )
         order = json.dumps({**request, "load": saved, "train": 0})
         process = lambda: _start(descriptors, order)  # noqa: E731
-    channel.send({"seconds_fit": seconds_fit, "warm_up": getattr(detector, "warm_up", 0)})
+    known = {"warm_up": getattr(detector, "warm_up", 0), "explains": explains(detector)}
+    channel.send({"seconds_fit": seconds_fit, **known})
     while channel.receive()["group"]:
         if (code := process()) != SCORED:
             _end_like(code)
@@ -231,21 +234,21 @@ def _end_like(code: int) -> NoReturn:
 
 
 def _score_group(channel: Channel, detector: Detector, *, forked: bool = True) -> None:
-    """Score what comes until a chunk of zero, and end the processes that this has started."""
+    """Score, or explain, what comes until a chunk of zero, and end the processes of this."""
     channel.send({"pid": os.getpid(), "forked": forked})
     seconds = 0.0
-    while size := channel.receive()["score"]:
+    while size := (order := channel.receive())["score"]:
         chunk = [channel.receive_trajectory() for _ in range(size)]
         start = time.perf_counter()
-        scores = score_chunk(detector, chunk)
-        seconds += time.perf_counter() - start
-        for one in scores:
+        returned = (explain_chunk if order["explain"] else score_chunk)(detector, chunk)
+        seconds += 0.0 if order["explain"] else time.perf_counter() - start
+        for one in returned:
             if not isinstance(one, np.ndarray):
                 channel.send({"type": type(one).__name__})
             elif one.dtype.hasobject:
                 channel.send({"type": "ndarray of object"})
             else:
-                channel.send({"type": "array"})
+                channel.send({"type": "explanation" if order["explain"] else "array"})
                 channel.send_array(np.asarray(one))
     _end_children()
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})

@@ -13,7 +13,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
-from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, metric_info
+from oodd_eval.metrics.catalogue import ALARM_RANKING, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
@@ -128,8 +128,8 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
-    numerators, denominators = record.per_trajectory[metric]
-    return Contribution(np.array(numerators), np.array(denominators))
+    numerators, denominators = map(np.array, record.per_trajectory[metric])
+    return Contribution(numerators, denominators, metric in NAMES and metric_info(metric).median)
 
 
 def _mean(records: Iterable[Record], metric: str) -> float:

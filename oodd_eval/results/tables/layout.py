@@ -145,6 +145,27 @@ def guaranteed(
     return replace(_by_metric(board, title, columns, standings), note=note)
 
 
+def attribution(
+    board: Board, *, intervals: bool = False, standings: Sequence[Standing] = ()
+) -> Table | None:
+    """Return what detectors that explain say at their guaranteed alarms; None without any."""
+    explaining = {r.setting for r in board.records if r.metrics.keys() & {*catalogue.ATTRIBUTION}}
+    if not explaining:
+        return None
+    own = Board([r for r in board.records if r.setting in explaining])
+    names = catalogue.ATTRIBUTION
+    columns = [c._replace(title=c.title.partition(" at ")[0].lower())
+               for c in _overall(own, names, names if intervals else ())]  # fmt: skip
+    title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
+    note = (
+        "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
+        "sensor that they name first is a corrupted one, over sensor anomalies, and how far the "
+        "onset that they name is from the effect, the median of a cell."
+    )
+    placed = [one for one in standings if one.entry in explaining]
+    return replace(_by_metric(own, title, columns, placed), note=note)
+
+
 def _strictest(board: Board) -> str:
     """Return the suffix of the headline level, or of the strictest one that records have."""
     found = [s for s in catalogue.LEVELS if _present(board, [f"false_episodes_{s}"])]

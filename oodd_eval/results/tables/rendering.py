@@ -27,6 +27,7 @@ def _section(board: Board, *, intervals: bool) -> str:
     found = [
         layout.separability(board, intervals=intervals),
         layout.guaranteed(board, intervals=intervals),
+        layout.attribution(board, intervals=intervals),
         *(layout.anomaly_groups(board, h, intervals=intervals) for h in board.horizons),
         layout.all_metrics(board, intervals=intervals),
         *layout.all_alarms(board, intervals=intervals),

@@ -41,6 +41,7 @@ except ImportError as error:
     ) from error
 
 CONNECT_SECONDS: Final = 10.0
+_FILE: Final = ("parts", "cost", "order", "explained")  # what comes back of a unit's score file
 
 Message = dict[str, Any]
 
@@ -100,7 +101,7 @@ class DaskExecutor(Executor):
             self._running.discard(future)
         if "refused" in outcome:
             raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
-        file = ScoreFile(outcome["parts"], outcome["cost"], outcome["order"])
+        file = ScoreFile(**{name: outcome[name] for name in _FILE})
         return Scored(outcome["status"], outcome["reason"], file, outcome["log"])
 
     def stop(self) -> None:
@@ -173,8 +174,7 @@ def _scored(order: Message, stop: Stop) -> Message:
     )
     scored = UnitJob(plan, unit, data, offer)(Limits(**order["limits"]), stop, None, fresh=True)
     outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
-    file = scored.file
-    return {**outcome, "parts": file.parts, "cost": file.cost, "order": file.order}
+    return {**outcome, **{name: getattr(scored.file, name) for name in _FILE}}
 
 
 @functools.lru_cache(maxsize=16)

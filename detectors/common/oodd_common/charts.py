@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_mewma.forecast import product
-
 Floats = NDArray[np.float64]
+
+BLOCK: Final = 64
+"""Rows that are multiplied by a matrix at once."""
 
 
 def smooth(residuals: Floats, weights: Sequence[float]) -> Floats:
@@ -73,3 +75,18 @@ def distance(rows: Floats, root: Floats) -> Floats:
     whitened = product(rows, root)
     lengths: Floats = np.sqrt((whitened * whitened).sum(axis=1))
     return lengths
+
+
+def product(rows: Floats, matrix: Floats) -> Floats:
+    """Return ``rows @ matrix`` such that the bits of a row do not depend on how many follow it.
+
+    A matrix product picks its order of summation by the shapes. Blocks of one fixed shape, the last
+    one filled up with zeros, make the scores of a prefix the prefix of the scores exactly.
+
+    From (N, K) and (K, M) to (N, M).
+    """
+    n = len(rows)
+    blocks = np.zeros((-(-n // BLOCK), BLOCK, rows.shape[1]))
+    blocks.reshape(-1, rows.shape[1])[:n] = rows
+    multiplied: Floats = np.matmul(blocks, matrix).reshape(-1, matrix.shape[1])[:n]
+    return multiplied

@@ -1,0 +1,21 @@
+"""Where torch computes."""
+
+import torch
+
+from oodd_eval.errors import UsageError
+
+
+def chosen(detector: str, device: str) -> str:
+    """Return the device that a detector's parameter asks for: ``"cpu"`` or ``"cuda"``.
+
+    ``"auto"`` is cuda where there is one. Raises `UsageError` for cuda where there is none.
+    """
+    found = torch.cuda.is_available()
+    if device == "cuda" and not found:
+        raise UsageError(
+            f"parameter 'device' of {detector} is 'cuda', expected auto or cpu, since torch finds "
+            "no CUDA device here"
+        )
+    if device == "auto":
+        return "cuda" if found else "cpu"
+    return device

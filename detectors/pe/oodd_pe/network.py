@@ -1,0 +1,205 @@
+"""The ensemble's networks: forecasts of a whole distribution, and their training.
+
+A network describes the change of all sensors, in units of the errors of a linear forecast. It gives
+means, scales, a triangular matrix of dependences, and how heavy each tail is, all by the inputs.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+import torch
+from oodd_common.charts import Floats
+from oodd_torch.optimizers import Adam, Average, Muon
+from torch import Tensor
+from torch.nn import Parameter
+from torch.nn.functional import silu, smooth_l1_loss
+
+from oodd_eval.plugins.state import Arrays, take
+
+LAYERS: Final = 3
+RATE: Final = 8e-3
+"""Learning rate of biases and output layers."""
+HIDDEN_RATE: Final = 0.03
+"""Learning rate of the weights of hidden layers, by Muon."""
+DECAY: Final = 0.998
+WARM_UP: Final = 100
+"""Updates in which the rates rise from 0."""
+MEAN_FIRST: Final = 0.25
+"""Share of the updates in which squared errors weigh more than the likelihood.
+
+A likelihood alone widens the scales of what it could still learn to forecast.
+"""
+LOG_SCALE: Final = 12.0
+"""Largest size of the logarithm of a scale."""
+LOG_TAIL: Final = math.log(8.0)
+"""Half the logarithm of the largest degrees of freedom, 64; the least are 1."""
+
+
+class Forecast(NamedTuple):
+    """What M networks say of N rows of D sensors.
+
+    Attributes
+    ----------
+    residual
+        Whitened residuals e = s (I + U) (y - mean), (M, N, D).
+    log_scale
+        Logarithms of s, (M, N, D).
+    log_tail
+        Logarithms of the degrees of freedom of each residual's t distribution, (M, N, D).
+    mean
+        Forecasts, (M, N, D).
+    dependence
+        Entries of U below the diagonal, row after row, (M, N, D (D - 1) / 2).
+    """
+
+    residual: Tensor
+    log_scale: Tensor
+    log_tail: Tensor
+    mean: Tensor
+    dependence: Tensor
+
+    def surprise(self) -> Tensor:
+        """Return the negative log likelihoods of the rows, (M, N)."""
+        nu = self.log_tail.exp()
+        half = (nu + 1) / 2
+        log_density = (
+            torch.lgamma(half)
+            - torch.lgamma(nu / 2)
+            - 0.5 * (self.log_tail + math.log(math.pi))
+            + self.log_scale
+            - half * torch.log1p(self.residual.square() / nu)
+        )
+        return -log_density.sum(-1)
+
+    def deviance(self) -> Tensor:
+        r"""Return signed deviance residuals, (M, N, D).
+
+        :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
+        normal distribution where e has Student's t distribution with nu degrees of freedom.
+        """
+        nu = self.log_tail.exp()
+        squared = (nu + 1) * torch.log1p(self.residual.square() / nu)
+        return torch.sign(self.residual) * squared.sqrt()
+
+    def of_sensors(self, row: Tensor, column: Tensor) -> Tensor:
+        r"""Return what an error of one sensor alone would explain, in standard deviations.
+
+        With the precision :math:`\Lambda = L^\top L`, L = s (I + U), of the errors y - mean, these
+        are :math:`(\Lambda (y - \mu))_d / \sqrt{\Lambda_{dd}}`: by how much their squared length
+        would fall if the reading of sensor d were free. ``row`` and ``column`` place the entries of
+        U. Of shape (M, N, D).
+        """
+        scale = self.log_scale.exp()
+        pulled = scale * self.residual
+        slope = pulled.index_add(-1, column, self.dependence * pulled[..., row])
+        squares = scale.square()
+        squares = squares.index_add(-1, column, self.dependence.square() * squares[..., row])
+        return slope / squares.sqrt()
+
+
+class DensityNetworks(torch.nn.Module):
+    """M independent networks that forecast densities, trained and evaluated together.
+
+    Parameters
+    ----------
+    members, inputs, sensors, width
+        M, I, D and units of each hidden layer.
+    seed
+        Decides the initial weights.
+    """
+
+    def __init__(self, members: int, inputs: int, sensors: int, width: int, seed: int = 0) -> None:
+        super().__init__()
+        self.members, self.sensors = members, sensors
+        random = torch.Generator().manual_seed(seed)
+
+        def drawn(rows: int, columns: int, size: float = 1.0) -> Parameter:
+            weights = torch.randn(members, rows, columns, generator=random)
+            return Parameter(weights * (size / math.sqrt(rows)))
+
+        sizes = [inputs] + [width] * LAYERS
+        outputs = 3 * sensors + sensors * (sensors - 1) // 2
+        self.weights = torch.nn.ParameterList(map(drawn, sizes[:-1], sizes[1:]))
+        self.biases = torch.nn.ParameterList(
+            Parameter(torch.zeros(members, 1, width)) for _ in range(LAYERS)
+        )
+        self.out = drawn(width, outputs, 0.1)
+        self.out_bias = Parameter(torch.zeros(members, 1, outputs))
+        row, column = np.tril_indices(sensors, -1)
+        self.row: Tensor
+        self.column: Tensor
+        self.register_buffer("row", torch.from_numpy(row), persistent=False)
+        self.register_buffer("column", torch.from_numpy(column), persistent=False)
+
+    def forward(self, x: Tensor, y: Tensor) -> Forecast:
+        """Judge outcomes y, (M, N, D), by inputs x, (M, N, I)."""
+        hidden = silu(torch.baddbmm(self.biases[0], x, self.weights[0]))
+        for weights, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            hidden = hidden + silu(torch.baddbmm(bias, hidden, weights))
+        out = torch.baddbmm(self.out_bias, hidden, self.out)
+        d = self.sensors
+        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[-1] - 3 * d], -1)
+        log_scale = LOG_SCALE * torch.tanh(scale / LOG_SCALE)
+        log_tail = LOG_TAIL * (1 + torch.tanh(tail))
+        error = y - mean
+        known = dependence * error[..., self.column]
+        conditional = error.index_add(-1, self.row, known)
+        return Forecast(log_scale.exp() * conditional, log_scale, log_tail, mean, dependence)
+
+    def frozen(self) -> Self:
+        """Make the networks ready to judge: on the processor, in double precision."""
+        return self.requires_grad_(requires_grad=False).cpu().double()
+
+    def arrays(self) -> Arrays:
+        """Return the weights by name."""
+        return {name: p.detach().numpy() for name, p in self.named_parameters()}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over the weights of `arrays`; raises `FittedStateError` for others."""
+        for name, p in self.named_parameters():
+            p.data = torch.from_numpy(take(arrays, name, tuple(p.shape)))
+        self.frozen()
+
+
+def train(
+    network: DensityNetworks,
+    x: Floats,
+    y: Floats,
+    *,
+    updates: int,
+    batch: int,
+    seed: int,
+    device: str,
+) -> None:
+    """Maximize the likelihood of outcomes y, (N, D), given inputs x, (N, I), in place.
+
+    Every member draws batches of its own. The weights are averaged over the last updates. What is
+    trained in single precision is used in double.
+    """
+    random = np.random.default_rng([seed, 1])
+    network.to(device)
+    inputs = torch.from_numpy(x.astype(np.float32)).to(device)
+    outcomes = torch.from_numpy(y.astype(np.float32)).to(device)
+    rest = [*network.biases, network.out, network.out_bias]
+    hidden, others = Muon(network.weights), Adam(rest)
+    average = Average(network.parameters(), DECAY)
+    one = torch.ones(network.members, device=device)
+    for update in range(updates):
+        drawn = random.integers(0, len(x), (network.members, batch))
+        rows = torch.from_numpy(drawn).to(device)
+        target = outcomes[rows]
+        forecast = network(inputs[rows], target)
+        loss = forecast.surprise().mean(1).sum() / network.sensors
+        if update < MEAN_FIRST * updates:
+            errors = smooth_l1_loss(forecast.mean, target, beta=0.3, reduction="none")
+            loss = 0.3 * loss + 3.0 * errors.mean((1, 2)).sum()
+        loss.backward()
+        decay = 0.5 * (1 + math.cos(math.pi * update / updates))
+        rate = min(1.0, (update + 1) / WARM_UP) * (decay + 1e-3)
+        others.step(RATE * rate * one)
+        hidden.step(HIDDEN_RATE * rate * one)
+        average.update()
+    average.apply()

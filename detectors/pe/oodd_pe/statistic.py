@@ -1,0 +1,225 @@
+"""From residuals to one statistic: charts of several memories, brought to one scale.
+
+What an ensemble says of one step is weak evidence of a small change; what it says of many steps
+with the same sign is strong. Each chart adds up residuals with another memory. The statistic is the
+largest of their distances from nominal operation, each in units of how far it gets in an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from oodd_common.charts import Floats, Smoother, distance, whitening
+
+from oodd_eval.plugins.forecasting import CONSTANT
+from oodd_eval.plugins.state import Arrays, take
+
+BINS: Final = 5
+"""Groups of equal size, by the forecast tail, in which residuals are brought to one scale."""
+PRIOR: Final = 50
+"""Rows of average size that are added to each group, so that small groups stay near the average."""
+LARGEST: Final = 36.0
+"""Limit of a squared residual in these averages."""
+SMALLEST: Final = 0.05
+"""Least scale of a residual."""
+ENERGY: Final = 9.0
+"""Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
+MOVEMENT: Final = 0.5
+"""Share of the median movement below which a step counts as less than one in the sums."""
+REFERENCE: Final = 2.0
+"""Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
+SHRINKAGE: Final = 0.02
+"""Least share of the identity in a correlation matrix."""
+
+
+class Evidence(NamedTuple):
+    """What an ensemble says of N steps of an episode.
+
+    Attributes
+    ----------
+    residuals
+        Signed deviance residuals, means over the members, (N, D); then one column a constant
+        sensor.
+    log_tails
+        Logarithms of the degrees of freedom that were forecast, (N, D).
+    movement
+        How far the sensors moved since the step before: root mean square, in training standard
+        deviations, (N,).
+    of_sensors
+        Squared standard deviations that an error of one sensor alone would explain, (N, sensors);
+        without columns where nobody asks which sensor it was.
+    """
+
+    residuals: Floats
+    log_tails: Floats
+    movement: Floats
+    of_sensors: Floats
+
+
+class Charts:
+    """Charts of D sensors that vary and any that do not, one for each of W memories.
+
+    The first has no memory: it judges a step by itself. Fitted attributes:
+
+    knots_, scales_
+        Root mean squares of residuals by the logarithm of the tail, each (D, bins).
+    centre_, energy_, spread_
+        Means of the columns, (C - 1,), mean and standard deviation of their energy, each ().
+    still_
+        Movement from which a step counts fully, ().
+    roots_
+        Matrices by which distances of smoothed columns are measured, (W, C, C).
+    median_, reach_
+        Median distance, and how far beyond it an episode's largest is, each (W, 1).
+    """
+
+    def __init__(self, memories: Sequence[float]) -> None:
+        self.memories = list(memories)
+
+    def fit(self, episodes: Sequence[Evidence]) -> None:
+        """Learn from nominal episodes that the ensemble was not trained on."""
+        residuals = np.concatenate([e.residuals for e in episodes])
+        tails = np.concatenate([e.log_tails for e in episodes])
+        squares = np.minimum(residuals[:, : tails.shape[1]] ** 2, LARGEST)
+        prior = PRIOR * squares.mean(axis=0)
+        groups = np.array_split(np.argsort(tails, axis=0, kind="stable"), min(BINS, len(tails)))
+        self.knots_ = np.stack([np.take_along_axis(tails, g, 0).mean(axis=0) for g in groups], 1)
+        sums = [np.take_along_axis(squares, g, 0).sum(axis=0) for g in groups]
+        means = [(s + prior) / (len(g) + PRIOR) for s, g in zip(sums, groups, strict=True)]
+        self.scales_ = np.maximum(np.sqrt(np.stack(means, axis=1)), SMALLEST)
+        self.still_ = MOVEMENT * np.median(np.concatenate([e.movement for e in episodes]))
+        self.centre_, self.energy_ = np.zeros(residuals.shape[1]), np.zeros(())
+        columns = np.concatenate([self.columns(e) for e in episodes])
+        self.centre_, self.energy_ = columns[:, :-1].mean(axis=0), columns[:, -1].mean()
+        self.spread_ = columns[:, -1].std()
+
+        smoothed = [Running(self)(e) for e in episodes]
+        pooled = np.concatenate(smoothed, axis=1)
+        weights = [1.0, *self.memories]
+        self.roots_ = np.stack([_root(z, w) for z, w in zip(pooled, weights, strict=True)])
+        distances = [self._distances(z) for z in smoothed]
+        largest = np.stack([x.max(axis=1) for x in distances], axis=1)
+        median = np.median(np.concatenate(distances, axis=1), axis=1)
+        reach = largest.mean(axis=1) + largest.std(axis=1) - median
+        self.median_ = median[:, None]
+        self.reach_ = np.where(reach < CONSTANT, 1.0, reach)[:, None]
+
+    def standardized(self, evidence: Evidence) -> Floats:
+        """Return residuals in units of what is nominal where such a tail was forecast."""
+        d = len(self.knots_)
+        # Linear between the knots: the first scale and the part of every slope that is behind.
+        gaps = np.diff(self.knots_, axis=1)
+        slopes = np.diff(self.scales_, axis=1) / np.where(gaps > 0, gaps, 1.0)
+        passed = evidence.log_tails[:, :, None] - self.knots_[:, :-1]
+        scales = self.scales_[:, 0] + (slopes * np.clip(passed, 0.0, gaps)).sum(axis=2)
+        scaled: Floats = evidence.residuals.copy()
+        scaled[:, :d] /= scales
+        scaled[:, d:] /= SMALLEST
+        return scaled
+
+    def columns(self, evidence: Evidence) -> Floats:
+        """Return centred residuals and their energy, (N, C)."""
+        u = self.standardized(evidence) - self.centre_
+        energy = np.minimum(u**2, ENERGY).mean(axis=1, keepdims=True)
+        return np.concatenate([u, energy - self.energy_], axis=1)
+
+    def _distances(self, smoothed: Floats) -> Floats:
+        pairs = zip(smoothed, self.roots_[: len(smoothed)], strict=True)
+        return np.stack([distance(z, root) for z, root in pairs])
+
+    def statistic(self, smoothed: Floats) -> Floats:
+        """Return the distances of smoothed columns on their common scale: (W, N, C) to (W, N)."""
+        w = len(smoothed)
+        scaled: Floats = (self._distances(smoothed) - self.median_[:w]) / self.reach_[:w]
+        return scaled
+
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        return {name: np.asarray(getattr(self, name + "_")) for name in SHAPES}
+
+    def restore(self, arrays: Arrays, sensors: int, constant: int) -> None:
+        """Take over fitted charts of so many varying and constant sensors."""
+        w, c = len(self.memories) + 1, sensors + constant + 1
+        lengths = {"D": sensors, "W": w, "C": c, "R": c - 1, "1": 1, "B": None}
+        for name, shape in SHAPES.items():
+            setattr(self, name + "_", take(arrays, name, tuple(lengths[n] for n in shape)))
+
+
+SHAPES: Final = {
+    "knots": "DB",
+    "scales": "DB",
+    "centre": "R",
+    "energy": "",
+    "spread": "",
+    "still": "",
+    "roots": "WCC",
+    "median": "W1",
+    "reach": "W1",
+}
+
+
+class Running:
+    """The sums of an episode so far: each call continues where the last one ended."""
+
+    def __init__(self, charts: Charts, *, accumulate: bool = True) -> None:
+        self._charts = charts
+        self._smoother = Smoother(charts.memories, len(charts.centre_) + 1) if accumulate else None
+
+    def __call__(self, evidence: Evidence) -> Floats:
+        """Return the columns of the next N steps, and their sums: (W, N, C)."""
+        columns = self._charts.columns(evidence)
+        if self._smoother is None:
+            return columns[None]
+        # A robot that stands still repeats one error: a hundred such steps are not a hundred
+        # pieces of evidence.
+        share = np.minimum(1.0, evidence.movement / max(float(self._charts.still_), CONSTANT))
+        return np.concatenate([columns[None], self._smoother(columns * share[:, None])])
+
+
+class Attribution:
+    """Which sensors the evidence of an episode so far points at, and since when.
+
+    The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
+    of two nominal standard deviations. A sensor's share is its part of what errors of single
+    sensors would explain, averaged over the steps since then with their energy as weight.
+    """
+
+    def __init__(self, charts: Charts, first: int) -> None:
+        self._charts, self._now = charts, first
+        self._sum, self._onset = 0.0, first
+        self._weighted: Floats = np.zeros(0)
+
+    def __call__(self, evidence: Evidence) -> tuple[Floats, NDArray[np.int64]]:
+        """Return shares, (N, sensors), and onsets, (N,), of the next N steps."""
+        parts = np.maximum(evidence.of_sensors, CONSTANT)
+        parts = parts / parts.sum(axis=1, keepdims=True)
+        excess = self._charts.columns(evidence)[:, -1]
+        shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
+        for n, (part, more) in enumerate(zip(parts, excess, strict=True)):
+            if self._sum <= 0:
+                self._onset, self._weighted = self._now, np.zeros(len(part))
+            self._sum = max(0.0, self._sum + more - REFERENCE * float(self._charts.spread_))
+            weight = max(more + float(self._charts.energy_), CONSTANT)
+            self._weighted = self._weighted + weight * part
+            shares[n] = self._weighted / self._weighted.sum()
+            onsets[n] = self._onset
+            self._now += 1
+        return shares, onsets
+
+
+def _root(smoothed: Floats, weight: float) -> Floats:
+    """Return the matrix that makes Mahalanobis lengths of rows like these, (N, C), about zero.
+
+    Correlations are shrunk towards none, the more the fewer independent rows there are: sums with
+    weight w forget in 1 / w rows.
+    """
+    n, c = smoothed.shape
+    size = np.sqrt((smoothed**2).mean(axis=0))
+    size = np.where(size < CONSTANT, 1.0, size)
+    scaled = smoothed / size
+    shrinkage = max(SHRINKAGE, c / (max(1.0, n * weight) + c))
+    root: Floats = whitening(scaled.T @ scaled / n, shrinkage) / size[:, None]
+    return root

@@ -1,0 +1,90 @@
+"""Explanations: the checks that they honour the contract, and what the harness keeps of them."""
+
+from collections.abc import Sequence
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError
+from oodd_eval.plugins.contract import TOLERANCE, ExplainingDetector, Explanation, Scores
+
+Named: TypeAlias = NDArray[np.int32]
+"""What is kept of an explanation, shape (2, T + 1): sensors named first and onsets, or -1."""
+
+FLIPPED: Final = 0.05
+"""Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
+
+
+def explains(detector: object) -> bool:
+    """Tell whether a detector offers explanations."""
+    return isinstance(detector, ExplainingDetector)
+
+
+def explain_chunk(detector: Any, chunk: Sequence[Trajectory]) -> list[object]:
+    """Return what is kept of a detector's explanations, after they were checked."""
+    checked = (checked_explanation(detector.explain(one), one) for one in chunk)
+    # Of several with the largest share the first one is named.
+    return [
+        np.array([np.where(o < 0, -1, np.nan_to_num(s).argmax(axis=1)), o], dtype=np.int32)
+        for s, o in checked
+    ]
+
+
+def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
+    """Return what ``explain`` returned for a trajectory; `ContractError` against the contract."""
+    rows, sensors = trajectory.observations.shape
+    try:
+        shares, onsets = returned
+    except (TypeError, ValueError):
+        kind = type(returned).__name__
+        raise ContractError(f"explain returned {kind}, expected shares and onsets") from None
+    for name, array, form in (
+        ("shares", shares, f"float64 of shape {(rows, sensors)}"),
+        ("onsets", onsets, f"int64 of shape {(rows,)}"),
+    ):
+        is_array = isinstance(array, np.ndarray)
+        found = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
+        if found != form:
+            raise ContractError(f"explain returned {name} as {found}, expected {form}")
+    undefined = np.isnan(shares).all(axis=1)
+    parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= TOLERANCE)
+    known = (onsets >= 0) & (onsets <= np.arange(rows))
+    for name, array, fine, expected in (
+        ("shares", shares, undefined | parts, "parts of 1, or NaN alone where it is undefined"),
+        ("onset", onsets, np.where(undefined, onsets == -1, known),
+         "a row from 0 to t, or -1 where the shares are NaN"),
+    ):  # fmt: skip
+        if not fine.all():
+            t = int(fine.argmin())
+            raise ContractError(f"explain gives the {name} {array[t]} at t = {t}: {expected}")
+    return Explanation(shares, onsets)
+
+
+def check_named(
+    found: object, scores: Scores, sensors: int, where: str, whole: Named | None = None
+) -> Named:
+    """Return what came from a worker, if it can explain these scores; else `ContractError`.
+
+    Where the scores are of a prefix, `whole` is what is kept for the episode.
+    """
+    rows = len(scores)
+    if not isinstance(found, np.ndarray) or found.dtype != np.int32 or found.shape != (2, rows):
+        raise ContractError(f"no explanation came back for {where}")
+    known = ((found >= 0) & (found <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
+    fine = np.where(np.isnan(scores), (found == -1).all(axis=0), known)
+    if not fine.all():
+        t = int(fine.argmin())
+        raise ContractError(
+            f"explain names sensor {found[0, t]} and onset {found[1, t]} at t = {t} of {where}, "
+            f"with the score {scores[t]}: expected both where it is defined, and -1 elsewhere"
+        )
+    differing = (found != (found if whole is None else whole[:, :rows])).any(axis=0)
+    if differing.mean() > FLIPPED:
+        raise ContractError(
+            f"explain names another sensor or onset at {differing.sum()} of the first {rows} "
+            f"observations of {where} when they are all it gets: expected the same, as it may use "
+            "nothing after a row's time (`oodd-eval check` with -k explain)"
+        )
+    return found

@@ -1,0 +1,453 @@
+"""Attribution: explanations of detectors, what is kept of them, and the metrics that come of it."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import Explanation, Trajectory, evaluate, load_split
+from oodd_eval.cli.main import main
+from oodd_eval.data.parts import CALIBRATION, TWINS, lengths_of, parts_of
+from oodd_eval.errors import ContractError
+from oodd_eval.leaderboard.verify.files import Findings
+from oodd_eval.leaderboard.verify.records import check_record, check_together
+from oodd_eval.leaderboard.verify.scores import check_scores
+from oodd_eval.metrics.alarms import GuaranteedAlarm, attribution_contributions
+from oodd_eval.metrics.auc import Contribution, mean_of
+from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
+from oodd_eval.metrics.catalogue import ATTRIBUTION
+from oodd_eval.plugins.contract import PROBES
+from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.tables import layout
+from oodd_eval.results.tables.board import ranked
+
+NAN = float("nan")
+SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION
+
+PLUGIN = '''
+import os
+import numpy as np
+from oodd_eval import DetectorSpec, Explanation, hookimpl
+
+
+class Silent:
+    """Largest change of a sensor, in its usual spread."""
+    def __init__(self, *, seed=0, horizon=1): pass
+    def fit(self, nominal):
+        changes = [np.diff(x.observations, axis=0) for x in nominal]
+        self.std = np.concatenate(changes).std(axis=0) + 1e-6
+    def changes(self, x):
+        before = np.concatenate([x.observations[:1], x.observations[:-1]])
+        return abs(x.observations - before).astype(float) / self.std
+    def score(self, x):
+        scores = self.changes(x).max(axis=1)
+        scores[:1] = np.nan
+        return scores
+
+
+class Tells(Silent):
+    """Names the sensor that changed most; the onset is the row, or the largest change so far."""
+    def explain(self, x):
+        if "EXPLAIN_LOG" in os.environ:
+            with open(os.environ["EXPLAIN_LOG"], "a") as log:
+                print(os.getpid(), len(x), file=log)
+        changes = self.changes(x) + 1e-9
+        shares = changes / changes.sum(axis=1, keepdims=True)
+        shares[:1] = np.nan
+        onsets = np.arange(len(x))
+        onsets[:1] = -1
+        return Explanation(shares, onsets)
+
+
+class Fails(Tells):
+    def explain(self, x): raise RuntimeError("no idea")
+
+
+class Overstates(Tells):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return 2 * shares, onsets
+
+
+class TooMuch(Tells):
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        return np.nan_to_num(shares, nan=1 / shares.shape[1]), np.maximum(onsets, 0)
+
+
+class Ahead(Tells):
+    """Knows the whole episode."""
+    def explain(self, x):
+        shares, onsets = super().explain(x)
+        last = shares[-1]
+        return np.where(np.isnan(shares), np.nan, last[np.argsort(last * len(x) % 1e-3)]), onsets
+
+
+class Lasting(Tells):
+    """Cannot be forked after its fit, and is loaded for every group."""
+    def fit(self, nominal):
+        import threading, time
+        super().fit(nominal)
+        threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+    def save(self, directory): np.save(directory / "std.npy", self.std)
+    def load(self, directory): self.std = np.load(directory / "std.npy", allow_pickle=False)
+
+
+@hookimpl
+def oodd_detectors():
+    own = Silent, Tells, Fails, Overstates, TooMuch, Ahead, Lasting
+    return [DetectorSpec(c.__name__.lower(), c, "a test's", deterministic=True) for c in own]
+'''
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A plug-in of detectors that explain, and results of some of them in one directory."""
+    home = tmp_path_factory.mktemp("explained")
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch, home / "plugin", "explained", PLUGIN, header="")
+        patch.setenv("PYTHONPATH", str(home / "plugin"))
+        patch.setenv("EXPLAIN_LOG", str(home / "log"))
+        found = {
+            name: evaluate(name, environments="cartpole", anomalies="iid,drift,gravity",
+                           output=home / "results")
+            for name in ("silent", "tells")
+        }  # fmt: skip
+        patch.delenv("EXPLAIN_LOG")
+        yield home, found
+
+
+# Metrics
+
+
+def test_metrics_of_hand_made_explanations():
+    rule = GuaranteedAlarm(None, 5.0)  # an alarm where the score is above 5
+    quiet, loud = np.zeros(10), np.zeros(10)
+    loud[6:] = 9.0
+    undefined = np.where(np.arange(10) < 2, NAN, loud)
+    explained = np.full((2, 10), -1, dtype=np.int32)
+    explained[:, 6] = 3, 2
+    other = explained.copy()
+    other[:, 6] = 0, 6
+    found = attribution_contributions(
+        [loud, loud, quiet, loud, undefined, loud],
+        [explained, other, explained, explained, other, explained],
+        [[1, 3], [1, 3], [3], [3], (), [3]],
+        [4, 6, 4, 7, 5, 6],
+        rule,
+    )
+    named, error = found["sensor_named"], found["onset_error"]
+    # Without an alarm or with an early one (e = 7) nothing is defined; no sensor in the fifth one.
+    assert named.denominator.tolist() == [1, 1, 0, 0, 0, 1]
+    assert named.numerator.tolist() == [1, 0, 0, 0, 0, 1]
+    assert named.value == pytest.approx(2 / 3)
+    assert error.denominator.tolist() == [1, 1, 0, 0, 1, 1]
+    assert error.numerator.tolist() == [2, 0, 0, 0, 1, 4]
+    assert (error.value, error.n) == (1.5, 4)
+
+
+def test_without_a_detected_anomaly_nothing_is_defined():
+    rule, nothing = GuaranteedAlarm(None, 5.0), np.full((2, 4), -1, dtype=np.int32)
+    found = attribution_contributions([np.zeros(4)], [nothing], [[0]], [1], rule)
+    assert all(np.isnan(c.value) and c.n == 0 for c in found.values())
+
+
+@pytest.mark.parametrize("values", [[5.0], [1.0, 2.0, NAN, 8.0, 3.0], [4.0, NAN, 4.0, 0.0], [NAN]])
+def test_medians_of_resamples_are_those_of_what_was_drawn(values):
+    weights = bootstrap_weights(len(values), resamples=200)
+    found = resampled(mean_of(values, median=True), weights)
+    for median, counts in zip(found, weights.astype(int), strict=True):
+        drawn = np.repeat(values, counts)
+        drawn = drawn[~np.isnan(drawn)]
+        assert np.array_equal(median, np.median(drawn) if drawn.size else NAN, equal_nan=True)
+
+
+def test_a_median_is_that_of_the_defined():
+    assert mean_of([3.0, NAN, 1.0, 2.0], median=True).value == 2.0
+    assert np.isnan(mean_of([NAN], median=True).value)
+    assert Contribution(np.array([3.0, 1.0]), np.ones(2)).value == 2.0
+
+
+# What is kept, and checked
+
+
+class Two:
+    """Explains two sensors; the second one is due at even rows."""
+
+    def fit(self, nominal): ...
+
+    def score(self, x):
+        return np.zeros(len(x))
+
+    def explain(self, x):
+        second = np.arange(len(x)) % 2 == 0
+        return Explanation(np.stack([~second, second], axis=1) / 1.0, np.arange(len(x)) // 2)
+
+
+def test_the_sensor_with_the_largest_share_is_kept():
+    (found,) = explain_chunk(Two(), [Trajectory(np.zeros((4, 2)))])
+    assert found.dtype == np.int32
+    assert found.tolist() == [[1, 0, 1, 0], [0, 0, 1, 1]]
+    assert explains(Two())
+    assert not explains(GuaranteedAlarm(None, 1.0))
+
+
+WHOLE = np.array([[-1, *[0] * 39], [-1, *[1] * 39]], dtype=np.int32)
+SCORES = np.array([NAN, *[0.0] * 39])
+
+
+def changed(row, at, value):
+    found = WHOLE.copy()
+    found[row, at] = value
+    return found
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (WHOLE.astype(np.int64), "no explanation came back"),
+        (WHOLE[:, :-1], "no explanation came back"),
+        ("WHOLE", "no explanation came back"),
+        (changed(0, 3, 2), "names sensor 2 and onset 1 at t = 3"),
+        (changed(1, 3, 4), "names sensor 0 and onset 4 at t = 3"),
+        (changed(1, 3, -1), "names sensor 0 and onset -1 at t = 3"),
+        (changed(0, 0, 0), "with the score nan"),
+        (changed(0, slice(7, 10), 1), "another sensor or onset at 3 of the first 40"),
+        (changed(1, slice(7, 10), 5), "another sensor or onset at 3 of the first 40"),
+    ],
+)
+def test_what_cannot_be_an_explanation_is_refused(found, message):
+    with pytest.raises(ContractError, match=message):
+        check_named(found, SCORES, 2, "hopper/test/iid[0]", WHOLE)
+
+
+def test_rounding_may_turn_a_row_of_a_prefix():
+    assert check_named(changed(0, 7, 1), SCORES, 2, "here", WHOLE) is not None
+    assert check_named(WHOLE[:, :20], SCORES[:20], 2, "here", WHOLE) is not None
+
+
+# Storage
+
+
+def test_explanations_are_stored_beside_scores_and_read_back(tmp_path):
+    results = ResultsDirectory(tmp_path)
+    results.prepare()
+    scores, named = [SCORES, SCORES[:5]], [WHOLE, WHOLE[:, :5]]
+    nominal = {CALIBRATION: scores, TWINS: scores}
+    results.write_scores(
+        "a", ScoreFile({**nominal, "test/iid": scores}, {}, 1, {"test/iid": named})
+    )
+    # A later run adds a part, without explanations as of an earlier version.
+    results.write_scores("a", ScoreFile({**nominal, "test/drift": scores}, {}, 2))
+    lengths = {part: [40, 5] for part in (*nominal, "test/iid", "test/drift")}
+    found = results.scores("a", lengths)
+    assert list(found.explained) == ["test/iid"]
+    for one, other in zip(found.explained["test/iid"], named, strict=True):
+        assert one.dtype == np.int32
+        assert np.array_equal(one, other)
+    with h5py.File(tmp_path / "scores/a.h5") as file:
+        assert {*file["test/iid"]} == {"scores", "offsets", "sensors", "onsets"}
+        assert {*file["test/drift"]} == {*file[TWINS]} == {"scores", "offsets"}
+    with h5py.File(tmp_path / "scores/a.h5", "r+") as file:
+        for name in ("sensors", "onsets"):
+            del file["test/iid"][name]
+            file["test/iid"][name] = np.zeros(44, dtype=np.int32)
+    assert results.scores("a", lengths) is None
+
+
+# A run
+
+
+def test_records_have_the_metrics_of_detectors_that_explain_only(world):
+    _, found = world
+    for record in found["silent"]:
+        assert record.ok
+        assert not {*ATTRIBUTION} & (record.metrics.keys() | record.per_trajectory.keys())
+    for record in found["tells"]:
+        assert record.ok, record.reason
+        named, error = (record.metrics[name] for name in ATTRIBUTION)
+        delays = record.per_trajectory["delay_at_5pct"]
+        # It names the row of the alarm, so that its error is the delay.
+        assert record.per_trajectory[ONSET_ERROR] == delays
+        assert error.n == sum(delays[1])
+        if error.n:
+            defined = [d for d, known in zip(*delays, strict=True) if known]
+            assert error.value == np.median(defined)
+            assert error.low <= error.value <= error.high
+        assert named.n == (error.n if record.group == "sensor" else 0)
+    iid = next(r for r in found["tells"] if r.anomaly == "iid")
+    assert iid.metrics[SENSOR_NAMED].value > 0.5
+
+
+def test_only_the_anomalous_are_explained_each_group_in_a_process_of_its_own(world):
+    home, _ = world
+    calls = [tuple(map(int, line.split())) for line in (home / "log").read_text().splitlines()]
+    with load_split("mini").opened() as opened:
+        data = opened("cartpole")
+        lengths = lengths_of(parts_of(data, ["iid", "drift", "gravity"]), None)
+    anomalous = [own for part, own in lengths.items() if part not in (CALIBRATION, TWINS)]
+    whole = sorted(n for _, n in calls)
+    for n in (n for own in anomalous for n in own):
+        whole.remove(n)
+    assert len(whole) == PROBES
+    assert len({pid for pid, _ in calls}) == len(anomalous) + 1
+
+
+def test_metrics_are_recomputed_from_what_is_stored(world):
+    home, found = world
+    results = ResultsDirectory(home / "results")
+    again = rescore(found["tells"], results, load_split("mini"))
+    assert [r.to_json() for r in again] == [r.to_json() for r in found["tells"]]
+
+
+def test_scores_of_a_file_without_explanations_are_scored_as_ever(world, tmp_path):
+    home, found = world
+    key = found["tells"][0].scores
+    (tmp_path / "scores").mkdir()
+    content = (home / "results/scores" / f"{key}.h5").read_bytes()
+    (tmp_path / "scores" / f"{key}.h5").write_bytes(content)
+    with h5py.File(tmp_path / "scores" / f"{key}.h5", "r+") as file:
+        for anomaly in ("iid", "drift", "gravity"):
+            del file[f"test/{anomaly}/sensors"], file[f"test/{anomaly}/onsets"]
+    for old, new in zip(
+        found["tells"], rescore(found["tells"], ResultsDirectory(tmp_path), load_split("mini")),
+        strict=True,
+    ):  # fmt: skip
+        assert new.ok
+        assert old.metrics.keys() - new.metrics == {*ATTRIBUTION}
+        assert all(str(old.metrics[name]) == str(new.metrics[name]) for name in new.metrics)
+
+
+def test_a_detector_of_this_process_explains_too(world):
+    _, found = world
+    import oodd_explained
+
+    records = evaluate(oodd_explained.Tells, environments="cartpole", anomalies="iid")
+    iid = next(r for r in found["tells"] if r.anomaly == "iid")
+    assert str(records[0].metrics) == str(iid.metrics)
+
+
+def test_a_detector_that_cannot_be_forked_explains_too(world):
+    _, found = world
+    records = evaluate("lasting", environments="cartpole", anomalies="iid")
+    iid = next(r for r in found["tells"] if r.anomaly == "iid")
+    assert records[0].ok, records[0].reason
+    assert str(records[0].metrics) == str(iid.metrics)
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "reason"),
+    [
+        ("fails", "error", "RuntimeError: no idea"),
+        ("overstates", "invalid", "explain gives the shares"),
+        ("toomuch", "invalid", "with the score nan: expected both where it is defined"),
+        ("ahead", "invalid", "nothing after a row's time"),
+    ],
+)
+def test_a_failing_explanation_is_a_state_with_a_reason(world, name, status, reason):
+    (record,) = evaluate(name, environments="hopper", anomalies="iid")
+    assert record.status == status, record.reason
+    assert reason in record.reason
+    assert not record.metrics
+
+
+def test_tables_have_a_section_for_detectors_that_explain(world, capsys):
+    home, _ = world
+    assert main(["show", str(home / "results")]) == 0
+    shown = capsys.readouterr().out
+    section = shown[shown.index("Attribution at 5 %") :].split("\n\n")[0]
+    assert "tells" in section
+    assert "silent" not in section
+    assert "sensor named" in section
+    assert main(["show", str(home / "results"), "--markdown"]) == 0
+    assert "### Attribution at 5 %" in capsys.readouterr().out
+    options = ["--detector", "tells", "--metric", ONSET_ERROR, "--intervals"]
+    assert main(["show", str(home / "results"), *options]) == 0
+    assert "Onset error at 5 % by anomaly" in capsys.readouterr().out
+    assert main(["list", "metrics"]) == 0
+    assert all(name in capsys.readouterr().out for name in [SENSOR_NAMED])
+
+
+def test_a_board_has_the_section_in_the_order_of_its_rows(world):
+    _, found = world
+    ranks = ranked([*found["silent"], *found["tells"]])
+    table = layout.attribution(ranks.board, intervals=True, standings=ranks.standings)
+    assert table.header[:5] == ["rank", "detector", "settings", "sensor named", "onset error"]
+    (row,) = table.rows
+    assert row[1] == "tells"
+    assert "[" in row[3]
+    assert "[" in row[4]
+    assert layout.attribution(ranked(found["silent"]).board) is None
+
+
+# Verification
+
+
+def verified(records):
+    """Problems of records of the split mini, checked alone and together."""
+    findings, sums = Findings(), {}
+    named = {f"{i}": record for i, record in enumerate(records)}
+    for where, record in named.items():
+        sums[where] = check_record(where, record, findings)
+    entry = records[0]
+    check_together(entry, named, {w: s for w, s in sums.items() if s}, findings)
+    return [p.text for p in findings.problems if "lacks" not in p.text]
+
+
+def test_sound_records_are_accepted_and_others_are_not(world):
+    _, found = world
+    records = found["tells"]
+    assert not verified(records)
+    plain = json.loads(records[0].to_json())
+    record = type(records[0])
+
+    def problems(change):
+        mine = json.loads(json.dumps(plain))
+        change(mine)
+        return " ".join(verified([record.from_json(json.dumps(mine)), *records[1:]]))
+
+    def half(mine):
+        mine["per_trajectory"][SENSOR_NAMED][0][0] = 0.5
+
+    def fewer(mine):
+        del mine["per_trajectory"][SENSOR_NAMED], mine["metrics"][SENSOR_NAMED]
+
+    def none(mine):
+        for name in ATTRIBUTION:
+            del mine["per_trajectory"][name], mine["metrics"][name]
+
+    def better(mine):
+        mine["metrics"][ONSET_ERROR]["value"] = 0.25
+
+    assert "the numerator 0 or 1" in problems(half)
+    assert "is missing" in problems(fewer)
+    assert "explains all of its alarms or none" in problems(none)
+    assert "per_trajectory gives" in problems(better)
+
+
+@pytest.mark.parametrize("tamper", [None, "short", "undefined", "nominal"])
+def test_score_files_with_explanations_are_accepted_where_they_are_sound(world, tmp_path, tamper):
+    home, found = world
+    record = found["tells"][0]
+    name = f"scores/{record.scores}.h5"
+    (tmp_path / "scores").mkdir()
+    (tmp_path / name).write_bytes((home / "results" / name).read_bytes())
+    with h5py.File(tmp_path / name, "r+") as file:
+        onsets = file["test/iid/onsets"][:]
+        if tamper == "short":
+            del file["test/iid/onsets"]
+            file["test/iid/onsets"] = onsets[1:]
+        elif tamper == "undefined":
+            file["test/iid/onsets"][5] = -1
+        elif tamper == "nominal":
+            for one in ("sensors", "onsets"):
+                file[f"{TWINS}/{one}"] = onsets
+    findings = Findings()
+    check_scores(tmp_path, [name], {"1": record}, findings)
+    # The file of this run has three of the eight anomalies.
+    problems = [p.text for p in findings.problems if "is missing" not in p.text]
+    assert bool(problems) == bool(tamper), problems
