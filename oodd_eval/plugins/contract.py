@@ -155,7 +155,7 @@ class StorableDetector(Detector, Protocol):
 
 
 class Explanation(NamedTuple):
-    """What a detector makes responsible for each score of one episode with T transitions.
+    """Shares of the sensors in each score of one episode with T transitions, and onsets.
 
     Attributes
     ----------
