@@ -155,7 +155,7 @@ class StorableDetector(Detector, Protocol):
 
 
 class Explanation(NamedTuple):
-    """What a detector makes responsible for each score of one episode with T transitions.
+    """Shares of the sensors in each score of one episode with T transitions, and onsets.
 
     Attributes
     ----------
@@ -178,8 +178,12 @@ class ExplainingDetector(Detector, Protocol):
     def explain(self, trajectory: Trajectory) -> Explanation:
         """Return what the scores of an episode are due to; as causal as `score`.
 
-        It is asked of fitted detectors, for episodes that they may not have scored. The one sensor
-        with the largest share at a row is named for it.
+        The one sensor with the largest share at a row is named for it.
+
+        Parameters
+        ----------
+        trajectory
+            One episode, which a fitted detector may not have scored.
         """
 
 
