@@ -22,7 +22,7 @@ from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError
 from oodd_eval.plugins.forecasting import FeatureScale, anomaly_scores
 from oodd_eval.plugins.state import Arrays, take
-from oodd_torch.device import chosen
+from oodd_torch.device import resolved_device
 from oodd_torch.forecast import Forecaster
 from oodd_torch.network import Architecture, Ensemble
 from oodd_torch.parameters import NetworkParameters
@@ -123,7 +123,7 @@ class NetworkDetector(StorableWindowDetector):
             # A forecast of the next observation is never made from a forecast.
             scheduled_sampling=parameters.scheduled_sampling if horizon > 1 else 0.0,
         )
-        self.device = chosen(name, parameters.device)
+        self.device = resolved_device(name, parameters.device)
         self.network_: Ensemble
         self.history_: list[list[float]]
         self.residual_: NDArray[np.float32]

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from oodd_common.windows import StorableWindowDetector, windows
-from oodd_torch.device import chosen
+from oodd_torch.device import resolved_device
 
 from oodd_eval import Explanation, Trajectory
 from oodd_eval.errors import TrajectoryError
@@ -92,7 +92,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             name, seed=seed, horizon=horizon, window=parameters.window, actions=actions
         )
         self.parameters, self.accumulate = parameters, accumulate
-        self.device = chosen(name, parameters.device)
+        self.device = resolved_device(name, parameters.device)
         self.charts_ = Charts(parameters.memories)
         self.network_: DensityNetworks
 
