@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oodd_pe import make_pe
-from oodd_pe.network import DensityNetworks, train
+from oodd_pe.network import LEAST_SCALES, DensityNetworks, deviance, train
 from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 from scipy import stats
 
@@ -78,13 +78,12 @@ def test_surprise_is_that_of_scipys_t_distributions(forecast):
     np.testing.assert_allclose(found.surprise().numpy(), -(density + volume))
 
 
-def test_deviance_residuals_of_a_t_distribution_are_about_standard_normal(forecast):
-    _, _, found = forecast
-    for nu, std in ((4.0, 1.19), (16.0, 1.05), (64.0, 1.01)):
-        e = torch.from_numpy(stats.t(df=nu).ppf(np.arange(1, 2000) / 2000))[None, :, None]
-        r = found._replace(residual=e, log_tail=torch.full_like(e, math.log(nu))).deviance()
-        assert r.std().item() == pytest.approx(std, abs=0.01)
-        assert (r.sign() == e.sign()).all()
+@pytest.mark.parametrize(("nu", "std"), [(4.0, 1.19), (16.0, 1.05), (64.0, 1.01)])
+def test_deviance_residuals_of_a_t_distribution_are_about_standard_normal(nu, std):
+    e = stats.t(df=nu).ppf(np.arange(1, 2000) / 2000)
+    r = deviance(e, np.full_like(e, math.log(nu)))
+    assert r.std() == pytest.approx(std, abs=0.01)
+    assert (np.sign(r) == np.sign(e)).all()
 
 
 def test_an_error_of_one_sensor_is_explained_by_that_sensor_alone(forecast):
@@ -115,6 +114,24 @@ def test_training_finds_means_scales_dependence_and_tails():
     np.testing.assert_allclose(found.dependence[..., 0].mean(0), -0.8, atol=0.1)
     tails = found.log_tail.exp().mean((0, 1))
     assert tails[0] < 8 < tails[1]
+
+
+def test_no_error_is_forecast_to_be_wider_than_those_in_training():
+    random = np.random.default_rng(0)
+    x = random.normal(size=(2000, 1))
+    y = np.exp(x) * random.normal(size=(2000, 1))  # the wider, the larger x
+    network = DensityNetworks(2, 1, 1, 16, seed=0)
+    train(network, x, y, updates=300, batch=128, seed=0, device="cpu")
+    network.frozen()
+
+    def scales(x):
+        given = torch.from_numpy(x).expand(2, -1, -1)
+        return network(given, torch.zeros_like(given)).log_scale
+
+    seen, far = scales(x), scales(np.full((1, 1), 10.0))
+    torch.testing.assert_close(far, seen.min(dim=1, keepdim=True).values)
+    at_least = (seen == far).double().mean(dim=1)
+    np.testing.assert_allclose(at_least, LEAST_SCALES, atol=2e-3)
 
 
 def test_training_is_the_same_twice_and_differs_by_seed():
@@ -196,6 +213,7 @@ def test_running_charts_continue_where_they_ended(charts):
 def test_onset_and_shares_by_hand(charts):
     r = np.zeros((30, 2))
     r[20:, 1] = 6.0
+    r[21:, 0] = 30.0  # what the first corrupted row does to later forecasts
     shares, onsets = Attribution(charts, 1)(evidence(30, residuals=r))
     np.testing.assert_array_equal(onsets[:21], np.arange(1, 22))
     np.testing.assert_array_equal(onsets[20:], 21)  # the first of these rows is that of time 1

@@ -22,7 +22,7 @@ from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
-from oodd_pe.network import DensityNetworks, train
+from oodd_pe.network import DensityNetworks, deviance, train
 from oodd_pe.statistic import Attribution, Charts, Evidence, Running
 
 HELD_OUT: Final = 0.15
@@ -46,14 +46,14 @@ class _Known(NamedTuple):
 class ProbabilisticEnsemble(StorableWindowDetector):
     r"""Residuals of forecast distributions, accumulated with several memories.
 
-    .. math:: e_t = s(x_t) \, (I + U(x_t)) \, (y_t - \mu(x_t)), \quad
+    .. math:: e_t = \frac{1}{M} \sum_m s_m(x_t) \, (I + U_m(x_t)) \, (y_t - \mu_m(x_t)), \quad
               r_t = \operatorname{sign}(e_t) \sqrt{(\nu + 1) \log(1 + e_t^2 / \nu(x_t))}, \quad
               z^\lambda_t = (1 - \lambda) z^\lambda_{t-1} + \lambda g_t u_t, \quad
               s_t = \max_\lambda \frac{d^\lambda_t - m_\lambda}{q_\lambda}
 
     where :math:`x_t` holds the latest observations up to :math:`o_{t-h}` (and actions, if asked
-    for), :math:`y_t` the change since then that a ridge regression does not explain, u the mean of
-    r over the members with its nominal scale removed, g less than one only while the sensors stand
+    for), :math:`y_t` the change since then that a ridge regression does not explain, m counts the
+    members, u is r with its nominal scale removed, g less than one only while the sensors stand
     still, and d the Mahalanobis length of z. Higher means more anomalous. Scores are undefined
     (NaN) for t < h.
 
@@ -259,12 +259,13 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         movement = self._changes(now, before)
         of_sensors = np.zeros((len(now), len(scale.mean) if explain else 0))
         if explain:
-            alone = forecast.of_sensors(network.row, network.column).mean(0).numpy()
-            of_sensors[:, self.varying_] = alone**2
+            alone = forecast.of_sensors(network.row, network.column).square().mean(0)
+            of_sensors[:, self.varying_] = alone.numpy()
             of_sensors[:, constant] = moved**2
+        residual, log_tail = forecast.residual.mean(0).numpy(), forecast.log_tail.mean(0).numpy()
         return Evidence(
-            np.concatenate([forecast.deviance().mean(0).numpy(), changed], axis=1),
-            forecast.log_tail.mean(0).numpy(),
+            np.concatenate([deviance(residual, log_tail), changed], axis=1),
+            log_tail,
             np.sqrt((movement**2).sum(axis=1) / max(1, movement.shape[1])),
             of_sensors,
         )

@@ -20,6 +20,8 @@ from torch.nn.functional import silu, smooth_l1_loss
 from oodd_eval.plugins.state import Arrays, take
 
 LAYERS: Final = 3
+CHUNK: Final = 4096
+"""Rows that are looked at together outside the training: bounds memory."""
 RATE: Final = 8e-3
 """Learning rate of biases and output layers."""
 HIDDEN_RATE: Final = 0.03
@@ -34,6 +36,13 @@ A likelihood alone widens the scales of what it could still learn to forecast.
 """
 LOG_SCALE: Final = 12.0
 """Largest size of the logarithm of a scale."""
+LEAST_SCALES: Final = 0.01
+"""Share of the training rows with smaller scales than the least that a forecast may have.
+
+Far from its training inputs a network says that it knows nothing. It would forecast errors a
+hundred times as wide as any in training, and an anomaly would be hidden by the inputs that it
+corrupts.
+"""
 LOG_TAIL: Final = math.log(8.0)
 """Half the logarithm of the largest degrees of freedom, 64; the least are 1."""
 
@@ -74,16 +83,6 @@ class Forecast(NamedTuple):
         )
         return -log_density.sum(-1)
 
-    def deviance(self) -> Tensor:
-        r"""Return signed deviance residuals, (M, N, D).
-
-        :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
-        normal distribution where e has Student's t distribution with nu degrees of freedom.
-        """
-        nu = self.log_tail.exp()
-        squared = (nu + 1) * torch.log1p(self.residual.square() / nu)
-        return torch.sign(self.residual) * squared.sqrt()
-
     def of_sensors(self, row: Tensor, column: Tensor) -> Tensor:
         r"""Return what an error of one sensor alone would explain, in standard deviations.
 
@@ -98,6 +97,17 @@ class Forecast(NamedTuple):
         squares = scale.square()
         squares = squares.index_add(-1, column, self.dependence.square() * squares[..., row])
         return slope / squares.sqrt()
+
+
+def deviance(residual: Floats, log_tail: Floats) -> Floats:
+    r"""Return signed deviance residuals.
+
+    :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
+    normal distribution where e has Student's t distribution with nu degrees of freedom.
+    """
+    nu = np.exp(log_tail)
+    signed: Floats = np.sign(residual) * np.sqrt((nu + 1) * np.log1p(residual**2 / nu))
+    return signed
 
 
 class DensityNetworks(torch.nn.Module):
@@ -131,6 +141,8 @@ class DensityNetworks(torch.nn.Module):
         row, column = np.tril_indices(sensors, -1)
         self.row: Tensor
         self.column: Tensor
+        self.floor: Tensor
+        self.register_buffer("floor", torch.full((members, 1, sensors), -math.inf))
         self.register_buffer("row", torch.from_numpy(row), persistent=False)
         self.register_buffer("column", torch.from_numpy(column), persistent=False)
 
@@ -142,24 +154,33 @@ class DensityNetworks(torch.nn.Module):
         out = torch.baddbmm(self.out_bias, hidden, self.out)
         d = self.sensors
         mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[-1] - 3 * d], -1)
-        log_scale = LOG_SCALE * torch.tanh(scale / LOG_SCALE)
+        log_scale = torch.maximum(LOG_SCALE * torch.tanh(scale / LOG_SCALE), self.floor)
         log_tail = LOG_TAIL * (1 + torch.tanh(tail))
         error = y - mean
         known = dependence * error[..., self.column]
         conditional = error.index_add(-1, self.row, known)
         return Forecast(log_scale.exp() * conditional, log_scale, log_tail, mean, dependence)
 
+    @torch.no_grad()
+    def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return each member's and sensor's least log scale for training rows, (M, 1, D)."""
+        parts = zip(torch.split(x, CHUNK), torch.split(y, CHUNK), strict=True)
+        found = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
+        scales = torch.cat(found, dim=1)
+        least = round(LEAST_SCALES * scales.shape[1])
+        return scales.sort(dim=1).values[:, least : least + 1]
+
     def frozen(self) -> Self:
         """Make the networks ready to judge: on the processor, in double precision."""
         return self.requires_grad_(requires_grad=False).cpu().double()
 
     def arrays(self) -> Arrays:
-        """Return the weights by name."""
-        return {name: p.detach().numpy() for name, p in self.named_parameters()}
+        """Return the weights, and the least scales, by name."""
+        return {name: p.detach().numpy() for name, p in self.state_dict().items()}
 
     def restore(self, arrays: Arrays) -> None:
         """Take over the weights of `arrays`; raises `FittedStateError` for others."""
-        for name, p in self.named_parameters():
+        for name, p in self.state_dict(keep_vars=True).items():
             p.data = torch.from_numpy(take(arrays, name, tuple(p.shape)))
         self.frozen()
 
@@ -203,3 +224,4 @@ def train(
         hidden.step(HIDDEN_RATE * rate * one)
         average.update()
     average.apply()
+    network.floor = network.least_scales(inputs, outcomes)

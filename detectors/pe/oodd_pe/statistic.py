@@ -25,9 +25,9 @@ LARGEST: Final = 36.0
 """Limit of a squared residual in these averages."""
 SMALLEST: Final = 0.05
 """Least scale of a residual."""
-ENERGY: Final = 9.0
+ENERGY: Final = 25.0
 """Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
-MOVEMENT: Final = 0.5
+MOVEMENT: Final = 0.7
 """Share of the median movement below which a step counts as less than one in the sums."""
 REFERENCE: Final = 2.0
 """Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
@@ -41,8 +41,7 @@ class Evidence(NamedTuple):
     Attributes
     ----------
     residuals
-        Signed deviance residuals, means over the members, (N, D); then one column a constant
-        sensor.
+        Signed deviance residuals of the members' mean, (N, D); then one column a constant sensor.
     log_tails
         Logarithms of the degrees of freedom that were forecast, (N, D).
     movement
@@ -184,28 +183,26 @@ class Attribution:
 
     The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
     of two nominal standard deviations. A sensor's share is its part of what errors of single
-    sensors would explain, averaged over the steps since then with their energy as weight.
+    sensors would explain of that step alone: later forecasts start from corrupted readings, and
+    every sensor disagrees with them.
     """
 
     def __init__(self, charts: Charts, first: int) -> None:
         self._charts, self._now = charts, first
         self._sum, self._onset = 0.0, first
-        self._weighted: Floats = np.zeros(0)
+        self._part: Floats = np.zeros(0)
 
     def __call__(self, evidence: Evidence) -> tuple[Floats, NDArray[np.int64]]:
         """Return shares, (N, sensors), and onsets, (N,), of the next N steps."""
         parts = np.maximum(evidence.of_sensors, CONSTANT)
         parts = parts / parts.sum(axis=1, keepdims=True)
-        excess = self._charts.columns(evidence)[:, -1]
+        energy = self._charts.columns(evidence)[:, -1] - REFERENCE * float(self._charts.spread_)
         shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
-        for n, (part, more) in enumerate(zip(parts, excess, strict=True)):
+        for n, (part, more) in enumerate(zip(parts, energy, strict=True)):
             if self._sum <= 0:
-                self._onset, self._weighted = self._now, np.zeros(len(part))
-            self._sum = max(0.0, self._sum + more - REFERENCE * float(self._charts.spread_))
-            weight = max(more + float(self._charts.energy_), CONSTANT)
-            self._weighted = self._weighted + weight * part
-            shares[n] = self._weighted / self._weighted.sum()
-            onsets[n] = self._onset
+                self._onset, self._part = self._now, part
+            self._sum = max(0.0, self._sum + more)
+            shares[n], onsets[n] = self._part, self._onset
             self._now += 1
         return shares, onsets
 
