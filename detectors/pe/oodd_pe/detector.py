@@ -235,7 +235,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         now, before = x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
         return self._judged(self._known(x), now, before, explain=explain)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def _judged(
         self,
         known: _Known,
@@ -253,7 +253,8 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         )
         network, scale = self.network_, self.observation_scale_
         forecast = network(given, outcome)
-        constant = np.setdiff1d(np.arange(len(scale.mean)), self.varying_)
+        constant = np.ones(len(scale.mean), dtype=bool)
+        constant[self.varying_] = False
         moved = (now - scale.mean)[:, constant] / CONSTANT
         changed = np.sign(moved) * np.sqrt(2.0 * np.log1p(moved**2))
         movement = self._changes(now, before)

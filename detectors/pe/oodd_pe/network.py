@@ -148,18 +148,20 @@ class DensityNetworks(torch.nn.Module):
 
     def forward(self, x: Tensor, y: Tensor) -> Forecast:
         """Judge outcomes y, (M, N, D), by inputs x, (M, N, I)."""
-        hidden = silu(torch.baddbmm(self.biases[0], x, self.weights[0]))
-        for weights, bias in zip(self.weights[1:], self.biases[1:], strict=True):
-            hidden = hidden + silu(torch.baddbmm(bias, hidden, weights))
-        out = torch.baddbmm(self.out_bias, hidden, self.out)
+        # Rows last: what is gathered by sensor is then contiguous, and several times as quick.
+        layers = zip([*self.weights, self.out], [*self.biases, self.out_bias], strict=True)
+        hidden = silu(_layer(x.mT, *next(layers)))
+        for _ in range(LAYERS - 1):
+            hidden = hidden + silu(_layer(hidden, *next(layers)))
+        out = _layer(hidden, *next(layers))
         d = self.sensors
-        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[-1] - 3 * d], -1)
-        log_scale = torch.maximum(LOG_SCALE * torch.tanh(scale / LOG_SCALE), self.floor)
+        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[1] - 3 * d], 1)
+        log_scale = torch.maximum(LOG_SCALE * torch.tanh(scale / LOG_SCALE), self.floor.mT)
         log_tail = LOG_TAIL * (1 + torch.tanh(tail))
-        error = y - mean
-        known = dependence * error[..., self.column]
-        conditional = error.index_add(-1, self.row, known)
-        return Forecast(log_scale.exp() * conditional, log_scale, log_tail, mean, dependence)
+        error = y.mT - mean
+        known = dependence * error[:, self.column]
+        residual = log_scale.exp() * error.index_add(1, self.row, known)
+        return Forecast(residual.mT, log_scale.mT, log_tail.mT, mean.mT, dependence.mT)
 
     @torch.no_grad()
     def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
@@ -183,6 +185,13 @@ class DensityNetworks(torch.nn.Module):
         for name, p in self.state_dict(keep_vars=True).items():
             p.data = torch.from_numpy(take(arrays, name, tuple(p.shape)))
         self.frozen()
+
+
+def _layer(x: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
+    """Return weights' x + bias', (M, O, N), from (M, I, N), (M, I, O) and (M, 1, O)."""
+    if x.shape[2] == 1:  # A product of a row takes a quarter of the time of that of a column.
+        return torch.baddbmm(bias, x.mT, weights).mT
+    return torch.baddbmm(bias.mT, weights.mT, x)
 
 
 def train(
