@@ -48,7 +48,7 @@ LOG_TAIL: Final = math.log(8.0)
 
 
 class Forecast(NamedTuple):
-    """What M networks say of N rows of D sensors.
+    """Forecasts of M networks for N rows of D sensors, and how far outcomes are from them.
 
     Attributes
     ----------

@@ -1,7 +1,6 @@
 """From residuals to one statistic: charts of several memories, brought to one scale.
 
-What an ensemble says of one step is weak evidence of a small change; what it says of many steps
-with the same sign is strong. Each chart adds up residuals with another memory. The statistic is the
+One residual is weak evidence of a small change; many with the same sign are strong evidence. Each chart adds up residuals with another memory. The statistic is the
 largest of their distances from nominal operation, each in units of how far it gets in an episode.
 """
 
@@ -36,7 +35,7 @@ SHRINKAGE: Final = 0.02
 
 
 class Evidence(NamedTuple):
-    """What an ensemble says of N steps of an episode.
+    """How far N steps of an episode are from their forecasts.
 
     Attributes
     ----------
@@ -179,7 +178,7 @@ class Running:
 
 
 class Attribution:
-    """Which sensors the evidence of an episode so far points at, and since when.
+    """Which sensors are likely to be corrupted, and since when, by an episode so far.
 
     The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
     of two nominal standard deviations. A sensor's share is its part of what errors of single
