@@ -1,7 +1,8 @@
 """From residuals to one statistic: charts of several memories, brought to one scale.
 
-One residual is weak evidence of a small change; many with the same sign are strong evidence. Each chart adds up residuals with another memory. The statistic is the
-largest of their distances from nominal operation, each in units of how far it gets in an episode.
+One residual is weak evidence of a small change; many with the same sign are strong evidence. Each
+chart adds up residuals with another memory. The statistic is the largest of their distances from
+nominal operation, each in units of how far it gets in an episode.
 """
 
 from __future__ import annotations
