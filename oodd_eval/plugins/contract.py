@@ -52,8 +52,11 @@ TOLERANCE: Final = 1e-5
 Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
 """
 
-PROBE_TOLERANCE: Final = 1e-3
-"""The same for the prefixes of a run, whatever the horizon: rollouts multiply rounding errors."""
+PROBE_TOLERANCE: Final = 5e-3
+"""The same for the prefixes of a run, whatever the horizon: rollouts multiply rounding errors.
+
+Ten steps in single precision, where forecasts are precise to a hundredth, have reached 1.4e-3.
+"""
 
 Scores: TypeAlias = "NDArray[np.float64]"
 
