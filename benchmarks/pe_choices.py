@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from oodd_pe import detector as module
 from oodd_pe import make_pe, statistic
-from oodd_pe.network import deviance
+from oodd_pe.statistic import deviance
 from tabulate import tabulate
 
 from oodd_eval import DetectorSpec, evaluate, load_split
@@ -82,10 +82,8 @@ def measured(detector, change, split, environment):
             stack.enter_context(
                 patch.object(module, "deviance", lambda e, t: deviance(e, t * 0 + math.log(nu)))
             )
-        network = detector.network_
         if change.get("wide"):
-            unbounded = torch.full_like(network.floor, -math.inf)
-            stack.enter_context(patch.object(network, "floor", unbounded))
+            stack.enter_context(patch.object(detector.ensemble_, "_floor", -math.inf))
         records = evaluate(spec(detector, change), split, environments=environment)
     return [
         np.mean([r.metrics[m].value for r in records if r.group == group])

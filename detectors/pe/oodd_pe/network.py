@@ -1,4 +1,4 @@
-"""The ensemble's networks: forecasts of a whole distribution, and their training.
+"""The ensemble's networks in torch: forecasts of a whole distribution, and their training.
 
 A network describes the change of all sensors, in units of the errors of a linear forecast. It gives
 means, scales, a triangular matrix of dependences, and how heavy each tail is, all by the inputs.
@@ -7,17 +7,17 @@ means, scales, a triangular matrix of dependences, and how heavy each tail is, a
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from oodd_common.charts import Floats
+from numpy.typing import NDArray
 from oodd_torch.optimizers import Adam, Average, Muon
 from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import silu, smooth_l1_loss
 
-from oodd_eval.plugins.state import Arrays, take
+from oodd_eval.plugins.state import Arrays
 
 LAYERS: Final = 3
 CHUNK: Final = 4096
@@ -60,15 +60,12 @@ class Forecast(NamedTuple):
         Logarithms of the degrees of freedom of each residual's t distribution, (M, N, D).
     mean
         Forecasts, (M, N, D).
-    dependence
-        Entries of U below the diagonal, row after row, (M, N, D (D - 1) / 2).
     """
 
     residual: Tensor
     log_scale: Tensor
     log_tail: Tensor
     mean: Tensor
-    dependence: Tensor
 
     def surprise(self) -> Tensor:
         """Return the negative log likelihoods of the rows, (M, N)."""
@@ -82,32 +79,6 @@ class Forecast(NamedTuple):
             - half * torch.log1p(self.residual.square() / nu)
         )
         return -log_density.sum(-1)
-
-    def of_sensors(self, row: Tensor, column: Tensor) -> Tensor:
-        r"""Return what an error of one sensor alone would explain, in standard deviations.
-
-        With the precision :math:`\Lambda = L^\top L`, L = s (I + U), of the errors y - mean, these
-        are :math:`(\Lambda (y - \mu))_d / \sqrt{\Lambda_{dd}}`: by how much their squared length
-        would fall if the reading of sensor d were free. ``row`` and ``column`` place the entries of
-        U. Of shape (M, N, D).
-        """
-        scale = self.log_scale.exp()
-        pulled = scale * self.residual
-        slope = pulled.index_add(-1, column, self.dependence * pulled[..., row])
-        squares = scale.square()
-        squares = squares.index_add(-1, column, self.dependence.square() * squares[..., row])
-        return slope / squares.sqrt()
-
-
-def deviance(residual: Floats, log_tail: Floats) -> Floats:
-    r"""Return signed deviance residuals.
-
-    :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
-    normal distribution where e has Student's t distribution with nu degrees of freedom.
-    """
-    nu = np.exp(log_tail)
-    signed: Floats = np.sign(residual) * np.sqrt((nu + 1) * np.log1p(residual**2 / nu))
-    return signed
 
 
 class DensityNetworks(torch.nn.Module):
@@ -161,43 +132,32 @@ class DensityNetworks(torch.nn.Module):
         error = y.mT - mean
         known = dependence * error[:, self.column]
         residual = log_scale.exp() * error.index_add(1, self.row, known)
-        return Forecast(residual.mT, log_scale.mT, log_tail.mT, mean.mT, dependence.mT)
+        return Forecast(residual.mT, log_scale.mT, log_tail.mT, mean.mT)
 
     @torch.no_grad()
     def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
         """Return each member's and sensor's least log scale for training rows, (M, 1, D)."""
         parts = zip(torch.split(x, CHUNK), torch.split(y, CHUNK), strict=True)
         found = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
-        scales = torch.cat(found, dim=1)
+        scales = torch.cat(found, dim=1).cpu().numpy()
         least = round(LEAST_SCALES * scales.shape[1])
-        return scales.sort(dim=1).values[:, least : least + 1]
-
-    def frozen(self) -> Self:
-        """Make the networks ready to judge: on the processor, in double precision."""
-        return self.requires_grad_(requires_grad=False).cpu().double()
+        lowest = np.partition(scales, least, axis=1)[:, least : least + 1]
+        return torch.from_numpy(lowest).to(x.device)
 
     def arrays(self) -> Arrays:
-        """Return the weights, and the least scales, by name."""
-        return {name: p.detach().numpy() for name, p in self.state_dict().items()}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take over the weights of `arrays`; raises `FittedStateError` for others."""
-        for name, p in self.state_dict(keep_vars=True).items():
-            p.data = torch.from_numpy(take(arrays, name, tuple(p.shape)))
-        self.frozen()
+        """Return the weights, and the least scales, by name, in double precision."""
+        return {name: p.detach().cpu().double().numpy() for name, p in self.state_dict().items()}
 
 
 def _layer(x: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
     """Return weights' x + bias', (M, O, N), from (M, I, N), (M, I, O) and (M, 1, O)."""
-    if x.shape[2] == 1:  # A product of a row takes a quarter of the time of that of a column.
-        return torch.baddbmm(bias, x.mT, weights).mT
     return torch.baddbmm(bias.mT, weights.mT, x)
 
 
 def train(
     network: DensityNetworks,
-    x: Floats,
-    y: Floats,
+    x: NDArray[Any],
+    y: NDArray[Any],
     *,
     updates: int,
     batch: int,
@@ -206,13 +166,14 @@ def train(
 ) -> None:
     """Maximize the likelihood of outcomes y, (N, D), given inputs x, (N, I), in place.
 
-    Every member draws batches of its own. The weights are averaged over the last updates. What is
-    trained in single precision is used in double.
+    Every member draws batches of its own. The weights are averaged over the last updates. Networks
+    are trained in single precision.
     """
     random = np.random.default_rng([seed, 1])
     network.to(device)
-    inputs = torch.from_numpy(x.astype(np.float32)).to(device)
-    outcomes = torch.from_numpy(y.astype(np.float32)).to(device)
+    inputs, outcomes = (
+        torch.from_numpy(v.astype(np.float32, copy=False)).to(device) for v in (x, y)
+    )
     rest = [*network.biases, network.out, network.out_bias]
     hidden, others = Muon(network.weights), Adam(rest)
     average = Average(network.parameters(), DECAY)
