@@ -44,12 +44,12 @@ def peak(dtype):
     return 10 * 2 * 768**3 / (time.perf_counter() - start)
 
 
-def flops(network, batch):
+def flops(arrays, batch):
     """Return operations of judging a row, and of an update of all members."""
-    shapes = [w.shape[1:] for w in (*network.weights, network.out)]
-    row = 2 * network.members * sum(i * o for i, o in shapes)
-    orthogonal = sum(2 * min(s) ** 2 * max(s) for s in shapes[:LAYERS]) * NEWTON_SCHULZ
-    return row, 3 * row * batch + network.members * orthogonal
+    hidden = [arrays[f"weights.{n}"].shape for n in range(LAYERS)]
+    row = sum(2 * m * i * o for m, i, o in (*hidden, arrays["out"].shape))
+    orthogonal = sum(2 * m * min(s) ** 2 * max(s) for m, *s in hidden) * NEWTON_SCHULZ
+    return row, 3 * row * batch + orthogonal
 
 
 def measured(environment, updates):
@@ -76,7 +76,7 @@ def measured(environment, updates):
             detector.update(observation, action)
             waits.append(time.perf_counter() - start)
     stream = 1e6 * float(np.median(waits))
-    of_row, of_update = flops(detector.network_, PeParameters().batch)
+    of_row, of_update = flops(detector.ensemble_.arrays, PeParameters().batch)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     at_fit = of_update * whole / fit / np.mean(rates)
     at_batch = of_row / (batch * 1e-6) / double

@@ -84,7 +84,8 @@ def rate(call, steps):
 
 def network():
     generators = [torch.Generator().manual_seed(i) for i in range(MEMBERS)]
-    made = Ensemble(Architecture(SENSORS), generators, np.full(SENSORS, 0.5, np.float32))
+    still = np.eye(SENSORS + 1, SENSORS, dtype=np.float32)
+    made = Ensemble(Architecture(SENSORS), generators, still, np.full(SENSORS, 0.5, np.float32))
     with torch.no_grad():
         made.out.normal_(0, 0.3, generator=generators[0])
     return made.requires_grad_(requires_grad=False)
@@ -112,7 +113,7 @@ def training():
     """Return transitions per second and member of training, and the peak, in every round."""
     rows = [e.observations for e in episodes(64)]
     schedule = riqn(seed=0, horizon=1).schedule
-    quick = replace(schedule, updates=30, evaluations=1)
+    quick = replace(schedule, updates=60)
     for _ in range(ROUNDS):
         made = network().requires_grad_()
         rngs = [np.random.default_rng(i) for i in range(MEMBERS)]

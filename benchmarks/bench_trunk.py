@@ -1,9 +1,8 @@
 """Cost of a network per sensor beside one trunk with a head per sensor: CPU seconds.
 
-``python benchmarks/bench_trunk.py``. RIQN on the mini split, with a twentieth of the updates of a
-fit; scoring is that of the test part, and does not depend on the updates. For the AUCs run
-``oodd-eval run --detector riqn --env cartpole,acrobot,hopper --param trunk=per-feature`` and with
-``trunk=shared``.
+``python benchmarks/bench_trunk.py``. RIQN on the mini split, with few updates, since the time of a
+fit grows with them; scoring is that of the test part. For the AUCs run ``oodd-eval run --detector
+riqn --env cartpole,acrobot,hopper --param trunk=per-feature`` and with ``trunk=shared``.
 """
 
 import functools

@@ -1,17 +1,19 @@
 """Achieved share of false episodes of every shipped row, on fresh nominal episodes.
 
-``python benchmarks/false_alarms.py [--episodes 200] [--seed-base 41] [--env NAMES] [DETECTOR ...]``
-fits each detector on split mini, takes its thresholds from mini's calibration part, and scores
-fresh nominal episodes of the same policies, simulators and episode cap. The promise holds on
-average over calibrations: given one, the number of alarms among m episodes has a beta-binomial
-distribution with parameters n + 1 - k and k. Printed is its 97.5 % quantile; that of the mean over
-environments is higher, so that all rows together have a chance of 2.5 % that any is above its own.
-Exit code 1 when a row is above in more environments than chance allows, or on average over them.
+``python benchmarks/false_alarms.py [--episodes 200] [--seed-base 41] [--env NAMES] [--fits RESULTS]
+[DETECTOR ...]`` fits each detector on split mini, or takes the fit that a results directory has,
+takes its thresholds from mini's calibration part, and scores fresh nominal episodes of the same
+policies, simulators and episode cap. The promise holds on average over calibrations: given one, the
+number of alarms among m episodes has a beta-binomial distribution with parameters n + 1 - k and k.
+Printed is its 97.5 % quantile; that of the mean over environments is higher, so that all rows
+together have a chance of 2.5 % that any is above its own. Exit code 1 when a row is above in more
+environments than chance allows, or on average over them.
 """
 
 import argparse
 import sys
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import betabinom, binom
@@ -24,9 +26,11 @@ from oodd_eval.metrics.alarms import GuaranteedAlarm, offered_levels, quantile_r
 from oodd_eval.names import select
 from oodd_eval.plugins.contract import make_detector, score_chunk
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.results.fits import FitStore
+from oodd_eval.scoring.plan import make_unit
 
 ROWS = ("random,clock,comb,persistence,range,mahalanobis,mewma,mewma-a,rf,rf-ewma,"
-        "npn,n-riqn,riqn,riqn-ms")  # fmt: skip
+        "npn,n-riqn,riqn,riqn-r,pe,pe-a,pe-step,pe-step-a")  # fmt: skip
 
 
 def fresh_episodes(environment, n, base, cap):
@@ -42,10 +46,20 @@ def shown(spec, trajectories):
     return [x.without_actions() if withheld else x for x in trajectories]
 
 
-def counts(spec, data, fresh):
+def fitted(offer, split, data, stores):
+    """Return a detector with seed 0 at horizon 1, fitted now or by an earlier run."""
+    detector = make_detector(offer.spec.factory, seed=0, horizon=1, parameters={})
+    unit = make_unit(offer, {}, data.id, (), 1, 0, split.digest, None)
+    kept = next(filter(None, (store.find(unit.fit_key) for store in stores)), None)
+    if kept:
+        detector.load(kept.path)
+        return detector
+    detector.fit(shown(offer.spec, data.train))
+    return detector
+
+
+def counts(detector, spec, data, fresh):
     """Return by level: alarms among the fresh episodes, and rank and number of calibration ones."""
-    detector = make_detector(spec.factory, seed=0, horizon=1, parameters={})
-    detector.fit(shown(spec, data.train))
     scores = score_chunk(detector, shown(spec, data.calibration))
     again = score_chunk(detector, shown(spec, fresh))
     n = len(scores) // 2 if spec.alarm == "cusum" else len(scores)
@@ -63,7 +77,9 @@ def main():
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed-base", type=int, default=41)
     parser.add_argument("--env", default="all")
+    parser.add_argument("--fits", type=Path, action="append", default=[], metavar="RESULTS")
     options = parser.parse_args()
+    stores = [FitStore(results / "fitted") for results in options.fits]
     split, plugins = load_split("mini"), discover()
     names = plugins.select(",".join(options.detectors) or ROWS)
     cap = split.manifest["definition"]["episode_cap"]
@@ -72,7 +88,9 @@ def main():
         fresh = fresh_episodes(environment, options.episodes, options.seed_base, cap)
         with closing(split.environment(environment)) as data:
             for name in names:
-                for suffix, found in counts(plugins.offer(name).spec, data, fresh).items():
+                offer = plugins.offer(name)
+                detector = fitted(offer, split, data, stores)
+                for suffix, found in counts(detector, offer.spec, data, fresh).items():
                     table.setdefault((name, suffix), {})[environment] = found
                     alarms, rank, n, _ = found
                     most = betabinom.ppf(0.975, options.episodes, n + 1 - rank, rank)

@@ -16,8 +16,9 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from oodd_pe import detector as module
 from oodd_pe import make_pe, statistic
-from oodd_pe.network import Forecast
+from oodd_pe.statistic import deviance
 from tabulate import tabulate
 
 from oodd_eval import DetectorSpec, evaluate, load_split
@@ -32,6 +33,7 @@ VARIANTS = {
     "steps at rest count fully": {"MOVEMENT": 0.0},
     "one scale for all tails": {"BINS": 1},
     "no energy": {"ENERGY": 0.0},
+    "scales wider than in training": {"wide": True},
     "8 degrees of freedom everywhere": {"BINS": 1, "nu": 8.0},
 }
 
@@ -73,18 +75,15 @@ def spec(detector, change):
 
 def measured(detector, change, split, environment):
     """Return the figures of one variant: for each metric sensor and dynamics anomalies."""
-    deviance = Forecast.deviance
     with ExitStack() as stack:
         for name in change.keys() & vars(statistic).keys():
             stack.enter_context(patch.object(statistic, name, change[name]))
         if nu := change.get("nu"):
-
-            def fixed(self):
-                return deviance(
-                    self._replace(log_tail=torch.full_like(self.log_tail, math.log(nu)))
-                )
-
-            stack.enter_context(patch.object(Forecast, "deviance", fixed))
+            stack.enter_context(
+                patch.object(module, "deviance", lambda e, t: deviance(e, t * 0 + math.log(nu)))
+            )
+        if change.get("wide"):
+            stack.enter_context(patch.object(detector.ensemble_, "_floor", -math.inf))
         records = evaluate(spec(detector, change), split, environments=environment)
     return [
         np.mean([r.metrics[m].value for r in records if r.group == group])

@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from oodd_npn import npn
 from oodd_riqn import riqn
-from oodd_torch.forecast import Forecaster
-from oodd_torch.training import arrange
+from oodd_torch.forecast import Forecaster, arrange
 from tabulate import tabulate
 
 from oodd_eval import load_split
@@ -56,7 +55,7 @@ def three_scores(detector, samples, trajectory):
     network, scale = detector.network_, detector.scale_
     rows = scale(trajectory)
     forecaster = Forecaster(network, horizon=1, samples=samples, mean_sampling=False, seed=0)
-    x = arrange([[rows]], 1)[0].expand(network.members, -1, -1, -1)
+    x = arrange([rows[:-1]], 1).expand(network.members, -1, -1, -1)
     drawn, _ = forecaster.forecast(x, network.start(1), range(1, len(rows)))
     drawn = np.sort(drawn[:, :, 0].permute(1, 3, 0, 2).flatten(2).numpy(), axis=2)  # (T, D, E M)
     truth = rows[1:, :, None]

@@ -35,7 +35,13 @@ def one_step(made, e, stream, index):
         change = [change_of(made, e * d + i, stream, index, [i])[0] for i in range(d)]
     else:
         change = change_of(made, e, stream, index, range(d))
-    return stream[-1] + made.unit.numpy() * np.array(change, np.float32)
+    w = made.architecture.window
+    past = np.concatenate([stream[max(len(stream) - 1 - i, 0)] for i in range(w)])
+    return linear(made, past) + made.unit.numpy() * np.array(change, np.float32)
+
+
+def linear(made, past):
+    return past @ made.base[:-1].numpy() + made.base[-1].numpy()
 
 
 def change_of(made, network, stream, index, sensors):
@@ -100,7 +106,8 @@ class Walker:
                     for k in range(h):
                         if k:
                             g, memory = gru_step(p, o, memory)
-                        o = o + self.made.unit * change(p, g, memory, drawn[0, k, e, m])
+                        linear = o @ self.made.base[:-1] + self.made.base[-1]
+                        o = linear + self.made.unit * change(p, g, memory, drawn[0, k, e, m])
                     total += float((rows[t + h] - o).abs().mean())
             found.append(total / len(self.weights) / self.samples)
         return np.array(found)

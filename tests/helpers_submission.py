@@ -36,7 +36,8 @@ def remembered_metrics():
 
     def metric_of(name, sums, environment):
         kind = metric_info(name).interval
-        key = kind, environment, sums.numerator.tobytes(), sums.denominator.tobytes()
+        terms = sums.numerator.tobytes(), sums.denominator.tobytes(), sums.median
+        key = kind, environment, *terms
         if key not in known:
             known[key] = whole(name, sums, environment)
         return known[key]

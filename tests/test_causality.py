@@ -91,6 +91,15 @@ def test_neither_a_constant_nor_a_spike_nor_a_step_hides_a_difference(constant, 
         check_prefix(whole[:50] + 1e-5, whole, detector="mine", where="hopper/test/iid[7]")
 
 
+def test_rollouts_may_leave_more_rounding_and_no_more_than_that():
+    whole = np.arange(100.0)  # the tenth nearest other score is five away
+    for horizon, allowed in ((1, 5e-3), (2, 25e-3)):
+        given = {"detector": "mine", "where": "hopper/test/iid[7]", "horizon": horizon}
+        check_prefix(whole[:90] + 0.9 * allowed, whole, **given)
+        with pytest.raises(ContractError, match="other scores when they are all it gets"):
+            check_prefix(whole[:90] + 1.1 * allowed, whole, **given)
+
+
 @pytest.mark.parametrize("scores", [np.full(20, 7.0), np.where(np.arange(20) == 9, 1.0, 2.0)])
 def test_scores_that_are_mostly_equal_stay_the_same_bit_for_bit(scores):
     check_prefix(scores[:15], scores, detector="mine", where="x")

@@ -16,7 +16,7 @@ ADAPTERS = [
 ]
 """Some of those that are made of any class of a library."""
 
-NETWORK = {"updates": 3, "members": 2, "chunk": 20}
+NETWORK = {"updates": 3, "members": 2}
 ENSEMBLE = {"updates": 20, "width": 16}
 QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
 SMALL = {
@@ -24,6 +24,7 @@ SMALL = {
     "rf-ewma": {"members": 2, "trees": 2},
     "riqn": QUANTILES,
     "riqn-ms": QUANTILES,
+    "riqn-r": QUANTILES,
     "n-riqn": QUANTILES,
     "npn": NETWORK,
     "pe": ENSEMBLE,
@@ -76,5 +77,5 @@ def must_conform(name, horizon, parameters):
 def test_no_plugin_is_left_out():
     assert not PLUGINS.broken
     assert {"random", "persistence", "clock", "comb", "range", "mahalanobis", "rf", "rf-ewma",
-            "riqn", "riqn-ms", "n-riqn", "npn", "mewma", "mewma-a",
+            "riqn", "riqn-ms", "riqn-r", "n-riqn", "npn", "mewma", "mewma-a",
             "pe", "pe-a", "pe-step", "pe-step-a"} <= set(PLUGINS.offers)  # fmt: skip

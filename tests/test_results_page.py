@@ -5,7 +5,10 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from oodd_eval.data.facts import ENVIRONMENTS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "results.md").read_text()
@@ -30,6 +33,30 @@ def test_the_table_is_the_boards():
         assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
     shown = [float(r[1]) for r in rows]
     assert shown == sorted(shown, reverse=True)
+
+
+def test_the_table_by_environment_is_the_boards():
+    (file,) = (ROOT / "leaderboard" / "tables").glob("mini-*-cells.csv")
+    with file.open() as lines:
+        cells = [r for r in csv.DictReader(lines) if (r["horizon"], r["overrides"]) == ("1", "{}")]
+
+    def mean(detector, group, metric):
+        wanted = (detector, environment, group)
+        own = [r for r in cells if (r["detector"], r["environment"], r["group"]) == wanted]
+        return 100 * np.mean([float(r[metric]) for r in own])
+
+    pair = r"([\d.]+), ([\d.]+)"
+    rows = re.findall(
+        rf"^\| (\w+) \| {pair} \| {pair} \| (\d+) \| (\d+) \| (\d+) \|$", PAGE, re.MULTILINE
+    )
+    assert [r[0] for r in rows] == list(ENVIRONMENTS)
+    for environment, *found in rows:
+        expected = [
+            mean(d, g, "auc_matched") for g in ("sensor", "dynamics") for d in ("pe", "pe-a")
+        ]
+        assert [float(n) for n in found[:4]] == pytest.approx(expected, abs=0.051), environment
+        missed = [mean(d, "dynamics", "missed_at_5pct") for d in ("mewma-a", "pe", "pe-a")]
+        assert [float(n) for n in found[4:]] == pytest.approx(missed, abs=0.51), environment
 
 
 def test_protocols_beside_each_other():

@@ -17,7 +17,7 @@ from oodd_eval.plugins.contract import (
 )
 
 Named: TypeAlias = NDArray[np.int32]
-"""What is kept of an explanation, shape (2, T + 1): sensors named first and onsets, or -1."""
+"""Sensors named first and onsets by row, shape (2, T + 1); -1 where a row has none."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""

@@ -76,11 +76,11 @@ class FeatureScale:
         return ((self.checked(observation) - self.mean) / self.std).astype(np.float32)
 
     def checked(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Return one observation as it is, float32 of shape (D,).
+        """Return a copy of one observation as it is, float32 of shape (D,).
 
         Raises `TrajectoryError` for another number of sensors, or a value that is not finite.
         """
-        found = np.asarray(observation, dtype=np.float32)
+        found = np.array(observation, dtype=np.float32)
         if found.shape != self.mean.shape or not np.isfinite(found).all():
             n, wild = len(self.mean), int((~np.isfinite(found)).sum())
             given = f"an observation of shape {found.shape} with {wild} values that are not finite"

@@ -190,7 +190,9 @@ class _Work:
                     one, rows, horizon=horizon, warm_up=warm_up, detector=detector, where=where
                 )
                 if group is self._probes:
-                    contract.check_prefix(found, parts[part][i], detector=detector, where=where)
+                    contract.check_prefix(
+                        found, parts[part][i], detector=detector, where=where, horizon=horizon
+                    )
                 else:
                     parts[part][i] = found
         return parts

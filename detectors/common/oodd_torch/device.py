@@ -1,12 +1,12 @@
-"""Where torch computes."""
+"""The parameter `device` of detectors that use torch."""
 
 import torch
 
 from oodd_eval.errors import UsageError
 
 
-def chosen(detector: str, device: str) -> str:
-    """Return the device that a detector's parameter asks for: ``"cpu"`` or ``"cuda"``.
+def resolved_device(detector: str, device: str) -> str:
+    """Return the device that the parameter's value stands for: ``"cpu"`` or ``"cuda"``.
 
     ``"auto"`` is cuda where there is one. Raises `UsageError` for cuda where there is none.
     """

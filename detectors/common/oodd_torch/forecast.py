@@ -14,10 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from oodd_common.windows import windows
 from torch import Tensor
 
 from oodd_torch.network import GRID, Ensemble
-from oodd_torch.training import arrange, predict
+from oodd_torch.training import predict
 
 ROWS = 4096
 """Forecasts of one network that are computed together at horizon 1: bounds memory."""
@@ -26,14 +27,33 @@ ROLLOUTS = 1024
 """The same at larger horizons, where arrays that fit the processor's cache are quicker."""
 
 
+def arrange(rows: Sequence[NDArray[np.float32]], window: int) -> Tensor:
+    """Lay out B trajectories, time first: windows (T + 1, B, W * D), zeros after an end."""
+    x = np.zeros((max(len(r) for r in rows), len(rows), window * rows[0].shape[1]), np.float32)
+    for b, r in enumerate(rows):
+        x[: len(r), b] = windows(r, np.arange(len(r)), window).reshape(len(r), -1)
+    return torch.from_numpy(x)
+
+
 class Forecaster:
-    """Forecasts at horizon h by M samples, with or without mean sampling; the seed keys levels."""
+    """Forecasts at horizon h by M samples, with or without mean sampling; the seed keys levels.
+
+    With `scale`, (D,), the distance is that of a point forecast, in these units.
+    """
 
     @torch.no_grad()
     def __init__(
-        self, network: Ensemble, *, horizon: int, samples: int, mean_sampling: bool, seed: int
+        self,
+        network: Ensemble,
+        *,
+        horizon: int,
+        samples: int,
+        mean_sampling: bool,
+        seed: int,
+        scale: NDArray[np.float32] | None = None,
     ) -> None:
         self.network, self.horizon, self.samples, self.seed = network, horizon, samples, seed
+        self.scale = None if scale is None else torch.from_numpy(scale).to(network.device)
         # Embeddings of the quantile levels depend on nothing else.
         self.table = network.table() if network.architecture.quantiles else None
         alone = mean_sampling or horizon == 1 or self.table is None
@@ -42,23 +62,23 @@ class Forecaster:
 
     @torch.no_grad()
     def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
-        """Return mean absolute errors of the forecasts of every ``o_t``, ``t >= horizon``.
+        """Return `distance` of every ``o_t``, ``t >= horizon``, averaged over sensors.
 
         From standardized observations of shape (T + 1, D) to errors of shape (max(T + 1 - h, 0),).
         """
+        return [e.mean(1) for e in self.distances(rows)]
+
+    @torch.no_grad()
+    def distances(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
+        """Return the same of every sensor: shape (max(T + 1 - h, 0), D)."""
         network, horizon = self.network, self.horizon
         longest = max(len(r) for r in rows)
         counts = [max(0, len(r) - horizon) for r in rows]
         if longest <= horizon:
-            return [np.zeros(0) for _ in rows]
-        # A lone row has no target; repeated, it is a step that is thrown away again.
-        episodes = [r if len(r) > 1 else np.repeat(r, 2, axis=0) for r in rows]
-        x = arrange([episodes], network.architecture.window)[0].to(network.device)
-        truth = np.zeros((longest, len(rows), network.architecture.features), np.float32)
-        for b, r in enumerate(rows):
-            truth[: len(r), b] = r
-        target = torch.from_numpy(truth).to(network.device)
-        x = x.expand(network.members, -1, -1, -1)  # (E, T, B, W * D)
+            return [np.zeros((0, rows[0].shape[1])) for _ in rows]
+        x = arrange(rows, network.architecture.window).to(network.device)
+        target = x[..., : network.architecture.features]
+        x = x.expand(network.members, -1, -1, -1)  # (E, T + 1, B, W * D)
         memory = network.start(len(rows))
         together = ROWS if horizon == 1 else ROLLOUTS // self.width
         chunk = max(1, together // len(rows))
@@ -67,10 +87,20 @@ class Forecaster:
             stop = min(start + chunk, longest - horizon)
             times = range(start + horizon, stop + horizon)
             predicted, memory = self.forecast(x[:, start:stop], memory, times)
-            error = (target[start + horizon : stop + horizon, :, None] - predicted).abs()
-            parts.append(error.mean((0, 3, 4), dtype=torch.float64))
-        errors = torch.cat(parts).cpu().numpy()  # (T + 1 - h, B)
+            parts.append(self.distance(predicted, target[start + horizon : stop + horizon]))
+        errors = torch.cat(parts).cpu().numpy()  # (T + 1 - h, B, D)
         return [errors[:count, b].copy() for b, count in enumerate(counts)]
+
+    def distance(self, samples: Tensor, truth: Tensor) -> Tensor:
+        """Return the distance between what came, (C, B, D), and its samples (E, C, B, M, D).
+
+        The mean absolute distance to the samples of all members, or, where there is a scale, the
+        absolute distance to their median divided by the scale: (C, B, D) in double precision.
+        """
+        if self.scale is None:
+            return (truth[:, :, None] - samples).abs().mean((0, 3), dtype=torch.float64)
+        middle = samples.movedim(0, -1).transpose(2, 3).flatten(3).median(-1).values
+        return ((truth - middle).abs() / self.scale).double()
 
     @torch.no_grad()
     def forecast(self, x: Tensor, memory: Tensor, times: range) -> tuple[Tensor, Tensor]:
@@ -89,8 +119,7 @@ class Forecaster:
         if levels is not None and self.table is not None:
             heads = network.heads_from(levels[0], self.table)
         change, memory = predict(network, x, memory, heads)
-        newest = x[..., None, : network.architecture.features]
-        return newest + network.unit * change, memory
+        return network.linear(x)[..., None, :] + network.unit * change, memory
 
     def _levels(self, times: range) -> Tensor | None:
         """Levels of shape (h, E, C, M, D), or None without quantiles."""
@@ -149,8 +178,8 @@ def rollouts(
             change = torch.matmul(z.reshape(k, c * width, b, -1), heads)  # (K, C R, B, M / R P)
             change = change.reshape(k, c, width, b, -1, p).transpose(2, 3).flatten(3, 4)
         change = network.gather(change + network.out_bias[:, None, None])
-        newest = window[..., :d].reshape(-1, c, width, b, d).transpose(2, 3)  # (E, C, B, R, D)
-        return newest + network.unit * change
+        linear = network.linear(window).reshape(-1, c, width, b, d).transpose(2, 3)
+        return linear + network.unit * change  # (E, C, B, R or M, D)
 
     def repeat(tensor: Tensor) -> Tensor:
         return tensor[:, :, None].expand(-1, -1, width, -1, -1).flatten(1, 3)

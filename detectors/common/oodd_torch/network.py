@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from oodd_torch.gru import GruCell, Sequence
+
 GRID: Final = 4096
 """Sampled quantile levels are the midpoints of this many equal parts of (0, 1).
 
@@ -62,51 +64,39 @@ class Architecture:
         return 1 if self.per_feature else self.features
 
 
-@dataclass(frozen=True, slots=True)
-class GruCell:
-    """A GRU's weights for many single steps: one product for both gates, two for the candidate.
-
-    Everything else works in place. A rollout's step is bound by passes over arrays larger than the
-    cache, and this way needs half of those of `Ensemble.gate`.
-    """
-
-    gates: Tensor  # (K, 2H, 2H): reset and update from input and memory
-    gates_bias: Tensor
-    new: Tensor  # (K, H, H): candidate from the input
-    new_bias: Tensor
-    old: Tensor  # (K, H, H): candidate from the memory
-    old_bias: Tensor
-
-    def __call__(self, f: Tensor, memory: Tensor) -> Tensor:
-        """One step: (K, B, H) and (K, B, H) to the new memory (K, B, H)."""
-        both = torch.cat([f, memory], 2)
-        reset, update = torch.bmm(both, self.gates).add_(self.gates_bias).sigmoid_().chunk(2, 2)
-        old = torch.bmm(memory, self.old).add_(self.old_bias)
-        candidate = torch.bmm(f, self.new).add_(self.new_bias).addcmul_(reset, old).tanh_()
-        return candidate.lerp_(memory, update)
-
-
 class Ensemble(torch.nn.Module):
     """E networks of the paper's appendix B side by side.
 
     ``f = relu(x W1 + b1)``, ``g = GRU(f)``, ``z = relu(g W2 + b2) + f`` (the skip connection),
     ``phi(tau) = relu(cos(pi i tau) C + c)``, and for sensor d
-    ``q_d(tau) = o_d + s_d [(z * phi(tau)) v_d + u_d]``: the output is the change from the newest
-    observation in units of the training standard deviation ``s_d`` of that change, so that an
-    untrained network predicts no change and all sensors weigh alike in the loss. Without memory
-    ``g = f``; without quantiles ``phi = 1``.
+    ``q_d(tau) = l_d + s_d [(z * phi(tau)) v_d + u_d]``: the output is a correction of the linear
+    forecast ``l = x A + a``, `linear`, in units of the deviation ``s_d`` that this forecast has in
+    training, so that an untrained network is a linear regression and all sensors weigh alike in
+    the loss. Without memory ``g = f``; without quantiles ``phi = 1``.
+
+    Parameters
+    ----------
+    architecture, generators
+        Shape of the members, and a generator for the weights of each.
+    base : (W * D + 1, D)
+        A, and a in the last row.
+    unit : (D,)
+        s.
     """
 
+    base: Tensor
     unit: Tensor
 
     def __init__(
         self,
         architecture: Architecture,
         generators: list[torch.Generator],
+        base: NDArray[np.float32],
         unit: NDArray[np.float32],
     ) -> None:
         super().__init__()
         a = self.architecture = architecture
+        self.register_buffer("base", torch.from_numpy(base))
         self.register_buffer("unit", torch.from_numpy(unit))
         h, inputs = a.units, a.window * a.features
         self.members = len(generators)
@@ -137,6 +127,15 @@ class Ensemble(torch.nn.Module):
         """Device of the parameters."""
         return self.first.device
 
+    def hidden(self) -> list[Tensor]:
+        """Weights between hidden layers, which are those for `Muon`."""
+        a = self.architecture
+        return [
+            self.second,
+            *([self.gru_in, self.gru] if a.recurrent else []),
+            *([self.cosine] if a.quantiles else []),
+        ]
+
     def start(self, rows: int) -> Tensor:
         """Return the memory before the first observation: zeros of shape (K, rows, H)."""
         return self.first.new_zeros(len(self.first), rows, self.architecture.units)
@@ -155,6 +154,10 @@ class Ensemble(torch.nn.Module):
     def _split(self) -> bool:
         return self.architecture.networks > 1
 
+    def linear(self, x: Tensor) -> Tensor:
+        """Linear forecast of the next observation: (..., W * D) to (..., D)."""
+        return x @ self.base[:-1] + self.base[-1]
+
     def inputs(self, x: Tensor) -> Tensor:
         """First layer: (E, B, W * D) to (K, B, H)."""
         return torch.relu(torch.baddbmm(self.first_bias, self.spread(x), self.first))
@@ -171,26 +174,19 @@ class Ensemble(torch.nn.Module):
             old_bias=self.gru_bias[..., 2 * h :],
         )
 
-    def gate(self, projected: Tensor, memory: Tensor) -> Tensor:
-        """One step of the GRU from the projected input (K, B, 3H)."""
-        h = self.architecture.units
-        recurrent = torch.baddbmm(self.gru_bias, memory, self.gru)  # (K, B, 3H)
-        opened = torch.sigmoid(projected[..., : 2 * h] + recurrent[..., : 2 * h])
-        reset, update = opened[..., :h], opened[..., h:]
-        candidate = torch.tanh(
-            torch.addcmul(projected[..., 2 * h :], reset, recurrent[..., 2 * h :])
-        )
-        return torch.lerp(candidate, memory, update)
+    def run(self, f: Tensor, memory: Tensor, kept: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """GRU over time: (K, T, B, H) to memories (K, T, B, H) and the last one (K, B, H).
 
-    def run(self, f: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """GRU over time: (K, T, B, H) to memories (K, T, B, H) and the last one (K, B, H)."""
+        The memory is multiplied with `kept`, (K, T, B, 1), before each step. No gradient flows
+        into it.
+        """
         k, t, b, h = f.shape
         projected = torch.baddbmm(self.gru_in_bias, f.reshape(k, t * b, h), self.gru_in)
-        outputs = []
-        for now in projected.reshape(k, t, b, 3 * h).unbind(1):
-            memory = self.gate(now, memory)
-            outputs.append(memory)
-        return torch.stack(outputs, dim=1), memory
+        projected = projected.reshape(k, t, b, 3 * h)
+        memories: Tensor = Sequence.apply(  # type: ignore[no-untyped-call]
+            projected, memory, self.gru, self.gru_bias, kept
+        )
+        return memories, memories[:, -1].detach()
 
     def trunk(self, f: Tensor, g: Tensor) -> Tensor:
         """Second layer and skip connection: (K, B, H) and (K, B, H) to (K, B, H)."""

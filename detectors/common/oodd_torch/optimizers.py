@@ -58,11 +58,12 @@ class Muon:
     It is for weights between hidden layers, ``y = x W`` with W of shape (rows, columns); biases and
     output layers are for `Adam`. A step with rate r changes the output by about r times the norm of
     a unit input, whatever the size of the gradient, which is why there is no clip. Source: Keller
-    Jordan et al. (2024), "Muon: an optimizer for hidden layers in neural networks".
+    Jordan et al. (2024), "Muon: an optimizer for hidden layers in neural networks". With `shrink`
+    a step also takes ``r shrink`` times the weights away.
     """
 
-    def __init__(self, parameters: Iterable[Tensor]) -> None:
-        self.parameters = list(parameters)
+    def __init__(self, parameters: Iterable[Tensor], shrink: float = 0.0) -> None:
+        self.parameters, self.shrink = list(parameters), shrink
         self.mean = [torch.zeros_like(p) for p in self.parameters]
 
     @torch.no_grad()
@@ -74,7 +75,7 @@ class Muon:
                 # Nesterov's momentum: the mean as it will be after another such gradient.
                 step = orthogonal(p.grad.lerp(m, MOMENTUM))
                 size = max(1.0, p.shape[2] / p.shape[1]) ** 0.5
-                p.sub_(rates[:, None, None] * size * step)
+                p.sub_(rates[:, None, None] * (size * step + self.shrink * p))
                 p.grad = None
 
 

@@ -10,9 +10,9 @@ class NetworkParameters:
     """Parameters of every detector of this family; subclasses add their own."""
 
     members: int = parameter(5, low=1, help="networks in the ensemble, e")
-    updates: int = parameter(600, low=1, help="gradient steps of each member, at most")
-    batch: int = parameter(16, low=1, help="episodes in a batch")
-    chunk: int = parameter(100, low=1, help="steps through which gradients flow")
+    updates: int = parameter(2500, low=1, help="gradient steps of each member")
+    batch: int = parameter(32, low=1, help="pieces of episodes in a batch")
+    chunk: int = parameter(10, low=1, help="steps of a piece, through which gradients flow")
     scheduled_sampling: float = parameter(
         0.5,
         low=0,

@@ -1,13 +1,16 @@
-"""Training of an ensemble: truncated gradients through time, early stopping per network.
+"""Training of an ensemble: truncated gradients through time, and the mean of the last weights.
 
-Episodes are passed in chunks of consecutive steps; the memory is carried from chunk to chunk, its
-gradient is not. Members are independent networks: each has its own order of episodes, learning
-rate and stopping point, and they are trained side by side only because one batched matrix product
-is quicker than five small ones.
+Every member strings all episodes together, in an order of its own. As many readers as a batch has
+rows go along that ring, evenly spaced, a chunk of steps in each update. A reader carries its memory
+from chunk to chunk, its gradient it does not, and forgets it where an episode begins. An update
+therefore sees many short pieces from everywhere, none of it padding, with the memory that scoring
+would have there.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -19,13 +22,34 @@ from oodd_common.windows import windows
 from torch import Tensor
 
 from oodd_torch.network import Ensemble
-from oodd_torch.optimizers import Adam
+from oodd_torch.optimizers import Adam, Average, Muon
+
+ADAM_RATE: Final = 8e-3
+"""Largest learning rate of biases, of the first and of the last layer."""
+
+MUON_RATE: Final = 2e-2
+"""Largest learning rate of the weights between hidden layers."""
+
+SHRINK: Final = 0.5
+"""Decay of the weights between hidden layers, per update and learning rate."""
+
+WARM_UP: Final = 20
+"""Updates over which the learning rates rise."""
+
+DECAY: Final = 0.998
+"""Decay per update of the mean of the weights."""
 
 SAMPLED: Final = 256
 """Quantile levels that the samples of one update are drawn from, one of each equal part of (0, 1).
 
 Embedding the levels of every step and sensor would take longer than the rest.
 """
+
+RIDGE: Final = 1e-6
+"""Penalty of the linear forecast's coefficients, per transition and squared coefficient."""
+
+LEAST: Final = 1e-6
+"""Smallest unit of a sensor: single precision holds no finer forecasts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,36 +59,94 @@ class Schedule:
     Attributes
     ----------
     updates
-        Gradient steps of every member, at most.
+        Gradient steps of every member.
     batch
-        Episodes in a batch.
+        Pieces of episodes in a batch.
     chunk
-        Steps through which gradients flow.
+        Steps of a piece, through which gradients flow.
     levels
         Quantile levels of an update.
-    rates
-        Largest learning rate of each member; warmed up and decayed to a hundredth by a cosine.
     widths
-        Width of the quadratic part of each member's quantile loss, kappa, in standard deviations
-        of a sensor's change.
+        Width of the quadratic part of each member's quantile loss, kappa, in the network's units.
     scheduled_sampling
         Probability, at the end of training, that an input is the network's own sample; rises
         linearly from 0.
-    evaluations
-        How often the loss on held-out episodes is looked at.
-    patience
-        Evaluations without a better held-out loss, after which training stops.
     """
 
     updates: int
     batch: int
     chunk: int
     levels: int
-    rates: tuple[float, ...]
     widths: tuple[float, ...]
     scheduled_sampling: float = 0.0
-    evaluations: int = 20
-    patience: int = 6
+
+
+def pairs(
+    episodes: Sequence[NDArray[np.float32]], window: int
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Yield inputs (T, W * D), newest observation first, and targets (T, D) of every episode."""
+    for e in episodes:
+        if (steps := len(e) - 1) > 0:
+            yield windows(e, np.arange(steps), window).reshape(steps, -1), e[1:]
+
+
+def linear_forecast(
+    episodes: Sequence[NDArray[np.float32]], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Fit the linear forecast of the next observation from a window, by ridge regression.
+
+    Returns coefficients (W * D + 1, D), the intercept last, and the root mean square of what they
+    leave of each sensor, (D,).
+    """
+
+    def moments() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        for x, y in pairs(episodes, window):
+            # What is fitted is the change, so that little data means no change and not the mean.
+            x64, change = x.astype(np.float64), y.astype(np.float64) - x[:, : y.shape[1]]
+            yield np.insert(x64, x.shape[1], 1.0, axis=1), change
+
+    gram, cross = (sum(v) for v in zip(*((x.T @ x, x.T @ y) for x, y in moments()), strict=True))
+    base = np.linalg.solve(gram + RIDGE * gram[-1, -1] * np.eye(len(gram)), cross)
+    left = np.sqrt(sum(np.square(y - x @ base).sum(0) for x, y in moments()) / gram[-1, -1])
+    base[: base.shape[1]] += np.eye(base.shape[1])
+    return base.astype(np.float32), np.maximum(left, LEAST).astype(np.float32)
+
+
+def transitions(
+    episodes: Sequence[NDArray[np.float32]], window: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return all transitions in a row: inputs (N, W * D), targets (N, D), starts or not (N,)."""
+    inputs, targets = zip(*pairs(episodes, window), strict=True)
+    starts = np.concatenate([np.arange(len(x)) == 0 for x in inputs])
+    return (
+        torch.from_numpy(np.concatenate(inputs)),
+        torch.from_numpy(np.concatenate(targets)),
+        torch.from_numpy(starts),
+    )
+
+
+def batches(
+    episodes: Sequence[NDArray[np.float32]],
+    rngs: Sequence[np.random.Generator],
+    window: int,
+    schedule: Schedule,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield inputs (E, T, B, W * D), targets (E, T, B, D) and starts (E, T, B) without end.
+
+    Every member has a generator of its own for its order of episodes and its readers' places.
+    """
+    x, y, starts = transitions(episodes, window)
+    n, size = len(x), schedule.batch
+    pieces = np.split(np.arange(n), np.flatnonzero(starts.numpy())[1:])
+    rings = np.stack(
+        [np.concatenate([pieces[i] for i in rng.permutation(len(pieces))]) for rng in rngs]
+    )
+    places = np.stack([(np.arange(size) + rng.random(size)) * n / size for rng in rngs])
+    steps = np.arange(schedule.chunk)[:, None]
+    for update in itertools.count():
+        now = (places[:, None].astype(np.int64) + update * schedule.chunk + steps) % n  # (E, T, B)
+        rows = np.take_along_axis(rings, now.reshape(len(rings), -1), axis=1).reshape(now.shape)
+        yield x[rows], y[rows], starts[rows]
 
 
 def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> Tensor:
@@ -79,57 +161,10 @@ def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> T
     return torch.abs(tau - (error < 0).to(error.dtype)) * huber / kappa
 
 
-def batches(
-    episodes: Sequence[NDArray[np.float32]],
-    rngs: Sequence[np.random.Generator],
-    window: int,
-    schedule: Schedule,
-) -> Iterator[tuple[Tensor, Tensor, Tensor, bool]]:
-    """Yield chunks of episodes without end: inputs, targets and mask of `arrange`, whether new.
-
-    Every member has a generator of its own for its order of episodes. Chunks of the same episodes
-    follow each other, so that the memory can be carried along; the first one is new.
-    """
-    usable = [e for e in episodes if len(e) > 1]
-    size = min(schedule.batch, len(usable))
-    while True:
-        orders = np.stack([rng.permutation(len(usable)) for rng in rngs])
-        for first in range(0, len(usable) - size + 1, size):
-            chosen = orders[:, first : first + size]
-            x, y, mask = arrange([[usable[i] for i in row] for row in chosen], window)
-            for start in range(0, x.shape[1], schedule.chunk):
-                part = slice(start, start + schedule.chunk)
-                if mask[:, part].any():
-                    yield x[:, part], y[:, part], mask[:, part], start == 0
-
-
-def arrange(
-    picked: Sequence[Sequence[NDArray[np.float32]]], window: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Lay out episodes of every member, time before batch.
-
-    Returns inputs (E, T, B, W * D), newest observation first, targets (E, T, B, D) and mask
-    (E, T, B).
-    """
-    members, size = len(picked), len(picked[0])
-    longest = max(len(e) for row in picked for e in row) - 1
-    d = picked[0][0].shape[1]
-    x = np.zeros((members, longest, size, window * d), np.float32)
-    y = np.zeros((members, longest, size, d), np.float32)
-    mask = np.zeros((members, longest, size), dtype=bool)
-    for e, row in enumerate(picked):
-        for b, episode in enumerate(row):
-            steps = len(episode) - 1
-            x[e, :steps, b] = windows(episode, np.arange(steps), window).reshape(steps, -1)
-            y[e, :steps, b] = episode[1:]
-            mask[e, :steps, b] = True
-    return torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(mask)
-
-
 def predict(
-    network: Ensemble, x: Tensor, memory: Tensor, heads: Tensor | None
+    network: Ensemble, x: Tensor, memory: Tensor, heads: Tensor | None, kept: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """One pass over a chunk: changes (E, T, B, N, D) to the next rows, and the last memory.
+    """One pass over a chunk: corrections (E, T, B, N, D), and the last memory.
 
     Parameters
     ----------
@@ -138,10 +173,12 @@ def predict(
     heads : (K, G, H, N * P)
         Output layers at N levels, see `Ensemble.heads_at`: G = T for levels of every step, G = 1
         for levels that all steps share. None without quantiles.
+    kept : (E, T, B)
+        0 where an episode begins and the memory is to be forgotten, else 1.
 
     Returns
     -------
-    Changes in the network's units: the prediction is ``o + unit * change``.
+    Corrections in the network's units: the prediction is ``linear(x) + unit * correction``.
     """
     e, t, b, _ = x.shape
     a = network.architecture
@@ -149,7 +186,8 @@ def predict(
     k, _, h = f.shape
     g = f
     if a.recurrent:
-        g, memory = network.run(f.reshape(k, t, b, h), memory)
+        forget = None if kept is None else network.spread(kept)[..., None]
+        g, memory = network.run(f.reshape(k, t, b, h), memory, forget)
         g = g.reshape(k, t * b, h)
     z = network.trunk(f, g)  # (K, T * B, H)
     if heads is None:
@@ -167,7 +205,7 @@ def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0
 
 def _error(network: Ensemble, x: Tensor, y: Tensor, change: Tensor) -> Tensor:
     """Return target minus prediction in the network's units: (E, T, B, N, D)."""
-    target = (y - x[..., : network.architecture.features]) / network.unit
+    target = (y - network.linear(x)) / network.unit
     return target[..., None, :] - change
 
 
@@ -175,29 +213,27 @@ def descend(
     network: Ensemble,
     x: Tensor,
     y: Tensor,
-    mask: Tensor,
+    kept: Tensor,
     memory: Tensor,
     tau: Tensor | None,
     kappa: Tensor,
 ) -> Tensor:
     """Add the gradients of every network's mean loss; return the last memory.
 
-    The loss is the mean over masked steps, levels and the network's sensors. ``kappa`` has shape
-    (E,); ``tau`` (E, N) holds the levels of this update, shared by all steps, episodes and sensors,
+    The loss is the mean over steps, pieces, levels and the network's sensors. ``kappa`` has shape
+    (E,); ``tau`` (E, N) holds the levels of this update, shared by all steps, pieces and sensors,
     so that their embeddings cost next to nothing. The slope of the loss is handed to the backward
     pass directly: the loss itself, a dozen passes over the largest array of a training step, is
     only needed when it is looked at.
     """
     heads = None if tau is None else network.heads_at(tau)
-    change, memory = predict(network, x, memory, heads)
+    change, memory = predict(network, x, memory, heads, kept)
     with torch.no_grad():
-        error = _error(network, x, y, change)
+        slope = _error(network, x, y, change)
         if tau is not None:
-            error = quantile_huber_slope(error, tau[:, None, None, :, None], _wide(kappa))
-        terms = error.shape[3] * network.architecture.outputs
-        steps = mask.sum((1, 2)).clamp(min=1) * terms  # (E,)
-        share = mask / steps[:, None, None]
-        slope = error.mul_(-share[..., None, None])
+            slope = quantile_huber_slope(slope, tau[:, None, None, :, None], _wide(kappa))
+        _, t, b, n, _ = slope.shape
+        slope *= -1 / (t * b * n * network.architecture.outputs)
     change.backward(slope)  # type: ignore[no-untyped-call]
     return memory
 
@@ -220,24 +256,25 @@ def evaluate(
     With scheduled sampling a `share` of the inputs are samples here, too, by the same draws every
     time: on true inputs alone the best look would be the one before sampling sets in.
     """
-    a = network.architecture
-    x, y, mask = (v.to(network.device) for v in arrange([list(episodes)], a.window))
-    x, y = (v.expand(network.members, -1, -1, -1) for v in (x, y))
-    mask = mask.expand(network.members, -1, -1)
+    a, members = network.architecture, network.members
+    # One reader goes through all episodes.
+    x, y, starts = (
+        v.to(network.device).expand(members, 1, *v.shape).transpose(1, 2)
+        for v in transitions(episodes, a.window)
+    )
+    memory = network.start(1)
     if share > 0:
-        rngs = [np.random.default_rng(e) for e in range(network.members)]
-        x = feed_back(network, x, network.start(x.shape[2]), share, rngs)
-    even = (torch.arange(levels, device=network.device) + 0.5) / levels
-    tau = even.expand(network.members, -1)
+        rngs = [np.random.default_rng(e) for e in range(members)]
+        x = feed_back(network, x, starts, memory, share, rngs)
+    tau = ((torch.arange(levels, device=network.device) + 0.5) / levels).expand(members, -1)
     heads = network.heads_at(tau) if a.quantiles else None
-    change, _ = predict(network, x, network.start(x.shape[2]), heads)
+    change, _ = predict(network, x, memory, heads, (~starts).to(x.dtype))
     error = _error(network, x, y, change)
     if a.quantiles:
         each = quantile_huber(error, tau[:, None, None, :, None], _wide(kappa))
     else:
         each = 0.5 * error.square()
-    steps = mask.sum((1, 2))[:, None]
-    loss = (each.mean(3) * mask[..., None]).sum((1, 2)) / steps  # (E, D)
+    loss = each.mean((1, 2, 3))  # (E, D)
     return loss.flatten() if a.per_feature else loss.mean(1)
 
 
@@ -248,47 +285,33 @@ def train(
     schedule: Schedule,
     rngs: Sequence[np.random.Generator],
 ) -> list[list[float]]:
-    """Train all members in place; each ends at its own best held-out loss.
+    """Train all members in place; each ends at the mean of its last weights.
 
-    Returns held-out losses, one list of K values per evaluation.
+    Returns held-out losses, K values before the training and K after it.
     """
-    a, device = network.architecture, network.device
-    optimiser = Adam(list(network.parameters()))
-    rates = network.spread(torch.tensor(schedule.rates, device=device))
+    a, device, share = network.architecture, network.device, schedule.scheduled_sampling
     kappa = torch.tensor(schedule.widths, device=device)
-    every = max(1, schedule.updates // schedule.evaluations)
-    best = torch.full((len(network.first),), torch.inf, device=device)
-    kept = [p.detach().clone() for p in network.parameters()]
-    history: list[list[float]] = []
-    stale, memory = 0, torch.zeros(0)
+    hidden = network.hidden()
+    others = [p for p in network.parameters() if all(p is not h for h in hidden)]
+    adam, muon = Adam(others), Muon(hidden, SHRINK)
+    average = Average(network.parameters(), DECAY)
+    history = [evaluate(network, held_out, schedule.levels, kappa, share).tolist()]
+    memory = network.start(schedule.batch)
+    every = torch.ones(len(memory), device=device)
     chunks = batches(episodes, rngs, a.window, schedule)
     for update in range(1, schedule.updates + 1):
-        x, y, mask, new = next(chunks)
-        x, y, mask = x.to(device), y.to(device), mask.to(device)
-        memory = network.start(x.shape[2]) if new else memory.detach()
+        x, y, starts = (v.to(device) for v in next(chunks))
         tau = _stratified(rngs, schedule.levels).to(device) if a.quantiles else None
         done = update / schedule.updates
-        share = schedule.scheduled_sampling * done
         if share > 0:
-            x = feed_back(network, x, memory, share, rngs)
-        memory = descend(network, x, y, mask, memory, tau, kappa)
-        warm = min(1.0, update / 20)
-        decay = 0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * done))
-        optimiser.step(rates * warm * float(decay))
-        if update % every == 0 or update == schedule.updates:
-            found = evaluate(network, held_out, schedule.levels, kappa, schedule.scheduled_sampling)
-            history.append(found.tolist())
-            better = found < best
-            best = torch.where(better, found, best)
-            for keep, p in zip(kept, network.parameters(), strict=True):
-                keep[better] = p.detach()[better]
-            stale = 0 if bool(better.any()) else stale + 1
-            if stale >= schedule.patience:
-                break
-    with torch.no_grad():
-        for keep, p in zip(kept, network.parameters(), strict=True):
-            p.copy_(keep)
-    return history
+            x = feed_back(network, x, starts, memory, share * done, rngs)
+        memory = descend(network, x, y, (~starts).to(x.dtype), memory, tau, kappa)
+        rate = min(1.0, update / WARM_UP) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+        adam.step(every * ADAM_RATE * rate)
+        muon.step(every * MUON_RATE * rate)
+        average.update()
+    average.apply()
+    return [*history, evaluate(network, held_out, schedule.levels, kappa, share).tolist()]
 
 
 def _stratified(rngs: Sequence[np.random.Generator], levels: int) -> Tensor:
@@ -301,20 +324,24 @@ def _stratified(rngs: Sequence[np.random.Generator], levels: int) -> Tensor:
 def feed_back(
     network: Ensemble,
     x: Tensor,
+    starts: Tensor,
     memory: Tensor,
     share: float,
     rngs: Sequence[np.random.Generator],
 ) -> Tensor:
     """Replace inputs by the network's own samples: scheduled sampling (Bengio et al. 2015).
 
-    Each observation after the first of the chunk is replaced with probability `share`, by a sample
-    that was made from the inputs before it as they are by then. Samples of samples are therefore
-    among them, as in a rollout. Windows hold what was fed in. Levels are drawn per step and sensor.
+    Each observation that is the first neither of its episode nor of the chunk is replaced with
+    probability `share`, by a sample that was made from the inputs before it as they are by then.
+    Samples of samples are therefore among them, as in a rollout. Windows hold what was fed in.
+    Levels are drawn per step and sensor.
 
     Parameters
     ----------
     x : (E, T, B, W * D)
         True inputs, newest observation first.
+    starts : (E, T, B)
+        Whether an episode begins.
     memory : (K, B, H)
         Memory before the chunk.
     share
@@ -330,6 +357,7 @@ def feed_back(
     d = a.features
     replaced = np.stack([rng.random(x.shape[1:3]) < share for rng in rngs])
     chosen = torch.from_numpy(replaced).to(x.device)[..., None]
+    first = starts[..., None]
     heads = None
     if a.quantiles:
         levels = _stratified(rngs, SAMPLED).to(x.device)
@@ -337,16 +365,17 @@ def feed_back(
         table = network.embedding(network.spread(levels))
         heads = network.heads_from(torch.from_numpy(drawn).to(x.device), table)
     cell = network.cell() if a.recurrent else None
-    out = (network.out,) * steps if heads is None else heads.unbind(1)
-    true = x[..., :d].unbind(1)
     fed = [x[:, 0]]
-    for head, own, following in zip(out, chosen.unbind(1)[1:], true[1:], strict=False):
+    for t in range(1, steps):
         f = network.inputs(fed[-1])
-        memory = f if cell is None else cell(f, memory)
-        change = network.gather(
-            torch.baddbmm(network.out_bias, network.trunk(f, memory), head)
-        )  # (E, B, D)
-        sample = torch.addcmul(fed[-1][..., :d], network.unit, change)
-        newest = torch.where(own, sample, following)
-        fed.append(torch.cat([newest, fed[-1][..., :-d]], dim=2))
+        if cell is not None:
+            forget = network.spread(first[:, t - 1])
+            memory = cell(f, memory.masked_fill(forget, 0))
+        state = f if cell is None else memory
+        head = network.out if heads is None else heads[:, t - 1]
+        change = torch.baddbmm(network.out_bias, network.trunk(f, state), head)
+        sample = network.linear(fed[-1]) + network.unit * network.gather(change)  # (E, B, D)
+        newest = torch.where(chosen[:, t], sample, x[:, t, :, :d])
+        grown = torch.cat([newest, fed[-1][..., :-d]], dim=2)
+        fed.append(torch.where(first[:, t], x[:, t], grown))
     return torch.stack(fed, dim=1)

@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from oodd_common.windows import StorableWindowDetector, windows
-from oodd_torch.device import chosen
+from oodd_torch.device import resolved_device
 
 from oodd_eval import Explanation, Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
+from oodd_pe.ensemble import DensityEnsemble
 from oodd_pe.network import DensityNetworks, train
-from oodd_pe.statistic import Attribution, Charts, Evidence, Running
+from oodd_pe.statistic import Charts, Evidence, Onsets, Running, deviance
 
 HELD_OUT: Final = 0.15
 """Share of the nominal trajectories from which the charts are learnt; at least one."""
@@ -32,28 +32,33 @@ RIDGE: Final = 1e-6
 """Penalty of the linear forecast, relative to the mean squared change of standardized sensors."""
 
 LIMIT: Final = 10.0
-"""Largest size of an input, in standard deviations: beyond it a network has seen nothing."""
+"""Inputs are clipped at this many standard deviations. No network is trained on larger ones."""
 
 
 class _Known(NamedTuple):
-    """What N forecasts may use."""
+    """What N forecasts start from."""
 
     window: NDArray[np.float32]  # (N, W, D), newest first
     actions: Floats | None  # (N, W, A), NaN before the beginning
     steps: NDArray[np.int64]  # (N,), times of the newest observations
 
+    def rows(self, index: NDArray[np.int64]) -> _Known:
+        """Return what some of the forecasts start from."""
+        actions = None if self.actions is None else self.actions[index]
+        return _Known(self.window[index], actions, self.steps[index])
+
 
 class ProbabilisticEnsemble(StorableWindowDetector):
     r"""Residuals of forecast distributions, accumulated with several memories.
 
-    .. math:: e_t = s(x_t) \, (I + U(x_t)) \, (y_t - \mu(x_t)), \quad
+    .. math:: e_t = \frac{1}{M} \sum_m s_m(x_t) \, (I + U_m(x_t)) \, (y_t - \mu_m(x_t)), \quad
               r_t = \operatorname{sign}(e_t) \sqrt{(\nu + 1) \log(1 + e_t^2 / \nu(x_t))}, \quad
               z^\lambda_t = (1 - \lambda) z^\lambda_{t-1} + \lambda g_t u_t, \quad
               s_t = \max_\lambda \frac{d^\lambda_t - m_\lambda}{q_\lambda}
 
     where :math:`x_t` holds the latest observations up to :math:`o_{t-h}` (and actions, if asked
-    for), :math:`y_t` the change since then that a ridge regression does not explain, u the mean of
-    r over the members with its nominal scale removed, g less than one only while the sensors stand
+    for), :math:`y_t` the change since then that a ridge regression does not explain, m counts the
+    members, u is r with its nominal scale removed, g less than one only while the sensors stand
     still, and d the Mahalanobis length of z. Higher means more anomalous. Scores are undefined
     (NaN) for t < h.
 
@@ -92,9 +97,9 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             name, seed=seed, horizon=horizon, window=parameters.window, actions=actions
         )
         self.parameters, self.accumulate = parameters, accumulate
-        self.device = chosen(name, parameters.device)
+        self.device = resolved_device(name, parameters.device)
         self.charts_ = Charts(parameters.memories)
-        self.network_: DensityNetworks
+        self.ensemble_: DensityEnsemble
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon."""
@@ -102,54 +107,62 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         scores = np.full(len(trajectory), np.nan)
         if trajectory.transitions >= self.horizon:
             running = Running(self.charts_, accumulate=self.accumulate)
-            smoothed = running(self._evidence(trajectory))
+            evidence = self._evidence(trajectory)
+            smoothed = running(self.charts_.columns(evidence), evidence.movement)
             scores[self.horizon :] = self.charts_.statistic(smoothed).max(axis=0)
         return scores
 
     def explain(self, trajectory: Trajectory) -> Explanation:
         """Return which sensors the evidence of each row points at, and since when.
 
-        See `oodd_pe.statistic.Attribution`.
+        See `oodd_pe.statistic.Onsets`. A sensor's share is its part of what errors of single
+        sensors would explain of the step at the onset alone: later forecasts start from corrupted
+        readings, and every sensor disagrees with them.
         """
         self._must_fit(trajectory)
         shares = np.full(trajectory.observations.shape, np.nan)
         onsets = np.full(len(trajectory), -1)
         if trajectory.transitions >= self.horizon:
-            found = Attribution(self.charts_, self.horizon)(
-                self._evidence(trajectory, explain=True)
-            )
-            shares[self.horizon :], onsets[self.horizon :] = found
+            found = Onsets(self.charts_)(self.charts_.columns(self._evidence(trajectory)))
+            rows, of_row = np.unique(found, return_inverse=True)
+            known, now = self._known(trajectory), trajectory.observations[self.horizon :]
+            shares[self.horizon :] = self._shares(known.rows(rows), now[rows])[of_row]
+            onsets[self.horizon :] = found + self.horizon
         return Explanation(shares, onsets)
 
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
         self._running: Running | None = None
-        self._attribution: Attribution | None = None
-        self._last: tuple[Floats, int] | None = None
+        self._onsets: Onsets | None = None
+        self._onset = -1
+        self._suspect: tuple[_Known, NDArray[np.float32]] | None = None
 
     def explain_last(self) -> tuple[Floats, int]:
-        """Return shares of the sensors, (D,), and the onset that the latest `update` points at."""
-        unknown = np.full(len(self._scale().mean), np.nan)
-        return (unknown, -1) if self._last is None else self._last
+        """Return the row of `explain` for the latest `update`: shares (sensors,), and the onset."""
+        if self._suspect is None:
+            return np.full(len(self._scale().mean), np.nan), -1
+        return self._shares(*self._suspect)[0], self._onset
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
-        self._running = self._running or Running(self.charts_, accumulate=self.accumulate)
-        self._attribution = self._attribution or Attribution(self.charts_, self.horizon)
+        if self._running is None or self._onsets is None:
+            self._running = Running(self.charts_, accumulate=self.accumulate)
+            self._onsets = Onsets(self.charts_)
         actions = None
         if self.actions:
             commands = list(self._commands)[self.lag - 1 :]
             actions = np.full((1, self.window, len(self.action_scale_.mean)), np.nan)
             actions[0, : len(commands)] = commands
         known = _Known(window[None], actions, np.array([t - self.lag]))
-        evidence = self._judged(known, now[None], self._rows[1][None], explain=True)
+        evidence = self._judged(known, now[None], self._rows[1][None])
         columns = self.charts_.columns(evidence)
-        shares, onsets = self._attribution(evidence, columns)
-        self._last = shares[0], int(onsets[0])
-        return float(self.charts_.statistic(self._running(evidence, columns)).max())
+        self._onset = int(self._onsets(columns)[0]) + self.horizon
+        if self._onset == t:
+            self._suspect = known, now[None]
+        return float(self.charts_.statistic(self._running(columns, evidence.movement)).max())
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         usable = [x for x in nominal if x.transitions >= self.horizon]
@@ -177,30 +190,47 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         # A single episode has no others, and judges itself.
         training = [usable[i] for i in order[held:]] or held_out
 
-        x = np.concatenate([self._inputs(self._known(t)) for t in training])
-        y = np.concatenate([self._changes(*self._seen(t)) for t in training])
-        ones = np.concatenate([x, np.ones((len(x), 1))], axis=1)
-        gram = ones.T @ ones + RIDGE * len(ones) * np.eye(ones.shape[1])
-        self.ridge_ = np.linalg.solve(gram, ones.T @ y)
-        self.error_scale_ = np.maximum(
-            np.sqrt(((y - ones @ self.ridge_) ** 2).mean(axis=0)), CONSTANT
-        )
-        self.input_scale_ = np.maximum(x.std(axis=0), CONSTANT)
-        p = self.parameters
-        self.network_ = DensityNetworks(p.members, x.shape[1], y.shape[1], p.width, self.seed)
-        if y.shape[1]:
+        inputs, outcomes = self._examples(training)
+        p, d = self.parameters, outcomes.shape[1]
+        network = DensityNetworks(p.members, inputs.shape[1], d, p.width, self.seed)
+        if d:
             train(
-                self.network_,
-                self._scaled(x),
-                self._errors(x, y),
+                network,
+                inputs,
+                outcomes,
                 updates=p.updates,
                 batch=p.batch,
                 seed=self.seed,
                 device=self.device,
             )
-        self.network_.frozen()
+        self.ensemble_ = DensityEnsemble(network.arrays())
         self.charts_.fit([self._evidence(t) for t in held_out])
         return scale
+
+    def _examples(self, training: Sequence[Trajectory]) -> tuple[NDArray[np.float32], Floats]:
+        """Fit the linear forecast; return inputs, (N, I), and outcomes, (N, D), of networks."""
+        # Twice over the episodes, since all their inputs in double precision need gigabytes.
+        moments = []
+        for t in training:
+            ones = np.pad(self._inputs(self._known(t)), ((0, 0), (0, 1)), constant_values=1.0)
+            moments.append((ones.T @ ones, ones.T @ self._changes(*self._seen(t))))
+        gram, cross = (np.sum(m, axis=0) for m in zip(*moments, strict=True))
+        n = int(gram[-1, -1])
+        self.ridge_ = np.linalg.solve(gram + RIDGE * n * np.eye(len(gram)), cross)
+        variance = np.diag(gram)[:-1] / n - (gram[-1, :-1] / n) ** 2
+        self.input_scale_ = np.sqrt(np.maximum(variance, CONSTANT**2))
+
+        inputs = np.empty((n, len(variance)), np.float32)
+        errors = np.empty((n, cross.shape[1]))
+        done = 0
+        for t in training:
+            x = self._inputs(self._known(t))
+            rows = slice(done, done := done + len(x))
+            inputs[rows] = self._scaled(x)
+            errors[rows] = self._errors(x, self._changes(*self._seen(t)))
+        self.error_scale_ = np.maximum(np.sqrt((errors**2).mean(axis=0)), CONSTANT)
+        errors /= self.error_scale_
+        return inputs, errors
 
     def _known(self, x: Trajectory) -> _Known:
         steps = np.arange(len(x) - self.horizon)
@@ -238,48 +268,50 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         return scaled
 
     def _errors(self, x: Floats, y: Floats) -> Floats:
-        """Return what the linear forecast leaves, in units of its training error."""
-        left: Floats = (y - x @ self.ridge_[:-1] - self.ridge_[-1]) / self.error_scale_
+        """Return what the linear forecast leaves of changes."""
+        left: Floats = y - x @ self.ridge_[:-1] - self.ridge_[-1]
         return left
 
-    def _evidence(self, x: Trajectory, *, explain: bool = False) -> Evidence:
+    def _evidence(self, x: Trajectory) -> Evidence:
         now, before = x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
-        return self._judged(self._known(x), now, before, explain=explain)
+        return self._judged(self._known(x), now, before)
 
-    @torch.inference_mode()
+    def _posed(self, known: _Known, now: NDArray[np.float32]) -> tuple[Floats, Floats]:
+        """Return what networks are given, (N, inputs), and what they are to forecast, (N, D)."""
+        x = self._inputs(known)
+        errors = self._errors(x, self._changes(now, known.window[:, 0]))
+        return self._scaled(x), errors / self.error_scale_
+
+    def _moved(self, now: NDArray[np.float32]) -> tuple[NDArray[np.bool_], Floats]:
+        """Return which sensors were constant in training, and how far they are from that."""
+        constant = np.ones(now.shape[1], dtype=bool)
+        constant[self.varying_] = False
+        moved: Floats = (now - self.observation_scale_.mean)[:, constant] / CONSTANT
+        return constant, moved
+
     def _judged(
-        self,
-        known: _Known,
-        now: NDArray[np.float32],
-        before: NDArray[np.float32],
-        *,
-        explain: bool = False,
+        self, known: _Known, now: NDArray[np.float32], before: NDArray[np.float32]
     ) -> Evidence:
         """Judge observations ``now`` (N, D); ``before`` are those of the step before."""
-        x = self._inputs(known)
-        y = self._errors(x, self._changes(now, known.window[:, 0]))
-        given, outcome = (
-            torch.from_numpy(v).expand(self.parameters.members, -1, -1)
-            for v in (self._scaled(x), y)
-        )
-        network, scale = self.network_, self.observation_scale_
-        forecast = network(given, outcome)
-        constant = np.ones(len(scale.mean), dtype=bool)
-        constant[self.varying_] = False
-        moved = (now - scale.mean)[:, constant] / CONSTANT
+        residual, log_tail = self.ensemble_(*self._posed(known, now))
+        moved = self._moved(now)[1]
         changed = np.sign(moved) * np.sqrt(2.0 * np.log1p(moved**2))
         movement = self._changes(now, before)
-        of_sensors = np.zeros((len(now), len(scale.mean) if explain else 0))
-        if explain:
-            alone = forecast.of_sensors(network.row, network.column).mean(0).numpy()
-            of_sensors[:, self.varying_] = alone**2
-            of_sensors[:, constant] = moved**2
         return Evidence(
-            np.concatenate([forecast.deviance().mean(0).numpy(), changed], axis=1),
-            forecast.log_tail.mean(0).numpy(),
+            np.concatenate([deviance(residual, log_tail), changed], axis=1),
+            log_tail,
             np.sqrt((movement**2).sum(axis=1) / max(1, movement.shape[1])),
-            of_sensors,
         )
+
+    def _shares(self, known: _Known, now: NDArray[np.float32]) -> Floats:
+        """Return each sensor's share in the evidence of single steps, (N, sensors)."""
+        explained = np.empty(now.shape)
+        explained[:, self.varying_] = self.ensemble_.of_sensors(*self._posed(known, now))
+        constant, moved = self._moved(now)
+        explained[:, constant] = moved**2
+        explained = np.maximum(explained, CONSTANT)
+        shares: Floats = explained / explained.sum(axis=1, keepdims=True)
+        return shares
 
     def _saved_with(self) -> dict[str, Any]:
         p = self.parameters
@@ -300,7 +332,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             "ridge": self.ridge_,
             "error_scale": self.error_scale_,
             "input_scale": self.input_scale_,
-            **self.network_.arrays(),
+            **self.ensemble_.arrays,
             **self.charts_.arrays(),
         }
 
@@ -315,6 +347,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self.error_scale_ = take(arrays, "error_scale", (d,))
         self.input_scale_ = take(arrays, "input_scale", (inputs,))
         p = self.parameters
-        self.network_ = DensityNetworks(p.members, inputs, d, p.width)
-        self.network_.restore(arrays)
+        self.ensemble_ = DensityEnsemble.restored(
+            arrays, DensityNetworks(p.members, inputs, d, p.width)
+        )
         self.charts_.restore(arrays, d, sensors - d)

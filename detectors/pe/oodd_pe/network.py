@@ -1,4 +1,4 @@
-"""The ensemble's networks: forecasts of a whole distribution, and their training.
+"""The ensemble's networks in torch: forecasts of a whole distribution, and their training.
 
 A network describes the change of all sensors, in units of the errors of a linear forecast. It gives
 means, scales, a triangular matrix of dependences, and how heavy each tail is, all by the inputs.
@@ -7,19 +7,21 @@ means, scales, a triangular matrix of dependences, and how heavy each tail is, a
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from oodd_common.charts import Floats
+from numpy.typing import NDArray
 from oodd_torch.optimizers import Adam, Average, Muon
 from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import silu, smooth_l1_loss
 
-from oodd_eval.plugins.state import Arrays, take
+from oodd_eval.plugins.state import Arrays
 
 LAYERS: Final = 3
+CHUNK: Final = 4096
+"""Rows that are looked at together outside the training: bounds memory."""
 RATE: Final = 8e-3
 """Learning rate of biases and output layers."""
 HIDDEN_RATE: Final = 0.03
@@ -34,12 +36,19 @@ A likelihood alone widens the scales of what it could still learn to forecast.
 """
 LOG_SCALE: Final = 12.0
 """Largest size of the logarithm of a scale."""
+LEAST_SCALES: Final = 0.01
+"""Share of the training rows with smaller scales than the least that a forecast may have.
+
+Far from its training inputs a network says that it knows nothing. It would forecast errors a
+hundred times as wide as any in training, and an anomaly would be hidden by the inputs that it
+corrupts.
+"""
 LOG_TAIL: Final = math.log(8.0)
 """Half the logarithm of the largest degrees of freedom, 64; the least are 1."""
 
 
 class Forecast(NamedTuple):
-    """What M networks say of N rows of D sensors.
+    """Forecasts of M networks for N rows of D sensors, and how far outcomes are from them.
 
     Attributes
     ----------
@@ -51,15 +60,12 @@ class Forecast(NamedTuple):
         Logarithms of the degrees of freedom of each residual's t distribution, (M, N, D).
     mean
         Forecasts, (M, N, D).
-    dependence
-        Entries of U below the diagonal, row after row, (M, N, D (D - 1) / 2).
     """
 
     residual: Tensor
     log_scale: Tensor
     log_tail: Tensor
     mean: Tensor
-    dependence: Tensor
 
     def surprise(self) -> Tensor:
         """Return the negative log likelihoods of the rows, (M, N)."""
@@ -73,31 +79,6 @@ class Forecast(NamedTuple):
             - half * torch.log1p(self.residual.square() / nu)
         )
         return -log_density.sum(-1)
-
-    def deviance(self) -> Tensor:
-        r"""Return signed deviance residuals, (M, N, D).
-
-        :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
-        normal distribution where e has Student's t distribution with nu degrees of freedom.
-        """
-        nu = self.log_tail.exp()
-        squared = (nu + 1) * torch.log1p(self.residual.square() / nu)
-        return torch.sign(self.residual) * squared.sqrt()
-
-    def of_sensors(self, row: Tensor, column: Tensor) -> Tensor:
-        r"""Return what an error of one sensor alone would explain, in standard deviations.
-
-        With the precision :math:`\Lambda = L^\top L`, L = s (I + U), of the errors y - mean, these
-        are :math:`(\Lambda (y - \mu))_d / \sqrt{\Lambda_{dd}}`: by how much their squared length
-        would fall if the reading of sensor d were free. ``row`` and ``column`` place the entries of
-        U. Of shape (M, N, D).
-        """
-        scale = self.log_scale.exp()
-        pulled = scale * self.residual
-        slope = pulled.index_add(-1, column, self.dependence * pulled[..., row])
-        squares = scale.square()
-        squares = squares.index_add(-1, column, self.dependence.square() * squares[..., row])
-        return slope / squares.sqrt()
 
 
 class DensityNetworks(torch.nn.Module):
@@ -131,45 +112,52 @@ class DensityNetworks(torch.nn.Module):
         row, column = np.tril_indices(sensors, -1)
         self.row: Tensor
         self.column: Tensor
+        self.floor: Tensor
+        self.register_buffer("floor", torch.full((members, 1, sensors), -math.inf))
         self.register_buffer("row", torch.from_numpy(row), persistent=False)
         self.register_buffer("column", torch.from_numpy(column), persistent=False)
 
     def forward(self, x: Tensor, y: Tensor) -> Forecast:
         """Judge outcomes y, (M, N, D), by inputs x, (M, N, I)."""
-        # Lists: a slice of a ParameterList is a module of its own, which takes long to make.
-        (weights, *deeper), (bias, *biases) = list(self.weights), list(self.biases)
-        hidden = silu(torch.baddbmm(bias, x, weights))
-        for weights, bias in zip(deeper, biases, strict=True):
-            hidden = hidden + silu(torch.baddbmm(bias, hidden, weights))
-        out = torch.baddbmm(self.out_bias, hidden, self.out)
+        # Rows last: what is gathered by sensor is then contiguous, and several times as quick.
+        layers = zip([*self.weights, self.out], [*self.biases, self.out_bias], strict=True)
+        hidden = silu(_layer(x.mT, *next(layers)))
+        for _ in range(LAYERS - 1):
+            hidden = hidden + silu(_layer(hidden, *next(layers)))
+        out = _layer(hidden, *next(layers))
         d = self.sensors
-        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[-1] - 3 * d], -1)
-        log_scale = LOG_SCALE * torch.tanh(scale / LOG_SCALE)
+        mean, scale, tail, dependence = torch.split(out, [d, d, d, out.shape[1] - 3 * d], 1)
+        log_scale = torch.maximum(LOG_SCALE * torch.tanh(scale / LOG_SCALE), self.floor.mT)
         log_tail = LOG_TAIL * (1 + torch.tanh(tail))
-        error = y - mean
-        known = dependence * error[..., self.column]
-        conditional = error.index_add(-1, self.row, known)
-        return Forecast(log_scale.exp() * conditional, log_scale, log_tail, mean, dependence)
+        error = y.mT - mean
+        known = dependence * error[:, self.column]
+        residual = log_scale.exp() * error.index_add(1, self.row, known)
+        return Forecast(residual.mT, log_scale.mT, log_tail.mT, mean.mT)
 
-    def frozen(self) -> Self:
-        """Make the networks ready to judge: on the processor, in double precision."""
-        return self.requires_grad_(requires_grad=False).cpu().double()
+    @torch.no_grad()
+    def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return each member's and sensor's least log scale for training rows, (M, 1, D)."""
+        parts = zip(torch.split(x, CHUNK), torch.split(y, CHUNK), strict=True)
+        found = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
+        scales = torch.cat(found, dim=1).cpu().numpy()
+        least = round(LEAST_SCALES * scales.shape[1])
+        lowest = np.partition(scales, least, axis=1)[:, least : least + 1]
+        return torch.from_numpy(lowest).to(x.device)
 
     def arrays(self) -> Arrays:
-        """Return the weights by name."""
-        return {name: p.detach().numpy() for name, p in self.named_parameters()}
+        """Return the weights, and the least scales, by name, in double precision."""
+        return {name: p.detach().cpu().double().numpy() for name, p in self.state_dict().items()}
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take over the weights of `arrays`; raises `FittedStateError` for others."""
-        for name, p in self.named_parameters():
-            p.data = torch.from_numpy(take(arrays, name, tuple(p.shape)))
-        self.frozen()
+
+def _layer(x: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
+    """Return weights' x + bias', (M, O, N), from (M, I, N), (M, I, O) and (M, 1, O)."""
+    return torch.baddbmm(bias.mT, weights.mT, x)
 
 
 def train(
     network: DensityNetworks,
-    x: Floats,
-    y: Floats,
+    x: NDArray[Any],
+    y: NDArray[Any],
     *,
     updates: int,
     batch: int,
@@ -178,13 +166,14 @@ def train(
 ) -> None:
     """Maximize the likelihood of outcomes y, (N, D), given inputs x, (N, I), in place.
 
-    Every member draws batches of its own. The weights are averaged over the last updates. What is
-    trained in single precision is used in double.
+    Every member draws batches of its own. The weights are averaged over the last updates. Networks
+    are trained in single precision.
     """
     random = np.random.default_rng([seed, 1])
     network.to(device)
-    inputs = torch.from_numpy(x.astype(np.float32)).to(device)
-    outcomes = torch.from_numpy(y.astype(np.float32)).to(device)
+    inputs, outcomes = (
+        torch.from_numpy(v.astype(np.float32, copy=False)).to(device) for v in (x, y)
+    )
     rest = [*network.biases, network.out, network.out_bias]
     hidden, others = Muon(network.weights), Adam(rest)
     average = Average(network.parameters(), DECAY)
@@ -205,3 +194,4 @@ def train(
         hidden.step(HIDDEN_RATE * rate * one)
         average.update()
     average.apply()
+    network.floor = network.least_scales(inputs, outcomes)

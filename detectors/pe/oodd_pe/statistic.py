@@ -1,8 +1,8 @@
 """From residuals to one statistic: charts of several memories, brought to one scale.
 
-What an ensemble says of one step is weak evidence of a small change; what it says of many steps
-with the same sign is strong. Each chart adds up residuals with another memory. The statistic is the
-largest of their distances from nominal operation, each in units of how far it gets in an episode.
+One residual is weak evidence of a small change; many with the same sign are strong evidence. Each
+chart adds up residuals with another memory. The statistic is the largest of their distances from
+nominal operation, each in units of how far it gets in an episode.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, Smoother, distance, whitening
+from oodd_common.charts import Floats, Smoother, whitening
 
 from oodd_eval.plugins.forecasting import CONSTANT
 from oodd_eval.plugins.state import Arrays, take
@@ -25,38 +25,44 @@ LARGEST: Final = 36.0
 """Limit of a squared residual in these averages."""
 SMALLEST: Final = 0.05
 """Least scale of a residual."""
-ENERGY: Final = 9.0
+ENERGY: Final = 25.0
 """Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
-MOVEMENT: Final = 0.5
-"""Share of the median movement below which a step counts as less than one in the sums."""
+MOVEMENT: Final = 0.7
+"""Share of the median movement; where sensors move less, a step counts less in the sums."""
 REFERENCE: Final = 2.0
 """Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
 SHRINKAGE: Final = 0.02
 """Least share of the identity in a correlation matrix."""
 
 
+def deviance(residual: Floats, log_tail: Floats) -> Floats:
+    r"""Return signed deviance residuals.
+
+    :math:`\operatorname{sign}(e) \sqrt{(\nu + 1) \log(1 + e^2 / \nu)}` has about a standard
+    normal distribution where e has Student's t distribution with nu degrees of freedom.
+    """
+    nu = np.exp(log_tail)
+    signed: Floats = np.sign(residual) * np.sqrt((nu + 1) * np.log1p(residual**2 / nu))
+    return signed
+
+
 class Evidence(NamedTuple):
-    """What an ensemble says of N steps of an episode.
+    """How far N steps of an episode are from their forecasts.
 
     Attributes
     ----------
     residuals
-        Signed deviance residuals, means over the members, (N, D); then one column a constant
-        sensor.
+        Signed deviance residuals of the members' mean, (N, D); then one column a constant sensor.
     log_tails
         Logarithms of the degrees of freedom that were forecast, (N, D).
     movement
         How far the sensors moved since the step before: root mean square, in training standard
         deviations, (N,).
-    of_sensors
-        Squared standard deviations that an error of one sensor alone would explain, (N, sensors);
-        without columns where nobody asks which sensor it was.
     """
 
     residuals: Floats
     log_tails: Floats
     movement: Floats
-    of_sensors: Floats
 
 
 class Charts:
@@ -90,13 +96,14 @@ class Charts:
         sums = [np.take_along_axis(squares, g, 0).sum(axis=0) for g in groups]
         means = [(s + prior) / (len(g) + PRIOR) for s, g in zip(sums, groups, strict=True)]
         self.scales_ = np.maximum(np.sqrt(np.stack(means, axis=1)), SMALLEST)
+        self._join()
         self.still_ = MOVEMENT * np.median(np.concatenate([e.movement for e in episodes]))
         self.centre_, self.energy_ = np.zeros(residuals.shape[1]), np.zeros(())
         columns = np.concatenate([self.columns(e) for e in episodes])
         self.centre_, self.energy_ = columns[:, :-1].mean(axis=0), columns[:, -1].mean()
         self.spread_ = columns[:, -1].std()
 
-        smoothed = [Running(self)(e) for e in episodes]
+        smoothed = [Running(self)(self.columns(e), e.movement) for e in episodes]
         pooled = np.concatenate(smoothed, axis=1)
         weights = [1.0, *self.memories]
         self.roots_ = np.stack([_root(z, w) for z, w in zip(pooled, weights, strict=True)])
@@ -107,14 +114,17 @@ class Charts:
         self.median_ = median[:, None]
         self.reach_ = np.where(reach < CONSTANT, 1.0, reach)[:, None]
 
+    def _join(self) -> None:
+        """Join the scales at the knots by straight lines."""
+        self._gaps = np.diff(self.knots_, axis=1)
+        self._slopes = np.diff(self.scales_, axis=1) / np.where(self._gaps > 0, self._gaps, 1.0)
+
     def standardized(self, evidence: Evidence) -> Floats:
         """Return residuals in units of what is nominal where such a tail was forecast."""
         d = len(self.knots_)
-        # Linear between the knots: the first scale and the part of every slope that is behind.
-        gaps = np.diff(self.knots_, axis=1)
-        slopes = np.diff(self.scales_, axis=1) / np.where(gaps > 0, gaps, 1.0)
-        passed = evidence.log_tails[:, :, None] - self.knots_[:, :-1]
-        scales = self.scales_[:, 0] + (slopes * np.clip(passed, 0.0, gaps)).sum(axis=2)
+        # Linear between the knots: the first scale, and each slope over what is passed of its gap.
+        passed = np.minimum(evidence.log_tails[:, :, None] - self.knots_[:, :-1], self._gaps)
+        scales = self.scales_[:, 0] + (self._slopes * np.maximum(passed, 0.0)).sum(axis=2)
         scaled: Floats = evidence.residuals.copy()
         scaled[:, :d] /= scales
         scaled[:, d:] /= SMALLEST
@@ -127,8 +137,9 @@ class Charts:
         return np.concatenate([u, energy - self.energy_], axis=1)
 
     def _distances(self, smoothed: Floats) -> Floats:
-        pairs = zip(smoothed, self.roots_[: len(smoothed)], strict=True)
-        return np.stack([distance(z, root) for z, root in pairs])
+        whitened = smoothed @ self.roots_[: len(smoothed)]
+        lengths: Floats = np.sqrt((whitened * whitened).sum(axis=2))
+        return lengths
 
     def statistic(self, smoothed: Floats) -> Floats:
         """Return the distances of smoothed columns on their common scale: (W, N, C) to (W, N)."""
@@ -146,6 +157,7 @@ class Charts:
         lengths = {"D": sensors, "W": w, "C": c, "R": c - 1, "1": 1, "B": None}
         for name, shape in SHAPES.items():
             setattr(self, name + "_", take(arrays, name, tuple(lengths[n] for n in shape)))
+        self._join()
 
 
 SHAPES: Final = {
@@ -165,58 +177,40 @@ class Running:
     """The sums of an episode so far: each call continues where the last one ended."""
 
     def __init__(self, charts: Charts, *, accumulate: bool = True) -> None:
-        self._charts = charts
+        self._still = max(float(charts.still_), CONSTANT)
         self._smoother = Smoother(charts.memories, len(charts.centre_) + 1) if accumulate else None
 
-    def __call__(self, evidence: Evidence, columns: Floats | None = None) -> Floats:
-        """Return the columns of the next N steps, and their sums: (W, N, C).
-
-        `columns` are those of the evidence where they are known already.
-        """
-        columns = self._charts.columns(evidence) if columns is None else columns
+    def __call__(self, columns: Floats, movement: Floats) -> Floats:
+        """Return the columns of the next N steps, and their sums: (W, N, C)."""
         if self._smoother is None:
             return columns[None]
-        # A robot that stands still repeats one error: a hundred such steps are not a hundred
-        # pieces of evidence.
-        share = np.minimum(1.0, evidence.movement / max(float(self._charts.still_), CONSTANT))
+        # While a robot stands still, the forecast repeats one error. Its residuals are then not
+        # independent evidence, and count less.
+        share = np.minimum(1.0, movement / self._still)
         return np.concatenate([columns[None], self._smoother(columns * share[:, None])])
 
 
-class Attribution:
-    """Which sensors the evidence of an episode so far points at, and since when.
+class Onsets:
+    """Since when an episode so far is likely to be anomalous.
 
     The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
-    of two nominal standard deviations. A sensor's share is its part of what errors of single
-    sensors would explain, averaged over the steps since then with their energy as weight.
+    of two nominal standard deviations.
     """
 
-    def __init__(self, charts: Charts, first: int) -> None:
-        self._charts, self._now = charts, first
-        self._sum, self._onset = 0.0, first
-        self._weighted: Floats = np.zeros(0)
+    def __init__(self, charts: Charts) -> None:
+        self._reference = REFERENCE * float(charts.spread_)
+        self._sum, self._now, self._onset = 0.0, 0, 0
 
-    def __call__(
-        self, evidence: Evidence, columns: Floats | None = None
-    ) -> tuple[Floats, NDArray[np.int64]]:
-        """Return shares, (N, sensors), and onsets, (N,), of the next N steps.
-
-        `columns` are those of the evidence where they are known already.
-        """
-        columns = self._charts.columns(evidence) if columns is None else columns
-        parts = np.maximum(evidence.of_sensors, CONSTANT)
-        parts = parts / parts.sum(axis=1, keepdims=True)
-        excess = columns[:, -1]
-        shares, onsets = np.empty_like(parts), np.empty(len(parts), np.int64)
-        for n, (part, more) in enumerate(zip(parts, excess, strict=True)):
+    def __call__(self, columns: Floats) -> NDArray[np.int64]:
+        """Return the onset at each of the next N steps, counted from the first step: (N,)."""
+        onsets = np.empty(len(columns), np.int64)
+        for n, energy in enumerate(columns[:, -1].tolist()):
             if self._sum <= 0:
-                self._onset, self._weighted = self._now, np.zeros(len(part))
-            self._sum = max(0.0, self._sum + more - REFERENCE * float(self._charts.spread_))
-            weight = max(more + float(self._charts.energy_), CONSTANT)
-            self._weighted = self._weighted + weight * part
-            shares[n] = self._weighted / self._weighted.sum()
-            onsets[n] = self._onset
+                self._onset = self._now
+            self._sum = max(0.0, self._sum + energy - self._reference)
             self._now += 1
-        return shares, onsets
+            onsets[n] = self._onset
+        return onsets
 
 
 def _root(smoothed: Floats, weight: float) -> Floats:

@@ -1,4 +1,4 @@
-"""Recurrent implicit quantile networks as detector plug-ins: riqn, riqn-ms and n-riqn.
+"""Recurrent implicit quantile networks as detector plug-ins: riqn, riqn-ms, riqn-r and n-riqn.
 
 A network forecasts the distribution of each sensor's next value through its quantile function; the
 score is the mean absolute distance between an observation and samples of its forecasts.
@@ -41,6 +41,12 @@ def riqn_ms(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     return _make("riqn-ms", given, seed, horizon, mean_sampling=True)
 
 
+def riqn_r(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+    """Return `riqn` with another score: the median forecast, and sensors in nominal distances."""
+    given = checked(RiqnParameters, "riqn-r", parameters)
+    return _make("riqn-r", given, seed, horizon, residual_units=True)
+
+
 def n_riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     """Return the same without memory: a window of observations instead of the GRU."""
     given = checked(WindowRiqnParameters, "n-riqn", parameters)
@@ -58,7 +64,7 @@ def _make(name: str, given: RiqnParameters, seed: int, horizon: int, **kind: Any
 
 @hookimpl
 def oodd_detectors() -> list[DetectorSpec]:
-    """Offer the three detectors of this package."""
+    """Offer the four detectors of this package."""
     common: dict[str, Any] = {
         "reference": "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
         "requires": ("torch", "safetensors"),
@@ -77,6 +83,14 @@ def oodd_detectors() -> list[DetectorSpec]:
             name="riqn-ms",
             factory=riqn_ms,
             summary="RIQN whose rollouts feed back the mean of M samples",
+            parameters=RiqnParameters,
+            fit_name="riqn",
+            **common,
+        ),
+        DetectorSpec(
+            name="riqn-r",
+            factory=riqn_r,
+            summary="RIQN scored by its median forecast, sensors in nominal distances",
             parameters=RiqnParameters,
             fit_name="riqn",
             **common,
