@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from oodd_eval._version import __version__
 
 if TYPE_CHECKING:
-    from oodd_eval.api import evaluate
+    from oodd_eval.api import evaluate, load_results
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from oodd_eval.testing import check_detector
 
 __all__ = ["Detector", "DetectorSpec", "Explanation", "Trajectory", "__version__",
-           "check_detector", "evaluate", "hookimpl", "load_split"]  # fmt: skip
+           "check_detector", "evaluate", "hookimpl", "load_results", "load_split"]  # fmt: skip
 
 _HOMES = {"Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
           "Explanation": "plugins.contract", "Trajectory": "data.trajectory",
           "check_detector": "testing", "evaluate": "api", "hookimpl": "plugins",
-          "load_split": "data.split"}  # fmt: skip
+          "load_results": "api", "load_split": "data.split"}  # fmt: skip
 
 
 def __getattr__(name: str) -> object:

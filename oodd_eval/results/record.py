@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.identity import Cell, Setting
 
 SCHEMA: Final = 3
@@ -143,8 +144,14 @@ class Record:
         return str(self.cell), self.split_digest, json.dumps(conditions, sort_keys=True)
 
     def value(self, metric: str) -> float:
-        """Return a metric's value; NaN where the cell has none."""
-        return self.metrics[metric].value if metric in self.metrics else NAN
+        """Return a metric's value; NaN where the cell has none, `UnknownNameError` if none could.
+
+        See ``oodd-eval list metrics``.
+        """
+        if metric not in self.metrics:
+            metric_info(metric)
+            return NAN
+        return self.metrics[metric].value
 
     def to_json(self) -> str:
         """Return one line of JSON, keys in a fixed order, NaN as null."""

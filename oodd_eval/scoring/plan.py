@@ -25,7 +25,8 @@ class Unit:
 
     `parameters` are all that the factory gets, sorted by name; `shown` are those that are part of
     the result, which the device is not. `plugin` is empty for a factory of this process, which has
-    no `source` (the digest of a plug-in's code) and no keys of stored scores and fits.
+    no `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored
+    under a key, but never taken from there by a later run.
     """
 
     environment: str
@@ -140,15 +141,15 @@ def make_unit(
         for name, value in shown.items()
         if name not in declared or value != declared[name].default
     }
-    source = scores = fit = ""
+    source = source_digest(offer.module) if offer.plugin else ""
+    identity: dict[str, Any] = {
+        "distribution": offer.distribution, "version": offer.version, "source": source,
+        "detector": spec.name, "parameters": shown, "seed": seed, "horizon": horizon,
+        "environment": environment, "split_digest": split_digest, "limit": limit,
+    }  # fmt: skip
+    scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
+    fit = ""
     if offer.plugin:
-        source = source_digest(offer.module)
-        identity: dict[str, Any] = {
-            "distribution": offer.distribution, "version": offer.version, "source": source,
-            "detector": spec.name, "parameters": shown, "seed": seed, "horizon": horizon,
-            "environment": environment, "split_digest": split_digest, "limit": limit,
-        }  # fmt: skip
-        scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
         deciding = {name: value for name, value in shown.items() if kinds[name] == "fit"}
         same: dict[str, Any] = {"detector": spec.fit_name or spec.name, "parameters": deciding}
         if not spec.horizon_decides_fit:

@@ -104,7 +104,7 @@ def _as_they_finish(
 
     def score(job: UnitJob) -> Scored:
         scored = executor(job)
-        if results and not job.unit.local:
+        if results:
             if scored.status == "ok" and not scored.resumed:
                 results.write_scores(job.unit.scores_key, scored.file)
             if scored.log:

@@ -1,0 +1,238 @@
+"""Results as scripts and notebooks use them: records, and the scores and episodes behind them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from html import escape
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, overload
+
+from tabulate import tabulate
+
+from oodd_eval.data.parts import TWINS
+from oodd_eval.data.split import Split, load_split
+from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
+from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
+from oodd_eval.names import check_known
+from oodd_eval.results import paired, plots
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.episode import ScoredEpisode
+from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.paired import Comparison, row_named
+from oodd_eval.results.record import Record
+from oodd_eval.results.tables import layout
+from oodd_eval.results.tables.board import boards
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Results(Sequence[Record]):
+    """The records of an evaluation, one a cell; made by `evaluate` and `load_results`.
+
+    A row is a detector with its settings, named as tables name it: ``"rf"`` or ``"riqn[h=10]"``.
+    Where there is only one it need not be named.
+
+    Parameters
+    ----------
+    records
+        In any order.
+    directory
+        Where their scores are, if anywhere.
+    split
+        The split that they are of; by default the one of that name on this machine.
+    """
+
+    def __init__(
+        self, records: Sequence[Record], directory: ResultsDirectory | None = None,
+        split: Split | None = None,
+    ) -> None:  # fmt: skip
+        self.records = list(records)
+        self._directory, self._split = directory, split
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.records)
+
+    @overload
+    def __getitem__(self, index: int) -> Record: ...
+    @overload
+    def __getitem__(self, index: slice) -> Results: ...
+    def __getitem__(self, index: int | slice) -> Record | Results:
+        """Return a record, or the results of a slice."""
+        if isinstance(index, slice):
+            return Results(self.records[index], self._directory, self._split)
+        return self.records[index]
+
+    def __iter__(self) -> Iterator[Record]:
+        """Iterate over the records."""
+        return iter(self.records)
+
+    def __repr__(self) -> str:
+        """Return one line: how many cells of what, and how many failed."""
+        states = ", ".join(f"{n} {status}" for status, n in Counter(r.status for r in self).items())
+        splits = ", ".join(dict.fromkeys(r.split for r in self)) or "nothing"
+        return f"Results({len(self)} cells of {splits}: {', '.join(self.rows)}; {states or 'none'})"
+
+    def _repr_html_(self) -> str:
+        """Return the tables that ``oodd-eval show`` prints, for notebooks."""
+        parts = [f"<p>{escape(repr(self))}</p>"]
+        for board in boards(self.records):
+            for table in (layout.separability(board), layout.guaranteed(board)):
+                if table:
+                    shown = tabulate(table.rows, table.header, "html", colalign=table.alignment,
+                                     disable_numparse=True)  # fmt: skip
+                    parts.append(f"<p><b>{escape(table.title)}</b></p>{shown}")
+            parts += [f"<p>{escape(f'{r.status}: {r.cell}: {r.reason}')}</p>"
+                      for r in board.failures()]  # fmt: skip
+        return "\n".join(parts)
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Names of the rows."""
+        return tuple(dict.fromkeys(str(r.setting) for r in self.records))
+
+    @property
+    def ok(self) -> bool:
+        """True if no cell failed."""
+        return all(r.ok for r in self.records)
+
+    def mean(self, metric: str = RANKING, row: str = "") -> float:
+        """Return a row's mean of a metric over all cells, as the tables have it.
+
+        Parameters
+        ----------
+        metric
+            See ``oodd-eval list metrics``.
+        row
+            Name of the row.
+        """
+        metric_info(metric)
+        setting = self._row(row)
+        (board,) = boards([r for r in self.records if r.setting == setting])
+        return board.mean(setting, board.environments, board.anomalies, metric).value
+
+    def compare(self, first: str, second: str, metric: str = RANKING) -> Comparison:
+        """Tell whether one row is better than another, by the paired bootstrap over test seeds.
+
+        See `oodd_eval.results.paired.compare`, for its parameters, too.
+        """
+        return paired.compare(self.records, first, second, metric)
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Return a flat mapping for each cell: what it is, its metrics, and what it cost."""
+        names = ("split", "environment", "anomaly", "strength", "group", "detector", "horizon",
+                 "seed", "status", "reason", "brief")  # fmt: skip
+        costs = ("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb")
+        metrics = dict.fromkeys(name for r in self.records for name in r.metrics)
+        return [
+            {**{n: getattr(r, n) for n in names}, "row": str(r.setting),
+             **{n: r.value(n) for n in metrics}, **{n: getattr(r, n) for n in costs}}
+            for r in self.records
+        ]  # fmt: skip
+
+    def to_frame(self) -> Any:
+        """Return `to_rows` as a ``pandas.DataFrame``; `MissingExtraError` without pandas."""
+        try:
+            pandas = import_module("pandas")
+        except ImportError:
+            wanted = "to_frame needs pandas: pip install pandas, or use to_rows"
+            raise MissingExtraError(wanted) from None
+        return pandas.DataFrame(self.to_rows())
+
+    def scores(
+        self, environment: str, anomaly: str, i: int = 0, *, row: str = "", seed: int | None = None
+    ) -> ScoredEpisode:
+        """Return one episode of a cell with its scores.
+
+        Parameters
+        ----------
+        environment, anomaly
+            The cell.
+        i
+            Place of the episode among the cell's, from 0.
+        row
+            Name of the row.
+        seed
+            Seed of the detector; by default the lowest.
+
+        Returns
+        -------
+        ScoredEpisode
+
+        Raises
+        ------
+        UnknownNameError, UsageError
+            When these results have no such cell or episode.
+        ResultsError
+            When the cell failed, or its scores were not kept.
+        """
+        found = self._scored(environment, anomaly, row=row, seed=seed)
+        if not 0 <= i < len(found):
+            cell = f"{environment}/{anomaly}"
+            raise UsageError(f"{cell} has no episode {i}: expected 0 to {len(found) - 1}")
+        return found[i]
+
+    def plot_trajectory(
+        self, environment: str, anomaly: str, i: int = 0, *, row: str = "", seed: int | None = None
+    ) -> Figure:
+        """Draw an episode: the sensors that leave their twin's course, and the statistic.
+
+        Parameters and errors are those of `scores`; `MissingExtraError` without matplotlib.
+        """
+        return plots.trajectory(self.scores(environment, anomaly, i, row=row, seed=seed))
+
+    def plot_power(self, *rows: str) -> Figure:
+        """Draw which share of episodes has an alarm at 5 % by how many rows after the effect.
+
+        Parameters
+        ----------
+        *rows
+            Names of rows; by default all.
+        """
+        chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})
+        curves = {}
+        for setting in chosen:
+            own = [r for r in self.records if r.setting == setting and r.ok]
+            curves[str(setting)] = [
+                e for r in own
+                for e in self._scored(r.environment, r.anomaly, row=str(setting), seed=r.seed)
+            ]  # fmt: skip
+        return plots.power(curves)
+
+    def _row(self, name: str) -> Setting:
+        if name or len(self.rows) == 1:
+            return row_named(self.records, name or self.rows[0])
+        raise UsageError(f"{len(self.rows)} rows, expected the name of one: {', '.join(self.rows)}")
+
+    def _scored(
+        self, environment: str, anomaly: str, *, row: str, seed: int | None
+    ) -> list[ScoredEpisode]:
+        """Return all episodes of a cell."""
+        own = [r for r in self.records if r.setting == self._row(row)]
+        check_known("environment of these results", {r.environment for r in own}, environment)
+        own = [r for r in own if r.environment == environment]
+        check_known(f"anomaly of these results in {environment}", {r.anomaly for r in own}, anomaly)
+        own = sorted((r for r in own if r.anomaly == anomaly), key=lambda r: r.seed)
+        record = next((r for r in own if seed in (None, r.seed)), None)
+        if record is None:
+            raise UsageError(f"no detector seed {seed}: expected one of {[r.seed for r in own]}")
+        if not record.ok:
+            raise ResultsError(f"{record.cell} has no scores, it failed: {record.reason}")
+        if self._directory is None:
+            raise ResultsError(f"{record.cell}: the scores of these results were not kept")
+        split = self._split or load_split(record.split.partition("@")[0])
+        must_be_of(split, record)
+        with split.opened() as opened:
+            data = opened(environment)
+            file = stored_scores([record], self._directory, data)
+            known, sensors = data.anomalous(anomaly), tuple(s.name for s in data.sensors)
+            rule = Rules.fit(file.parts["calibration"], record.alarm).guaranteed.get(HEADLINE)
+            pairs = zip(file.parts[f"test/{anomaly}"], file.parts[TWINS], strict=True)
+            return [
+                ScoredEpisode(record.cell, i, scores, twin, known[i], data.twins[i], sensors,
+                              int(known.onsets[i]), int(known.effects[i]), rule)
+                for i, (scores, twin) in enumerate(pairs)
+            ]  # fmt: skip

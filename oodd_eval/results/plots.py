@@ -1,0 +1,90 @@
+"""Figures of results for notebooks; they need matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from oodd_eval.errors import MissingExtraError, ResultsError
+from oodd_eval.results.episode import ScoredEpisode
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SENSORS: Final = 3
+"""Sensors that are drawn, those that leave their twin's course most."""
+LONGEST: Final = 300
+"""Rows after the effect at which curves of power end."""
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which colour-blind readers can tell apart."""
+
+
+def _subplots(rows: int, height: float) -> tuple[Figure, Any]:
+    try:
+        from matplotlib import pyplot as plt  # noqa: PLC0415
+    except ImportError:
+        wanted = "plots need matplotlib: pip install 'oodd-eval[plots]'"
+        raise MissingExtraError(wanted) from None
+    figure, axes = plt.subplots(rows, sharex=True, figsize=(7, height), layout="constrained")
+    plt.close(figure)  # A notebook shows what a cell returns, and would show it twice.
+    return figure, axes
+
+
+def trajectory(episode: ScoredEpisode) -> Figure:
+    """Draw sensors over the statistic of the alarm, the nominal twin dashed."""
+    figure, (upper, lower) = _subplots(2, 4.8)
+    own, twin = episode.trajectory.observations, episode.twin.observations
+    both = min(len(own), len(twin))
+    spread = np.maximum(twin.std(axis=0), 1e-6)
+    apart = np.abs(own[:both] - twin[:both]).mean(axis=0) / spread
+    for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
+        mean = twin[:, d].mean()
+        upper.plot((own[:, d] - mean) / spread[d], color=colour, label=episode.sensors[d])
+        upper.plot((twin[:, d] - mean) / spread[d], color=colour, linestyle="--", alpha=0.5)
+    upper.set_ylabel("sensor (std. of twin)")
+    upper.legend(loc="upper left", fontsize="small")
+    upper.set_title(str(episode.cell), fontsize="medium")
+    rule = episode.rule
+    for scores, style in ((episode.twin_scores, "--"), (episode.scores, "-")):
+        shown = scores if rule is None else rule.statistic(scores)
+        name = "nominal twin" if style == "--" else "anomalous"
+        finite = np.where(np.isfinite(shown), shown, np.nan)
+        lower.plot(finite, style, color=COLOURS[0], alpha=0.5 if style == "--" else 1, label=name)
+    lower.set_ylabel("score" if rule is None else "statistic")
+    lower.set_xlabel("row")
+    lower.axvline(episode.onset, color="0.5", linewidth=1, label="onset")
+    if rule is not None and np.isfinite(rule.threshold):
+        lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label="threshold at 5 %")
+        largest = max(0.0, *rule.statistic(episode.twin_scores), rule.threshold)
+        # The first rows beyond the threshold matter, not how far it goes.
+        lower.set_ylim(top=4 * largest + 1e-9)
+        if (alarm := episode.alarm) is not None:
+            lower.plot(alarm, min(rule.statistic(episode.scores)[alarm], 4 * largest), "v",
+                       color=COLOURS[1], label=f"alarm at row {alarm}")  # fmt: skip
+    lower.legend(loc="upper left", fontsize="small")
+    return figure
+
+
+def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
+    """Draw shares of episodes with an alarm by rows since the effect; dotted, of the twins.
+
+    Episodes with an alarm before the effect, or without a row after it, are left out.
+    """
+    if not any(e.rule for episodes in curves.values() for e in episodes):
+        raise ResultsError("no row has an alarm at 5 %: more calibration episodes are needed")
+    figure, axis = _subplots(1, 3.6)
+    rows = np.arange(LONGEST + 1)
+    for (name, episodes), colour in zip(curves.items(), COLOURS * 9, strict=False):
+        for twins, style in ((False, "-"), (True, ":")):
+            delays = np.array([e.delay(of_twin=twins) for e in episodes])
+            share = (delays[~np.isnan(delays), None] <= rows).mean(axis=0)
+            axis.step(rows + 1, 100 * share, style, where="post", color=colour,
+                      label=None if twins else name)  # fmt: skip
+    axis.set_xscale("log")
+    axis.set_xlabel("rows from the effect on (dotted: alarms of the nominal twins)")
+    axis.set_ylabel("episodes with an alarm (%)")
+    axis.set_ylim(0, 100)
+    axis.legend(fontsize="small")
+    return figure
