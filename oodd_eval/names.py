@@ -89,7 +89,7 @@ def parameter(text: str) -> tuple[str, Any]:
 
 
 def expression(text: str) -> Predicate:
-    """Return the test of cell ids that an expression of ``-k`` describes.
+    """Return the test of cell ids that an expression of ``-k`` describes; an empty one passes all.
 
     Words are substrings, regardless of case; ``and``, ``or``, ``not`` and round brackets join them.
 
@@ -97,6 +97,8 @@ def expression(text: str) -> Predicate:
     >>> wanted("mini/hopper/gravity::rf[h=1,seed=0]"), wanted("mini/hopper/iid::rf[h=1,seed=0]")
     (True, False)
     """
+    if not text:
+        return lambda _: True
     words: list[str] = []
 
     def named(match: re.Match[str]) -> str:

@@ -22,8 +22,10 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are exceptions, with a suggestion."""
 
     def __init__(self, **settings: Any) -> None:
-        super().__init__(allow_abbrev=False, **settings)
+        plain = {"formatter_class": argparse.RawDescriptionHelpFormatter, **settings}
+        super().__init__(allow_abbrev=False, **plain)
         self.choices: dict[str, Parser] = {}
+        self.examples: tuple[str, ...] = ()
 
     def nested(self, kind: str) -> Callable[[str, str], "Parser"]:
         """Return a function that adds a command or an action: its name and summary."""
@@ -31,10 +33,22 @@ class Parser(argparse.ArgumentParser):
         self.choices = nested.choices
         return lambda name, summary: nested.add_parser(name, help=summary, description=summary)
 
+    def format_help(self) -> str:
+        """Return the help, with examples below it: a command's own, or those of its actions."""
+        examples = self.examples or [e for p in self.choices.values() for e in p.examples[:1]]
+        if examples and not self.epilog:
+            lines = "".join(f"\n  oodd-eval {line}" for line in examples)
+            self.epilog = f"examples:{lines}"
+        return super().format_help()
+
     def options(
-        self, handler: Callable[[argparse.Namespace], int], *, plugins: bool = False
+        self, handler: Callable[[argparse.Namespace], int], *examples: str, plugins: bool = False
     ) -> Add:
-        """Add the options that all commands have; return the method that adds further ones."""
+        """Add the options that all commands have; return the method that adds further ones.
+
+        `examples` are arguments of oodd-eval that the help shows.
+        """
+        self.examples = examples
 
         def left_out(text: str) -> str:
             if not text.startswith("no:"):

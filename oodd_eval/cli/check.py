@@ -18,7 +18,9 @@ _STYLES: Final = {"passed": "green", "failed": "bold red", "skipped": "dim",
 def define(parser: Parser) -> None:
     """Add the options."""
     # fmt: off
-    add = parser.options(run, plugins=True)
+    add = parser.options(
+        run, "check rf", "check mine -k 'prefix or causality' -v", plugins=True
+    )
     add("detector", metavar="DETECTOR", help="name of a detector")
     add_detector(add)
     add("--seed", type=at_least(0), default=0, metavar="N", help="seed of a detector (default: 0)")

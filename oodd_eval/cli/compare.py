@@ -1,4 +1,4 @@
-"""``oodd-eval compare``: results against a reference, and writing references."""
+"""``oodd-eval compare``: two rows of results, results against a reference; writing references."""
 
 import argparse
 from pathlib import Path
@@ -6,17 +6,25 @@ from pathlib import Path
 from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UsageError
-from oodd_eval.metrics.catalogue import NAMES
+from oodd_eval.metrics.catalogue import NAMES, RANKING
 from oodd_eval.names import expression
-from oodd_eval.results import regression
+from oodd_eval.results import paired, regression
 from oodd_eval.results.regression import RecordSet, read_record_set, rendering, write_reference
 
 
 def define(parser: Parser) -> None:
     """Add the options."""
     # fmt: off
-    add = parser.options(run)
+    add = parser.options(
+        run,
+        "compare oodd-results pe rf",
+        "compare oodd-results --against reference.jsonl --fail auc_matched:-0.01",
+        "compare oodd-results --write-reference reference.jsonl -k 'seed=0'",
+    )
     add("results", metavar="DIR", help="results directory or file of records")
+    add("rows", nargs="*", metavar="ROW",
+        help="two rows of these results to compare by the paired bootstrap, such as pe and rf")
+    add("--metric", default=RANKING, help=f"metric of that comparison (default: {RANKING})")
     add("--against", metavar="REFERENCE", help="likewise: what the results should come up to")
     add("--fail", action="append", default=[], metavar="METRIC:[+-]NUMBER[%]",
         help="fail when the metric changed by more in the direction of the sign: auc:-0.01, "
@@ -26,7 +34,7 @@ def define(parser: Parser) -> None:
     add("--by", choices=("cell", "group", "mean"), default="cell",
         help="compare cells, means over the anomalies of a group in an environment, or means "
              "over all cells (default: cell)")
-    add("-k", dest="expression", metavar="EXPR", help=EXPRESSION)
+    add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
     add("--junit", metavar="FILE", help="write JUnit XML, a test case per cell and metric")
     add("--markdown", metavar="FILE", help="write Markdown, for a pull request")
     add("--write-reference", metavar="FILE",
@@ -36,10 +44,14 @@ def define(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval compare``; 1 when the comparison fails, 5 when nothing is in it."""
-    if not options.against and not options.write_reference:
-        raise UsageError("nothing to do: expected --against REFERENCE or --write-reference FILE")
-    wanted = expression(options.expression) if options.expression else None
+    if not options.against and not options.write_reference and not options.rows:
+        raise UsageError(
+            "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE"
+        )
+    wanted = expression(options.expression)
     now = read_record_set(options.results).selected(wanted)
+    if options.rows:
+        return _rows(now, options)
     code = 0
     if options.against:
         code = _compare(now, read_record_set(options.against).selected(wanted), options)
@@ -51,6 +63,17 @@ def run(options: argparse.Namespace) -> int:
         if options.verbosity >= 0:
             print(f"{len(now.records)} cells written to {options.write_reference}")
     return code
+
+
+def _rows(now: RecordSet, options: argparse.Namespace) -> int:
+    if len(options.rows) != 2 or options.against or options.write_reference:
+        given = " ".join(options.rows)
+        raise UsageError(f"rows {given!r}, expected two, without --against or --write-reference")
+    first, second = options.rows
+    for conditions, cells in now.boards.items():
+        print(conditions)
+        print(paired.compare(list(cells.values()), first, second, options.metric))
+    return 0 if now.boards else say(f"no record of {options.results} is selected", 5)
 
 
 def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) -> int:

@@ -22,7 +22,11 @@ def define(parser: Parser) -> None:
     action = parser.nested("action")
     split = "name or path of a split"
     place = "directory of the split (default: where splits are found)"
-    add = action("build", "record a split (needs the extra sim)").options(build)
+    add = action("build", "record a split (needs the extra sim)").options(
+        build,
+        "data build standard --jobs 2",
+        "data build dev --train 120 --calibration 40 --test 20 --cap 500 --seed-base 41",
+    )
     add("name", help="a published split, or a new name with sizes and a seed base of its own")
     add("--train", type=int, metavar="N", help="training trajectories per environment")
     add("--calibration", type=int, metavar="N", help="calibration trajectories per environment")
@@ -32,17 +36,23 @@ def define(parser: Parser) -> None:
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
     add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
     add("--output", type=Path, metavar="DIR", help=place)
-    action("verify", "compare a split with its digests").options(verify)("name", help=split)
-    add = action("fetch", "verify a copy of a split and install it").options(fetch)
+    action("verify", "compare a split with its digests").options(
+        verify, "data verify mini"
+    )("name", help=split)
+    add = action("fetch", "verify a copy of a split and install it").options(
+        fetch, "data fetch standard.tar.gz"
+    )
     add("place", metavar="FILE|DIR|URL", help="a split's directory, or a tar or zip archive of it")
     add("--digest", metavar="SHA256", help="the split's digest; another one is refused")
     add("--output", type=Path, metavar="DIR", help=place)
-    add = action("export", "write a split in another project's format").options(export)
+    add = action("export", "write a split in another project's format").options(
+        export, "data export mini --format minari --output datasets"
+    )
     add("name", help=split)
     add("--format", required=True, choices=["minari"], help="minari: one dataset a part")
     add("--output", required=True, type=Path, metavar="DIR", help="root of the datasets")
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
-    action("info", "describe a split").options(info)("name", help=split)
+    action("info", "describe a split").options(info, "data info mini")("name", help=split)
     # fmt: on
 
 

@@ -29,19 +29,25 @@ def define(parser: Parser) -> None:
     """Add the command, its actions and their options."""
     # fmt: off
     action = parser.nested("action")
-    add = action("build", "render tables and site from the entries").options(build)
+    add = action("build", "render tables and site from the entries").options(
+        build, "leaderboard build --check"
+    )
     add("results", nargs="?", default=RESULTS, metavar="RESULTS_DIR",
         help=f"directory of the entries (default: {RESULTS})")
     add("--output", default="leaderboard", metavar="DIR",
         help="where to write (default: leaderboard)")
     add("--check", action="store_true", help="write nothing, exit 1 where something would change")
-    add = action("verify", "check entries as data, running none of their code").options(verify)
+    add = action("verify", "check entries as data, running none of their code").options(
+        verify, "leaderboard verify leaderboard/results/paper-mini"
+    )
     add("paths", nargs="+", metavar="PATH", help="an entry, or a directory of entries")
     add("--split", metavar="PATH", help=SPLIT)
     add("--rerun", metavar="DIR", help="results of a run of your own to compare one entry with")
     add("--grant", default="", metavar="NAME",
         help="write the trust level that was reached into the entry, in this name")
-    add = action("submit", "write an entry from a results directory").options(submit)
+    add = action("submit", "write an entry from a results directory").options(
+        submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
+    )
     add("directory", metavar="DIR", help="results directory, written by oodd-eval run or reproduce")
     add("--results", default=RESULTS, metavar="RESULTS_DIR",
         help=f"directory of the entries (default: {RESULTS})")

@@ -17,7 +17,7 @@ Rows = Iterable[tuple[str, ...]]
 
 def define(parser: Parser) -> None:
     """Add the options."""
-    add = parser.options(run, plugins=True)
+    add = parser.options(run, "list detectors", "list metrics", plugins=True)
     add("what", metavar="detectors|envs|anomalies|splits|metrics")
 
 

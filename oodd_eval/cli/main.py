@@ -27,7 +27,9 @@ COMMANDS: Final = (
     ("list", "listing", "list what there is, one line each"),
     ("show", "show", "print the tables of earlier results from stored scores"),
     ("check", "check", "check that a detector honours the contract"),
-    ("compare", "compare", "compare results with a reference"),
+    ("compare", "compare", "compare rows of some results, or results with a reference"),
+    ("info", "info", "describe a detector, an environment or an anomaly"),
+    ("forget", "forget", "remove cells from a results directory"),
     ("leaderboard", "leaderboard", "submit, verify and show entries of the board"),
     ("data", "data", "build, verify, fetch and export splits"),
     ("policies", "policies", "train and evaluate nominal policies"),
@@ -43,7 +45,6 @@ def build_parser(named: Container[str] | None = None) -> Parser:
         prog="oodd-eval",
         description="Evaluate detectors of out-of-distribution dynamics on frozen trajectories.",
         epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"oodd-eval {__version__}")
     add_command = parser.nested("command")
@@ -68,6 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out a command line, by default this process's, and return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        if not given:
+            build_parser(given).print_help()
+            return 0
         options = _parse(given)
         code: int = options.handler(options)
         sys.stdout.flush()

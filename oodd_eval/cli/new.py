@@ -12,7 +12,7 @@ from oodd_eval.plugins.template import Project, write_project
 
 def define(parser: Parser) -> None:
     """Add the options."""
-    add = parser.options(run, plugins=True)
+    add = parser.options(run, "new my-detector", plugins=True)
     add("name", metavar="NAME", help="name of the detector: lower-case letters, digits, hyphens")
     add("--output", metavar="DIR", help="where to write it (default: oodd-NAME)")
 

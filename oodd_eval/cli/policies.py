@@ -16,12 +16,16 @@ def define(parser: Parser) -> None:
     """Add the actions and their options."""
     # fmt: off
     action = parser.nested("action")
-    add = action("train", "train a policy (needs the extra train)").options(train)
+    add = action("train", "train a policy (needs the extra train)").options(
+        train, "policies train hopper --steps 200000"
+    )
     add("environment", metavar="ENV")
     add("--output", default="policies", metavar="DIR", help="checkpoint and best policy")
     add("--steps", type=int, metavar="N", help="environment steps in all")
     add("--seed", type=int, default=1, metavar="N")
-    add = action("evaluate", "mean return of a policy").options(evaluate)
+    add = action("evaluate", "mean return of a policy").options(
+        evaluate, "policies evaluate hopper --episodes 20"
+    )
     add("environment", metavar="ENV")
     add("--policy", metavar="FILE", help="policy file (default: the frozen one)")
     add("--episodes", type=at_least(1), default=100, metavar="N",

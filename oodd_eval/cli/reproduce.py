@@ -26,7 +26,9 @@ from oodd_eval.scoring.runner import run as carry_out
 def define(parser: Parser) -> None:
     """Add the command and its options."""
     # fmt: off
-    add = parser.options(run, plugins=True)
+    add = parser.options(
+        run, "reproduce --tier mini", "reproduce --tier reduced --plan", plugins=True
+    )
     add("--tier", default="full", metavar="full|reduced|mini",
         help="how much: split standard; its first trajectories and fewer seeds; split mini "
              "(default: full)")

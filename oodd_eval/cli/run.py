@@ -26,7 +26,13 @@ from oodd_eval.scoring.runner import run as carry_out
 def define(parser: Parser) -> None:
     """Add the options."""
     # fmt: off
-    add = parser.options(run, plugins=True)
+    add = parser.options(
+        run,
+        "run --detector rf --env all",
+        "run --detector pe,rf --env hopper,ant --anomaly iid,gravity --jobs 2",
+        "run --detector riqn --env hopper --param updates=500 --horizon 1,10 --output mine",
+        plugins=True,
+    )
     parser.set_defaults(options_of=options_of)
     add("--detector", metavar="NAMES", help=f"{cli.NAMES} (required)")
     add("--env", metavar="NAMES", help=f"{cli.NAMES} (required)")
@@ -35,7 +41,7 @@ def define(parser: Parser) -> None:
     cli.add_detector(add)
     add("--seed", default="0", metavar="N,...", type=cli.value(partial(whole_numbers, least=0)),
         help="seeds of the detectors (default: 0)")
-    add("-k", dest="expression", metavar="EXPR", help=cli.EXPRESSION)
+    add("-k", dest="expression", default="", metavar="EXPR", help=cli.EXPRESSION)
     add("--collect-only", action="store_true", help="print the selected cells and do nothing")
     add("-x", dest="stop", action="store_true", help="stop at the first failure")
     add("--limit", type=cli.at_least(1), metavar="N",
@@ -66,8 +72,7 @@ def run(options: argparse.Namespace) -> int:
         horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
         device=options.device, limit=options.limit,
     )  # fmt: skip
-    if options.expression:
-        plan = plan.matching(expression(options.expression))
+    plan = plan.matching(expression(options.expression))
     if not plan.cells:
         return cli.say(f"no cell matches -k {options.expression!r}", 5)
     console = make_console()

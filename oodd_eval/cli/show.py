@@ -1,24 +1,32 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
 import argparse
+import json
 
-from oodd_eval.cli import Parser, say
+from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
+from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.split import load_split
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.names import check_known
+from oodd_eval.names import check_known, expression, select
+from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import boards
-from oodd_eval.results.tables.rendering import report
+from oodd_eval.results.tables.rendering import csv_rows, report
 
 
 def define(parser: Parser) -> None:
     """Add the options."""
     # fmt: off
-    add = parser.options(run)
+    add = parser.options(
+        run,
+        "show oodd-results --intervals",
+        "show oodd-results --detector rf --metric missed_at_5pct",
+        "show oodd-results --env hopper -k 'not drift' --csv",
+    )
     add("directory", metavar="DIR", help="results directory")
     add("--split", metavar="NAME", help="where the split is, if not at its usual place")
     add("--stored", action="store_true", help="print stored metrics without recomputing them")
@@ -29,6 +37,10 @@ def define(parser: Parser) -> None:
     add("--wide", action="store_true",
         help="print all metrics, nulls and guaranteed alarms at 10, 5 and 1 %% among them")
     add("--markdown", action="store_true", help="print Markdown, everything in it")
+    add("--csv", action="store_true", help="print a line per cell with all metrics")
+    add("--json", action="store_true", help="print the same as a JSON array")
+    add("--env", default="all", metavar="NAMES", help="only these environments (default: all)")
+    add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
     # fmt: on
 
 
@@ -37,11 +49,20 @@ def run(options: argparse.Namespace) -> int:
     check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()
+    chosen = select("environment", options.env, ENVIRONMENTS)
+    wanted = expression(options.expression)
+    records = [r for r in records if r.environment in chosen and wanted(str(r.cell))]
     if not options.stored:
         records = _recomputed(records, results, options.split)
     if not records:
-        return say(f"no records in {options.directory}", 5)
+        return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))
+    if options.csv or options.json:
+        # Neither has a NaN: null in JSON, nothing in CSV.
+        rows = [{name: None if v != v else v for name, v in row.items()}  # noqa: PLR0124
+                for row in Results(records).to_rows()]  # fmt: skip
+        print(json.dumps(rows, indent=1) + "\n" if options.json else csv_rows(rows), end="")
+        return code
     if options.markdown:
         print(report(records, intervals=options.intervals), end="")
         return code

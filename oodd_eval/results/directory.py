@@ -119,6 +119,17 @@ class ResultsDirectory:
             files.write_text(self.path / RECORDS, text)
         return merged
 
+    def forget(self, records: Iterable[Record]) -> None:
+        """Remove records, and the scores and logs that no other record names."""
+        gone = {record.identity: record for record in records}
+        with files.lock(self.path):
+            kept = [r for r in self.records() if r.identity not in gone]
+            text = "".join(record.to_json() + "\n" for record in kept)
+            files.write_text(self.path / RECORDS, text)
+            for key in {r.scores for r in gone.values()} - {r.scores for r in kept} - {""}:
+                for file in (self.path / "scores" / f"{key}.h5", self.log_path(key)):
+                    file.unlink(missing_ok=True)
+
     def log_path(self, key: str) -> Path:
         """Return the place of the log of a failed unit."""
         return self.path / "logs" / f"{key}.txt"

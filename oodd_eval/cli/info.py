@@ -1,0 +1,69 @@
+"""``oodd-eval info``: all there is to know of one detector, environment or anomaly."""
+
+import argparse
+import json
+from collections.abc import Iterator
+
+from tabulate import tabulate
+
+from oodd_eval.cli import Parser
+from oodd_eval.cli.terminal import discovered
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
+from oodd_eval.plugins.discovery import Offer
+from oodd_eval.plugins.parameters import parameters_of
+
+Lines = Iterator[tuple[str, str]]
+
+
+def define(parser: Parser) -> None:
+    """Add the options."""
+    add = parser.options(run, "info pe", "info hopper", "info gravity", plugins=True)
+    add("name", metavar="DETECTOR|ENV|ANOMALY")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Carry out ``oodd-eval info``."""
+    name = options.name
+    if name in ENVIRONMENTS:
+        lines = _environment(ENVIRONMENTS[name])
+    elif name in ANOMALIES:
+        lines = _anomaly(ANOMALIES[name])
+    else:
+        lines = _detector(discovered(options).offer(name))
+    print(tabulate(lines, tablefmt="plain", disable_numparse=True))
+    return 0
+
+
+def _environment(info: EnvironmentInfo) -> Lines:
+    yield "environment", f"{info.id} ({info.title} of the paper)"
+    yield "simulator", info.simulator
+    yield "policy", f"{info.policy}, mean return {info.paper_return:g} in the paper"
+    yield "longest episode", f"{info.episode_cap} steps"
+    for i, sensor in enumerate(info.sensors):
+        yield "" if i else f"{info.observation_dim} sensors", f"{sensor.name} ({sensor.unit})"
+    kind = "discrete actions" if info.discrete else "actions"
+    for i, action in enumerate(info.actions):
+        yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
+
+
+def _anomaly(info: AnomalyInfo) -> Lines:
+    yield "anomaly", f"{info.id} ({info.title} of the paper)"
+    yield "group", info.group
+    yield "what it changes", info.summary
+
+
+def _detector(offer: Offer) -> Lines:
+    spec = offer.spec
+    yield "detector", f"{spec.name}, {offer.origin}"
+    yield "summary", spec.summary
+    if why := offer.unavailable():
+        yield "unavailable", why
+    yield "source", spec.reference or "not given"
+    yield "looks at", spec.inputs.replace("+", " and ")
+    yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
+    yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
+    for i, (name, known) in enumerate(parameters_of(spec.parameters).items()):
+        default = f"{name} = {json.dumps(known.default, default=str)}"
+        yield "" if i else "parameters", f"{default}  {known.help}".rstrip()
+    if spec.other_parameters:
+        yield "", "and any others"
