@@ -10,7 +10,13 @@ from itertools import product
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 from tabulate import tabulate
 
@@ -24,7 +30,7 @@ from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import boards
 from oodd_eval.results.tables.layout import Table
-from oodd_eval.scoring.plan import Plan
+from oodd_eval.scoring.plan import Plan, Unit
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
@@ -66,6 +72,7 @@ class TerminalReporter:
         self._sizes: dict[tuple[str, str], int] = {}
         self._resumed = 0
         self._progress: Progress | None = None
+        self._running: list[tuple[str, str]] = []
 
     @hookimpl
     def oodd_run_started(self, plan: Plan) -> None:
@@ -83,10 +90,27 @@ class TerminalReporter:
         self._print(f"detectors: {', '.join(names)}")
         self._print(f"{len(plan.units)} fits, {len(plan.cells)} cells\n")
         if self.console.is_terminal:
-            columns = TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-            self._progress = Progress(*columns, console=self.console, transient=True)
-            self._progress.add_task("cells", total=len(plan.cells))
+            columns = (
+                BarColumn(20), MofNCompleteColumn(), TextColumn("cells, left"),
+                TimeRemainingColumn(), TextColumn("{task.description}"),
+            )  # fmt: skip
+            # A fit may take minutes: the speed is that of the whole run.
+            self._progress = Progress(
+                *columns, console=self.console, transient=True, speed_estimate_period=1e9
+            )
+            self._progress.add_task("", total=len(plan.cells))
             self._progress.start()
+
+    @hookimpl
+    def oodd_unit_started(self, unit: Unit) -> None:
+        """Name what runs beside the bar."""
+        self._running.append((unit.environment, unit.setting.label(unit.seed)))
+        self._name_running()
+
+    def _name_running(self) -> None:
+        if self._progress:
+            text = ", ".join("/".join(unit) for unit in self._running)
+            self._progress.update(self._progress.task_ids[0], description=text)
 
     @hookimpl
     def oodd_cell_finished(self, record: Record, resumed: bool) -> None:
@@ -97,6 +121,9 @@ class TerminalReporter:
         unit = record.environment, record.cell.label
         finished = self._open.setdefault(unit, [])
         finished.append(record)
+        if len(finished) == self._sizes.get(unit) and unit in self._running:
+            self._running.remove(unit)
+            self._name_running()
         if self.verbosity > 0:
             self._line(record, str(record.cell), [record], resumed=resumed)
         elif self.verbosity == 0 and len(finished) == self._sizes[unit]:

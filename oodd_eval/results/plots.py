@@ -27,24 +27,26 @@ def _subplots(rows: int, height: float) -> tuple[Figure, Any]:
     except ImportError:
         wanted = "plots need matplotlib: pip install 'oodd-eval[plots]'"
         raise MissingExtraError(wanted) from None
-    figure, axes = plt.subplots(rows, sharex=True, figsize=(7, height), layout="constrained")
+    figure, axes = plt.subplots(rows, sharex=True, figsize=(8, height), layout="constrained")
     plt.close(figure)  # A notebook shows what a cell returns, and would show it twice.
     return figure, axes
 
 
 def trajectory(episode: ScoredEpisode) -> Figure:
     """Draw sensors over the statistic of the alarm, the nominal twin dashed."""
-    figure, (upper, lower) = _subplots(2, 4.8)
+    figure, (upper, lower) = _subplots(2, 4.4)
     own, twin = episode.trajectory.observations, episode.twin.observations
     both = min(len(own), len(twin))
     spread = np.maximum(twin.std(axis=0), 1e-6)
     apart = np.abs(own[:both] - twin[:both]).mean(axis=0) / spread
     for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
         mean = twin[:, d].mean()
-        upper.plot((own[:, d] - mean) / spread[d], color=colour, label=episode.sensors[d])
-        upper.plot((twin[:, d] - mean) / spread[d], color=colour, linestyle="--", alpha=0.5)
+        upper.plot((twin[:, d] - mean) / spread[d], "--", color=colour, linewidth=0.8, alpha=0.5)
+        upper.plot((own[:, d] - mean) / spread[d], color=colour, linewidth=0.8,
+                   label=episode.sensors[d])  # fmt: skip
     upper.set_ylabel("sensor (std. of twin)")
-    upper.legend(loc="upper left", fontsize="small")
+    upper.axvline(episode.onset, color="0.5", linewidth=1)
+    _beside(upper)
     upper.set_title(str(episode.cell), fontsize="medium")
     rule = episode.rule
     for scores, style in ((episode.twin_scores, "--"), (episode.scores, "-")):
@@ -57,14 +59,23 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     lower.axvline(episode.onset, color="0.5", linewidth=1, label="onset")
     if rule is not None and np.isfinite(rule.threshold):
         lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label="threshold at 5 %")
-        largest = max(0.0, *rule.statistic(episode.twin_scores), rule.threshold)
+        own_statistic = rule.statistic(episode.scores)
         # The first rows beyond the threshold matter, not how far it goes.
-        lower.set_ylim(top=4 * largest + 1e-9)
+        nominal = max(*rule.statistic(episode.twin_scores), rule.threshold)
+        top = max(1.2 * nominal, min(1.1 * own_statistic.max(), 4 * nominal))
+        if top > 0:
+            least = np.nanmin([np.nanmin(line.get_ydata()) for line in lower.lines[:2]])
+            lower.set_ylim(min(0.0, least) - 0.05 * top, top)
         if (alarm := episode.alarm) is not None:
-            lower.plot(alarm, min(rule.statistic(episode.scores)[alarm], 4 * largest), "v",
-                       color=COLOURS[1], label=f"alarm at row {alarm}")  # fmt: skip
-    lower.legend(loc="upper left", fontsize="small")
+            lower.plot(alarm, min(own_statistic[alarm], 0.95 * top), "v", color=COLOURS[1],
+                       label=f"alarm at row {alarm}")  # fmt: skip
+    _beside(lower)
     return figure
+
+
+def _beside(axis: Any) -> None:
+    """Put the legend where it hides nothing."""
+    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small", frameon=False)
 
 
 def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
@@ -86,5 +97,5 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
     axis.set_xlabel("rows from the effect on (dotted: alarms of the nominal twins)")
     axis.set_ylabel("episodes with an alarm (%)")
     axis.set_ylim(0, 100)
-    axis.legend(fontsize="small")
+    _beside(axis)
     return figure

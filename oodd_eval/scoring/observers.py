@@ -14,7 +14,7 @@ import pluggy
 from oodd_eval.plugins import hookspec
 from oodd_eval.plugins.discovery import Plugins, register
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.plan import Plan
+from oodd_eval.scoring.plan import Plan, Unit
 
 
 @hookspec
@@ -25,6 +25,17 @@ def oodd_run_started(plan: Plan) -> None:
     ----------
     plan
         Everything that the run is going to do.
+    """
+
+
+@hookspec
+def oodd_unit_started(unit: Unit) -> None:
+    """Observe that a detector is about to be fitted, or its kept scores to be taken.
+
+    Parameters
+    ----------
+    unit
+        The detector with its setting, the environment and the anomalies.
     """
 
 

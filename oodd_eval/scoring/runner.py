@@ -67,6 +67,9 @@ def run(
         origin = gather(settings.command)
         with closing(_as_they_finish(jobs, executor, settings, results)) as finished:
             for index, scored in finished:
+                if scored is None:
+                    hearing.notify("oodd_unit_started", unit=plan.units[index])
+                    continue
                 done += 1
                 records = _records(jobs[index], scored, origin)
                 writer.add(index, records)
@@ -88,8 +91,8 @@ def run(
 def _as_they_finish(
     jobs: Sequence[UnitJob], executor: Executor, settings: RunSettings,
     results: ResultsDirectory | None,
-) -> Generator[tuple[int, Scored], None, None]:  # fmt: skip
-    """Yield places of jobs and their scores as they finish.
+) -> Generator[tuple[int, Scored | None], None, None]:  # fmt: skip
+    """Yield places of jobs, with None as they begin, and with their scores as they finish.
 
     Only a few more units are begun than are taken, so that few scores are in memory.
     """
@@ -101,6 +104,13 @@ def _as_they_finish(
     waiting.prepare()
     ready: list[int] = []
     running: dict[Future[Scored], int] = {}
+    told: set[int] = set()
+
+    def begun() -> list[int]:
+        """Return the jobs at work that have not been told: the pool takes them in their order."""
+        new = [index for index in [*running.values()][: executor.jobs] if index not in told]
+        told.update(new)
+        return new
 
     def score(job: UnitJob) -> Scored:
         scored = executor(job)
@@ -121,11 +131,13 @@ def _as_they_finish(
                     break
                 index = ready.pop(0)
                 if jobs[index].unit.local:
+                    yield index, None
                     yield index, score(jobs[index])  # in this thread, where it can be interrupted
                     waiting.done(index)
                     ready = sorted([*ready, *waiting.get_ready()])
                 else:
                     running[pool.submit(score, jobs[index])] = index
+            yield from ((index, None) for index in begun())
             if not running:
                 return
             finished = wait(running, return_when=FIRST_COMPLETED).done
