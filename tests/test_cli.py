@@ -1,10 +1,12 @@
 """The command line: answers, exit codes, and what is said where."""
 
 import contextlib
+import csv
 import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -240,7 +242,7 @@ def test_parameters_come_from_a_file_too(run, tmp_path, failing):
         (["rn"], "unknown command 'rn': did you mean 'run'?"),
         (["data", "bild"], "unknown action of data 'bild': did you mean 'build'?"),
         (["list", "detector"], "unknown thing to list 'detector': did you mean 'detectors'?"),
-        ([], "the following arguments are required: COMMAND"),
+        (["data"], "the following arguments are required: ACTION"),
         (
             [*CLOCK, "--detectr", "x"],
             "unrecognized arguments: --detectr x: did you mean --detector",
@@ -381,6 +383,54 @@ def test_show_with_intervals(run, clock):
     assert "50.0 [50.0, 50.0]" in run("show", clock, "--intervals")[1]
 
 
+def test_show_prints_a_line_a_cell_as_csv_and_json(run, clock):
+    code, out, _ = run("show", clock, "--csv", "--stored", "--env", "cartpole", "-k", "iid")
+    assert code == 0
+    (row,) = csv.DictReader(io.StringIO(out))
+    code, out, _ = run("show", clock, "--json", "-k", "iid or gravity")
+    iid, gravity = json.loads(out)
+    assert (iid["anomaly"], gravity["anomaly"]) == ("iid", "gravity")
+    assert float(row["auc_matched"]) == iid["auc_matched"] == 0.5
+    assert row["seconds_fit"]
+    assert (iid["delay"] is None) == (row["delay"] == "")
+    assert run("show", clock, "--csv", "-k", "nothing")[0] == 5
+
+
+def test_two_rows_of_one_run_are_compared(run):
+    run("run", "--detector", "clock,range", "--env", "all", "--split", "tiny")
+    code, out, _ = run("compare", "oodd-results", "range", "clock")
+    assert code == 0
+    assert re.search(r"matched AUC: range \S+, clock 50.0 %, difference \S+ \[.*\], p = ", out)
+    assert "16 cells: " in out
+    for wrong, message in (
+        (["range"], "rows 'range', expected two"),
+        (["range", "clock", "random"], "rows 'range clock random', expected two"),
+        (["range", "rf"], "unknown row of these results 'rf'"),
+        (["range", "clock", "--metric", "acu"], "unknown metric 'acu'"),
+    ):
+        code, _, err = run("compare", "oodd-results", *wrong)
+        assert code == 4
+        assert message in err
+
+
+def test_a_failed_detector_is_forgotten(run, failing, tmp_path):
+    run("run", "--detector", "fails,clock", "--env", "cartpole", "--split", "tiny")
+    place = tmp_path / "oodd-results"
+    assert run("show", place)[0] == 1
+    assert list((place / "logs").iterdir())
+    code, out, _ = run("forget", place, "--failed")
+    assert (code, out) == (0, f"8 cells removed from {place}\n")
+    assert not list((place / "logs").iterdir())
+    assert run("show", place)[0] == 0
+    assert run("forget", place, "--failed")[0] == 5
+    # Scores stay while another cell is of them.
+    assert run("forget", place, "-k", "iid")[0] == 0
+    assert list((place / "scores").iterdir())
+    assert run("forget", place, "-k", "clock")[0] == 0
+    assert not list((place / "scores").iterdir())
+    assert run("forget", place)[0] == 4
+
+
 def test_results_of_two_runs_are_reported_together(run, clock, tmp_path):
     shutil.copytree(clock, "oodd-results")
     run(*CLOCK, "--detector", "random")
@@ -451,6 +501,39 @@ def test_every_command_has_help(capsys):
             assert cli.main([command, *([action] if action else []), "--help"]) == 0
             assert "usage: oodd-eval" in capsys.readouterr().out
             assert callable((parser.choices[action] if action else parser).get_default("handler"))
+
+
+def test_every_help_has_examples_that_can_be_parsed(capsys):
+    parser = cli.build_parser()
+    for command in parser.choices.values():
+        for one in command.choices.values() or [command]:
+            assert one.examples
+            for example in one.examples:
+                assert callable(parser.parse_args(shlex.split(example)).handler)
+                one.print_help()
+                assert f"  oodd-eval {example}\n" in capsys.readouterr().out
+        command.print_help()
+        assert "\nexamples:\n  oodd-eval " in capsys.readouterr().out
+
+
+def test_the_bare_command_prints_help(capsys):
+    assert cli.main([]) == 0
+    assert "usage: oodd-eval" in capsys.readouterr().out
+
+
+def test_info_describes_detectors_environments_and_anomalies(run):
+    code, out, _ = run("info", "rf")
+    assert code == 0
+    assert re.search(r"^detector +rf, oodd-eval ", out)
+    assert re.search(r"trees = \d+  ", out)
+    code, out, _ = run("info", "hopper")
+    assert "15 sensors" in out
+    assert "torso height above its start (m)" in out
+    code, out, _ = run("info", "gravity")
+    assert re.search(r"^group +dynamics$", out, re.MULTILINE)
+    code, _, err = run("info", "gravty")
+    assert code == 4
+    assert "did you mean 'gravity'" in err
 
 
 def test_help_names_every_exit_code(capsys):

@@ -36,6 +36,10 @@ class Recorder:
         self.calls.append(("started", plan.cells))
 
     @hookimpl
+    def oodd_unit_started(self, unit):
+        self.calls.append(("unit", unit))
+
+    @hookimpl
     def oodd_cell_finished(self, record, resumed):
         self.calls.append(("cell", record.cell, resumed))
 
@@ -63,7 +67,7 @@ def watched(tiny_split):
 
 
 def test_every_hook_has_a_test_of_its_name():
-    assert len(SPECS) == 5
+    assert len(SPECS) == 6
     assert {f"test_{name}" for name in SPECS} <= set(globals())
     assert {name for name in SPECS if hasattr(observer_hooks, name)} == set(OBSERVER_HOOKS)
 
@@ -182,9 +186,15 @@ def test_oodd_run_started(watched):
     assert [c[0] for c in calls].count("started") == 1
 
 
+def test_oodd_unit_started(watched):
+    calls, plan, _ = watched()
+    assert calls[1] == ("unit", plan.units[0])
+    assert [c[0] for c in calls].count("unit") == 1
+
+
 def test_oodd_cell_finished(watched):
     calls, plan, _ = watched()
-    assert calls[1:-1] == [("cell", cell, False) for cell in plan.cells]
+    assert calls[2:-1] == [("cell", cell, False) for cell in plan.cells]
 
 
 def test_oodd_run_finished(watched):

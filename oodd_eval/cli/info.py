@@ -9,6 +9,7 @@ from tabulate import tabulate
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
+from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
 
@@ -29,7 +30,13 @@ def run(options: argparse.Namespace) -> int:
     elif name in ANOMALIES:
         lines = _anomaly(ANOMALIES[name])
     else:
-        lines = _detector(discovered(options).offer(name))
+        plugins = discovered(options)
+        try:
+            offer = plugins.offer(name)
+        except UnknownNameError:
+            known = [*ENVIRONMENTS, *ANOMALIES, *plugins.offers]
+            raise UnknownNameError("detector, environment or anomaly", name, known) from None
+        lines = _detector(offer)
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
 
