@@ -1,5 +1,8 @@
 """The examples run, and show what they say."""
 
+import ast
+import json
+import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,3 +65,27 @@ def test_what_was_fitted_is_kept(example, tmp_path):
     one = example.prepare("mewma", 0.1, tmp_path / "fit")
     other = example.prepare("any", 0.5, tmp_path / "fit")
     assert (other.rule, other.sensors) == (one.rule, one.sensors)
+
+
+@pytest.mark.docs
+def test_the_notebook_prints_what_is_stored_in_it(capsys):
+    for library in ("matplotlib", "pandas", "torch"):
+        pytest.importorskip(library)
+    notebook = json.loads((EXAMPLE.parent / "notebook.ipynb").read_text(encoding="utf-8"))
+    space = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        *body, last = ast.parse("".join(cell["source"])).body
+        shown = isinstance(last, ast.Expr)
+        exec(compile(ast.Module([*body, *([] if shown else [last])], []), "cell", "exec"), space)  # noqa: S102
+        value = eval(compile(ast.Expression(last.value), "cell", "eval"), space) if shown else None  # noqa: S307
+        outputs = cell["outputs"]
+        printed = [o for o in outputs if o["output_type"] == "stream"]
+        # The ensemble is small, and other machines train it to other last digits.
+        told, expected = capsys.readouterr().out, "".join(t for o in printed for t in o["text"])
+        assert re.sub(r"\d+%", "", told) == re.sub(r"\d+%", "", expected)
+        pictures = [o for o in outputs if "image/png" in o.get("data", {})]
+        assert bool(pictures) == hasattr(value, "savefig")
+        if html := [o["data"]["text/html"] for o in outputs if "text/html" in o.get("data", {})]:
+            assert value._repr_html_().split() == "".join(html[0]).split()

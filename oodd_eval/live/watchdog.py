@@ -197,7 +197,7 @@ class Watchdog:
     def promise(self) -> str:
         """How rare false alarms are, in words."""
         if (r := self.run_length) is None:
-            return f"at most {self.alpha:.3g} of nominal episodes raise an alarm"
+            return f"at most {100 * self.alpha:.3g} % of nominal episodes raise an alarm"
         interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
         beyond = "" if r.hours <= r.observed else ", by the shape of the tail"
         return (
