@@ -1,0 +1,65 @@
+"""What a watchdog adds to a control loop at 50 Hz: milliseconds of `update`, and memory.
+
+``python benchmarks/bench_live.py [--env hopper] [--detector pe-a] [--minutes 10] [--rate 50]
+[--kept DIR]``; with ``--kept`` the fitted watchdog is saved there and taken from there.
+
+A loop sleeps until the next row is due and hands it to the watchdog: twins of split mini, one after
+the other, with a reset between them. Exit code 1 above 1 ms in more than one row of a hundred, or
+where memory grows by more than 1 MB after the first minute.
+"""
+
+import argparse
+import itertools
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+from live_faults import watchdog_of
+
+from oodd_eval import load_split
+
+LIMIT = 1.0  # milliseconds, 99th percentile
+GROWTH = 1.0  # MB
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="hopper")
+    parser.add_argument("--detector", default="pe-a")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--rate", type=float, default=50.0)
+    parser.add_argument("--kept", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    watchdog = watchdog_of(options.env, options.detector, options.kept)
+    twins = list(load_split("mini").environment(options.env).twins)
+    rows = (row for x in itertools.cycle(twins)
+            for row in itertools.chain([None], zip(x.observations, [None, *x.actions])))  # fmt: skip
+    process, memory, waits = psutil.Process(), [], []
+    for i in range(round(options.minutes * 60 * options.rate)):
+        if i == 0:
+            due = time.perf_counter()
+        due += 1 / options.rate
+        row = next(rows)
+        if row is None:
+            watchdog.reset()
+            row = next(rows)
+        time.sleep(max(0.0, due - time.perf_counter()))
+        start = time.perf_counter()
+        watchdog.update(*row)
+        waits.append(1e3 * (time.perf_counter() - start))
+        if i % round(60 * options.rate) == 0:
+            memory.append(process.memory_info().rss / 1e6)
+    median, tail, worst = np.quantile(waits, [0.5, 0.99, 1.0])
+    grown = memory[-1] - memory[min(1, len(memory) - 1)]
+    print(f"{options.detector} on {options.env}, {len(waits)} updates at {options.rate:g} Hz: median "
+          f"{median:.2f} ms, 99 % {tail:.2f} ms, longest {worst:.2f} ms; memory {memory[-1]:.0f} MB, "
+          f"{grown:+.1f} MB since the first minute")  # fmt: skip
+    return int(tail > LIMIT or grown > GROWTH)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
