@@ -25,6 +25,14 @@ LIMIT = 1.0  # milliseconds, 99th percentile
 GROWTH = 1.0  # MB
 
 
+def endless(episodes):
+    """Yield whether an episode begins, and its next observation and action, over and over."""
+    for x in itertools.cycle(episodes):
+        actions = [None, *x.actions]
+        for t, row in enumerate(zip(x.observations, actions, strict=True)):
+            yield t == 0, row
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="hopper")
@@ -36,17 +44,15 @@ def main():
     torch.set_num_threads(1)
     watchdog = watchdog_of(options.env, options.detector, options.kept)
     twins = list(load_split("mini").environment(options.env).twins)
-    rows = (row for x in itertools.cycle(twins)
-            for row in itertools.chain([None], zip(x.observations, [None, *x.actions])))  # fmt: skip
+    stream = endless(twins)
     process, memory, waits = psutil.Process(), [], []
     for i in range(round(options.minutes * 60 * options.rate)):
         if i == 0:
             due = time.perf_counter()
         due += 1 / options.rate
-        row = next(rows)
-        if row is None:
+        first, row = next(stream)
+        if first:
             watchdog.reset()
-            row = next(rows)
         time.sleep(max(0.0, due - time.perf_counter()))
         start = time.perf_counter()
         watchdog.update(*row)
@@ -55,9 +61,9 @@ def main():
             memory.append(process.memory_info().rss / 1e6)
     median, tail, worst = np.quantile(waits, [0.5, 0.99, 1.0])
     grown = memory[-1] - memory[min(1, len(memory) - 1)]
-    print(f"{options.detector} on {options.env}, {len(waits)} updates at {options.rate:g} Hz: median "
-          f"{median:.2f} ms, 99 % {tail:.2f} ms, longest {worst:.2f} ms; memory {memory[-1]:.0f} MB, "
-          f"{grown:+.1f} MB since the first minute")  # fmt: skip
+    print(f"{options.detector} on {options.env}, {len(waits)} updates at {options.rate:g} Hz:")
+    print(f"  median {median:.2f} ms, 99 % {tail:.2f} ms, longest {worst:.2f} ms")
+    print(f"  memory {memory[-1]:.0f} MB, {grown:+.1f} MB since the first minute")
     return int(tail > LIMIT or grown > GROWTH)
 
 
