@@ -1,11 +1,12 @@
 """Speed and memory of the probabilistic ensemble on one core, beside the processor's peak.
 
-``python benchmarks/bench_pe.py [--env NAMES] [--updates N]``, about a minute an environment.
+``python benchmarks/bench_pe.py [--split mini] [--env NAMES] [--updates N]``, about a minute an
+environment.
 
-Fits `pe-a` to the mini split's training part, by as many updates as asked for, and scores its
-twins: in batch, and streamed one observation at a time. The processor's peak is that of large
-matrix products in the same minute, in single precision for the fit and in double for the scores,
-so that a busy machine slows both alike: read the ratios.
+Fits `pe-a` to the split's training part, by as many updates as asked for, and scores its twins: in
+batch, and streamed one observation at a time. The processor's peak is that of large matrix products
+in the same minute, in single precision for the fit and in double for the scores, so that a busy
+machine slows both alike: read the ratios.
 
 What bounds the speed: in the fit, products of 3 x 256 rows with matrices of 128 x 128 and, where
 there are many sensors, with the output layer, whose width grows with their square; as many
@@ -52,9 +53,9 @@ def flops(arrays, batch):
     return row, 3 * row * batch + orthogonal
 
 
-def measured(environment, updates):
+def measured(split, environment, updates):
     """Return the row of one environment."""
-    data = load_split("mini").environment(environment)
+    data = load_split(split).environment(environment)
     train, twins = list(data.train), list(data.twins)
     whole = PeParameters().updates
     start, rates = time.perf_counter(), [peak(torch.float32)]
@@ -86,11 +87,13 @@ def measured(environment, updates):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--split", default="mini", help="name or path")
     parser.add_argument("--env", default="all", help="names or globs of environments")
     parser.add_argument("--updates", type=int, default=600, help="updates that are timed")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [measured(e, args.updates) for e in select("environment", args.env, ENVIRONMENTS)]
+    chosen = select("environment", args.env, ENVIRONMENTS)
+    rows = [measured(args.split, e, args.updates) for e in chosen]
     heads = ["", "fit, s", "GFLOP an update", "of peak", "batch, us a row", "MFLOP a row",
              "of peak", "streamed, us", "99 %, us", "memory, MB"]  # fmt: skip
     print(tabulate(rows, heads, floatfmt=("", ".0f", ".2f", ".2f", ".0f", ".2f", ".2f", ".0f",

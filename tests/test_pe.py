@@ -122,14 +122,17 @@ def test_what_an_error_of_one_sensor_explains_is_that_of_the_precision_matrix(dr
     np.testing.assert_allclose(found, expected)
 
 
+def singles(*arrays):
+    return [a.astype(np.float32) for a in arrays]
+
+
 def test_training_finds_means_scales_dependence_and_tails():
     random = np.random.default_rng(0)
     x = random.normal(size=(8000, 1))
     first = x[:, 0] + (0.5 + 0.4 * (x[:, 0] > 0)) * random.standard_t(3, size=8000)
     second = 0.8 * first + 0.1 * random.normal(size=8000)
     network = DensityNetworks(2, 1, 2, 32, seed=0)
-    y = np.c_[first, second]
-    train(network, x, y, updates=600, batch=256, seed=0, device="cpu")
+    train(network, *singles(x, np.c_[first, second]), updates=600, batch=256, seed=0, device="cpu")
     at = torch.tensor([[-1.0], [1.0]])
     found = said(network, at, torch.zeros(2, 2))
     np.testing.assert_allclose(found.mean[..., 0].mean(0), [-1, 1], atol=0.2)
@@ -147,7 +150,7 @@ def test_no_error_is_forecast_to_be_wider_than_those_in_training():
     x = random.normal(size=(2000, 1))
     y = np.exp(x) * random.normal(size=(2000, 1))  # the wider, the larger x
     network = DensityNetworks(2, 1, 1, 16, seed=0)
-    train(network, x, y, updates=300, batch=128, seed=0, device="cpu")
+    train(network, *singles(x, y), updates=300, batch=128, seed=0, device="cpu")
     network.double()
 
     def scales(x):
@@ -166,7 +169,7 @@ def test_training_is_the_same_twice_and_differs_by_seed():
 
     def weights(seed):
         network = DensityNetworks(2, 2, 1, 8, seed=seed)
-        train(network, x, y, updates=5, batch=16, seed=seed, device="cpu")
+        train(network, *singles(x, y), updates=5, batch=16, seed=seed, device="cpu")
         return network.out.detach().numpy()
 
     np.testing.assert_array_equal(weights(1), weights(1))
@@ -282,14 +285,14 @@ def test_a_stream_is_explained_as_the_whole_episode_is(fitted):
     np.testing.assert_array_equal([onset for _, onset in found], whole.onsets)
 
 
-def test_a_robot_may_reuse_the_array_of_its_readings(fitted):
-    detector, x = fitted["pe"], episode(100)
-    reading = np.empty(3, np.float32)
+def test_a_robot_may_reuse_the_arrays_of_its_readings_and_commands(fitted):
+    detector, x = fitted["pe-a"], episode(100)
+    reading, command = np.empty(3, np.float32), np.empty(1, np.float32)
     detector.reset()
     found = []
-    for row in x.observations:
-        reading[:] = row
-        found.append(detector.update(reading))
+    for t, row in enumerate(x.observations):
+        reading[:], command[:] = row, x.actions[t - 1]
+        found.append(detector.update(reading, command))
     np.testing.assert_allclose(found[1:], detector.score(x)[1:])
 
 

@@ -147,6 +147,9 @@ class ProbabilisticEnsemble(StorableWindowDetector):
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
 
+    def _command(self, action: NDArray[np.float32] | None) -> NDArray[np.float32]:
+        return super()._command(action).copy()
+
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         if self._running is None or self._onsets is None:
             self._running = Running(self.charts_, accumulate=self.accumulate)
@@ -175,8 +178,8 @@ class ProbabilisticEnsemble(StorableWindowDetector):
                 "same shape"
             )
         scale = FeatureScale.fit(usable)
-        rows = np.concatenate([x.observations for x in usable]).astype(np.float64)
-        self.varying_ = np.flatnonzero(rows.std(axis=0) >= CONSTANT)
+        rows = np.concatenate([x.observations for x in usable])
+        self.varying_ = np.flatnonzero(rows.std(axis=0, dtype=np.float64) >= CONSTANT)
         self.observation_scale_ = scale
         if self.actions:
             commands = np.concatenate([x.actions for x in usable]).astype(np.float64)
@@ -207,7 +210,9 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self.charts_.fit([self._evidence(t) for t in held_out])
         return scale
 
-    def _examples(self, training: Sequence[Trajectory]) -> tuple[NDArray[np.float32], Floats]:
+    def _examples(
+        self, training: Sequence[Trajectory]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Fit the linear forecast; return inputs, (N, I), and outcomes, (N, D), of networks."""
         # Twice over the episodes, since all their inputs in double precision need gigabytes.
         moments = []
@@ -230,7 +235,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             errors[rows] = self._errors(x, self._changes(*self._seen(t)))
         self.error_scale_ = np.maximum(np.sqrt((errors**2).mean(axis=0)), CONSTANT)
         errors /= self.error_scale_
-        return inputs, errors
+        return inputs, errors.astype(np.float32)
 
     def _known(self, x: Trajectory) -> _Known:
         steps = np.arange(len(x) - self.horizon)
