@@ -29,13 +29,13 @@ TIMES = 3
 LEAST = 0.9
 
 
-def watchdog_of(environment, detector, kept):
+def watchdog_of(environment, detector, kept, **promise):
     """Return a fitted watchdog, kept or new."""
-    place = kept and kept / f"{detector}-{environment}"
+    place = kept and kept / "-".join([detector, environment, *map(str, promise.values())])
     if place and place.exists():
         return Watchdog.load(place)
     data = load_split("mini").environment(environment)
-    made = Watchdog.fit(detector, data.train, data.calibration, sensors=data.sensors)
+    made = Watchdog.fit(detector, data.train, data.calibration, sensors=data.sensors, **promise)
     if place:
         made.save(place)
     return made

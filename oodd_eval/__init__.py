@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
-    from oodd_eval.plugins.contract import Detector, DetectorSpec, Explanation
+    from oodd_eval.plugins.contract import Detector, DetectorSpec
+    from oodd_eval.plugins.explanations import Explanation
     from oodd_eval.testing import check_detector
 
 __all__ = ["Detector", "DetectorSpec", "Explanation", "Trajectory", "__version__",
            "check_detector", "evaluate", "hookimpl", "load_results", "load_split"]  # fmt: skip
 
 _HOMES = {"Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
-          "Explanation": "plugins.contract", "Trajectory": "data.trajectory",
+          "Explanation": "plugins.explanations", "Trajectory": "data.trajectory",
           "check_detector": "testing", "evaluate": "api", "hookimpl": "plugins",
           "load_results": "api", "load_split": "data.split"}  # fmt: skip
 

@@ -13,12 +13,11 @@ from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import AlarmKind
 from oodd_eval.plugins.contract import (
     Detector,
-    ExplainingDetector,
     StreamingDetector,
     make_detector,
 )
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.explanations import StreamingExplainer
+from oodd_eval.plugins.explanations import ExplainingDetector, StreamingExplainer
 
 Row = NDArray[np.float32]
 

@@ -19,7 +19,6 @@ from typing import (
     Any,
     Final,
     Literal,
-    NamedTuple,
     Protocol,
     TypeAlias,
     runtime_checkable,
@@ -71,8 +70,7 @@ class Detector(Protocol):
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
     - ``save(directory)`` and ``load(directory)``: see `StorableDetector`;
-    - ``explain(trajectory)``: see `ExplainingDetector`;
-    - ``explain_last()``: see `oodd_eval.plugins.explanations.StreamingExplainer`.
+    - ``explain(trajectory)`` and ``explain_last()``: see `oodd_eval.plugins.explanations`.
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
@@ -154,39 +152,6 @@ class StorableDetector(Detector, Protocol):
         ------
         FittedStateError
             For other files.
-        """
-
-
-class Explanation(NamedTuple):
-    """Shares of the sensors in each score of one episode with T transitions, and onsets.
-
-    Attributes
-    ----------
-    shares : float64 array of shape (T + 1, D)
-        Share of each sensor in the evidence of each row: not negative, with the sum 1. Equal shares
-        where there is no evidence; a row of NaN where the score is undefined.
-    onsets : int64 array of shape (T + 1,)
-        The row, at most t, with which an anomaly would have begun as seen at row t; -1 where the
-        score is undefined.
-    """
-
-    shares: NDArray[np.float64]
-    onsets: NDArray[np.int64]
-
-
-@runtime_checkable
-class ExplainingDetector(Detector, Protocol):
-    """A detector that tells which sensors its scores are from, and since when."""
-
-    def explain(self, trajectory: Trajectory) -> Explanation:
-        """Return what the scores of an episode are due to; as causal as `score`.
-
-        The one sensor with the largest share at a row is named for it.
-
-        Parameters
-        ----------
-        trajectory
-            One episode, which a fitted detector may not have scored.
         """
 
 

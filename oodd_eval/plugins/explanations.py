@@ -1,26 +1,53 @@
-"""Explanations: the checks that they honour the contract, and what the harness keeps of them."""
+"""Explanations of detectors: what they are, their checks, and what the harness keeps of them."""
 
 from collections.abc import Sequence
-from typing import Any, Final, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import (
-    TOLERANCE,
-    ExplainingDetector,
-    Explanation,
-    Scores,
-    StreamingDetector,
-)
+from oodd_eval.plugins.contract import TOLERANCE, Detector, Scores, StreamingDetector
 
 Named: TypeAlias = NDArray[np.int32]
 """Sensors named first and onsets by row, shape (2, T + 1); -1 where a row has none."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
+
+
+class Explanation(NamedTuple):
+    """Shares of the sensors in each score of one episode with T transitions, and onsets.
+
+    Attributes
+    ----------
+    shares : float64 array of shape (T + 1, D)
+        Share of each sensor in the evidence of each row: not negative, with the sum 1. Equal shares
+        where there is no evidence; a row of NaN where the score is undefined.
+    onsets : int64 array of shape (T + 1,)
+        The row, at most t, with which an anomaly would have begun as seen at row t; -1 where the
+        score is undefined.
+    """
+
+    shares: NDArray[np.float64]
+    onsets: NDArray[np.int64]
+
+
+@runtime_checkable
+class ExplainingDetector(Detector, Protocol):
+    """A detector that tells which sensors its scores are from, and since when."""
+
+    def explain(self, trajectory: Trajectory) -> Explanation:
+        """Return what the scores of an episode are due to; as causal as `score`.
+
+        The one sensor with the largest share at a row is named for it.
+
+        Parameters
+        ----------
+        trajectory
+            One episode, which a fitted detector may not have scored.
+        """
 
 
 @runtime_checkable

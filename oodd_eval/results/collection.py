@@ -20,7 +20,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.episode import ScoredEpisode
 from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.paired import Comparison, row_named
+from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout
 from oodd_eval.results.tables.board import boards
@@ -114,7 +114,7 @@ class Results(Sequence[Record]):
         (board,) = boards([r for r in self.records if r.setting == setting])
         return board.mean(setting, board.environments, board.anomalies, metric).value
 
-    def compare(self, first: str, second: str, metric: str = RANKING) -> Comparison:
+    def compare(self, first: str, second: str, metric: str = RANKING) -> PairedComparison:
         """Tell whether one row is better than another, by the paired bootstrap over test seeds.
 
         See `oodd_eval.results.paired.compare`, for its parameters, too.

@@ -14,7 +14,7 @@ from oodd_eval.results.tables.board import contribution, grouped
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class PairedComparison:
     """One row beside another.
 
     Attributes
@@ -88,7 +88,7 @@ def row_named(records: Sequence[Record], name: str) -> Setting:
 
 def compare(
     records: Sequence[Record], first: str, second: str, metric: str = RANKING
-) -> Comparison:
+) -> PairedComparison:
     """Compare two rows of one board over the cells in which both have a value.
 
     Parameters
@@ -102,7 +102,7 @@ def compare(
 
     Returns
     -------
-    Comparison
+    PairedComparison
 
     Raises
     ------
@@ -144,7 +144,7 @@ def compare(
     low, high = sorted((sign * one.low, sign * one.high))
     means = [sum(sum(c.value for c in cells.values()) / len(common) for cells in row.values())
              / len(row) for row in shared.values()]  # fmt: skip
-    return Comparison(
+    return PairedComparison(
         one.first, one.second, metric, (sign * means[0], sign * means[1]), sign * one.difference,
         low, high, min(t.p_holm for t in tests), len(common),
     )  # fmt: skip

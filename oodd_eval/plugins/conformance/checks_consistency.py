@@ -25,7 +25,7 @@ from oodd_eval.plugins.conformance.trial import (
     offered,
 )  # fmt: skip
 from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector
-from oodd_eval.plugins.explanations import FLIPPED, checked_explanation, explains
+from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 
 _PICKLE_SUFFIXES = frozenset({".pkl", ".pickle", ".joblib", ".dill"})
 
@@ -178,12 +178,10 @@ def check_explain(trial: Trial) -> None:
                 first = f"the first {n} of {len(trajectory)} observations alone have other {what}"
                 raise CheckFailedError(f"{first}: explain may use nothing after a row's time")
     if hasattr(trial.fitted(), "explain_last"):
-        _must_explain_last(trial, trajectory, contract.Explanation(whole, onsets))
+        _must_explain_last(trial, trajectory, Explanation(whole, onsets))
 
 
-def _must_explain_last(
-    trial: Trial, trajectory: Trajectory, expected: contract.Explanation
-) -> None:
+def _must_explain_last(trial: Trial, trajectory: Trajectory, expected: Explanation) -> None:
     """Raise `CheckFailedError` unless explain_last gives the rows of explain after each update."""
     detector: Any = offered(trial.fitted(), "reset", "update")
     rows = []
@@ -204,7 +202,7 @@ def _must_explain_last(
             )
 
 
-def _explanation(trial: Trial, trajectory: Trajectory) -> contract.Explanation:
+def _explanation(trial: Trial, trajectory: Trajectory) -> Explanation:
     detector: Any = trial.fitted()
     with doing("explain"):
         returned = detector.explain(trajectory)

@@ -1,0 +1,85 @@
+"""False alarms of a watchdog on fresh nominal episodes: by episode, and in operation without end.
+
+``python benchmarks/live_alarms.py [--env NAMES] [--detector pe-a] [--episodes 200] [--kept DIR]``,
+about three minutes an environment; with ``--kept`` fitted watchdogs are saved there and taken from
+there.
+
+Both watchdogs are fitted to split mini. One promises an alarm in at most 5 % of the episodes;
+printed is the share that has one, with the largest that the promise allows for one calibration
+(97.5 % quantile of the beta-binomial distribution). The other promises a mean time of three minutes
+at 50 Hz between false alarms: the episodes are handed over one after the other, each after a reset,
+as those that it was calibrated on; alarms less than two seconds apart are one. Printed is the mean
+time with the promised interval. Exit code 1 where an environment is beyond either.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from false_alarms import fresh_episodes
+from live_faults import first_alarm, rows_of, watchdog_of
+from scipy.stats import betabinom
+from tabulate import tabulate
+
+from oodd_eval import load_split
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.metrics.alarms import quantile_rank
+from oodd_eval.names import select
+
+RATE = 50.0  # Hz
+MINUTES = 3.0
+ONE = 100  # rows in which alarms are one
+
+
+def without_end(watchdog, episodes):
+    """Return the hours of all episodes and the number of alarms."""
+    alarms = rows = 0
+    for x in episodes:
+        watchdog.reset()
+        last = -ONE
+        for t, row in enumerate(rows_of(x)):
+            if watchdog.update(*row).alarm:
+                alarms += t - last >= ONE
+                last = t
+                watchdog.acknowledge()
+        rows += len(x)
+    return rows / RATE / 3600, alarms
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="all")
+    parser.add_argument("--detector", default="pe-a")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--kept", type=Path)
+    options = parser.parse_args()
+    split, table, wrong = load_split("mini"), [], False
+    cap, n = split.manifest["definition"]["episode_cap"], options.episodes
+    for environment in select("environment", options.env, ENVIRONMENTS):
+        fresh = fresh_episodes(environment, n, 41, cap)
+        watchdog = watchdog_of(environment, options.detector, options.kept)
+        alarms = sum(first_alarm(watchdog, rows_of(x)) is not None for x in fresh)
+        halves = watchdog.rule.standardization is not None
+        episodes = len(split.environment(environment).calibration) // (2 if halves else 1)
+        rank = quantile_rank(episodes, watchdog.alpha)
+        most = betabinom.ppf(0.975, n, episodes + 1 - rank, rank)
+        endless = watchdog_of(
+            environment, options.detector, options.kept, hours=MINUTES / 60, rate=RATE
+        )
+        hours, count = without_end(endless, fresh)
+        promised, mean = endless.run_length, hours / max(count, 1)
+        # No alarm at all says that the mean time is hardly below the hours that were seen.
+        inside = promised.low <= mean <= promised.high or (not count and mean <= promised.high)
+        wrong |= alarms > most or not inside
+        table.append([environment, f"{100 * alarms / n:.1f}", f"{100 * most / n:.1f}",
+                      f"{60 * mean:.1f}", f"{60 * promised.low:.1f} to {60 * promised.high:.1f}",
+                      count])  # fmt: skip
+        print(table[-1], flush=True)
+    heads = ["", "episodes with an alarm (%)", "at most", "minutes between alarms",
+             "promised: 3, within", "alarms"]  # fmt: skip
+    print(tabulate(table, heads, tablefmt="github"))
+    return int(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
