@@ -160,14 +160,15 @@ def test_progress_tells_of_every_unit_once_with_what_came_of_it():
 
 def test_the_remaining_time_is_corrected_by_what_has_finished():
     def after(times, factor):
-        units = [make_unit(seed=seed, fit=str(seed)) for seed in range(10)]
+        units = [make_unit(cheap, seed=seed, fit=str(seed)) for seed in range(10)]
         progress = Progress(units, {"ant": 0}, 2)
         for unit in units[:times]:
             finish(progress, unit, seconds_fit=factor * expected - 3, seconds_score=0.0)
         assert progress.factor() == pytest.approx(factor if times > 1 else 1.0)
         return progress.remaining()
 
-    expected = sum(estimated_cost(RIQN, "ant", 0))
+    cheap = Setting("rf")
+    expected = sum(estimated_cost(cheap, "ant", 0))
     assert expected < 60 < 5 * expected  # one unit says nothing yet
     assert after(5, 2.0) == pytest.approx(2.0 * 5 * expected / 2)
     assert after(1, 2.0) == pytest.approx(9 * expected / 2)
