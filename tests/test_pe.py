@@ -95,6 +95,9 @@ def test_surprise_is_that_of_scipys_t_distributions(drawn):
 @pytest.mark.parametrize("sensors", [0, 1, 3])
 def test_the_ensemble_judges_as_its_networks_do(sensors):
     network = DensityNetworks(2, 4, sensors, 8, seed=3).double()
+    with torch.no_grad():
+        network.out.mul_(10)
+        network.floor.fill_(-0.5)
     random = np.random.default_rng(0)
     x, y = random.normal(size=(ROWS, 4)), random.normal(size=(ROWS, sensors))
     ensemble = DensityEnsemble(network.arrays())

@@ -36,7 +36,7 @@ LIMIT: Final = 10.0
 
 
 class _Known(NamedTuple):
-    """What N forecasts start from."""
+    """The latest observations, actions and times from which N forecasts are made."""
 
     window: NDArray[np.float32]  # (N, W, D), newest first
     actions: Floats | None  # (N, W, A), NaN before the beginning

@@ -47,7 +47,7 @@ def deviance(residual: Floats, log_tail: Floats) -> Floats:
 
 
 class Evidence(NamedTuple):
-    """How far N steps of an episode are from their forecasts.
+    """Residuals of N steps of an episode, with what decides how much each of them counts.
 
     Attributes
     ----------
