@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 
 from false_alarms import fresh_episodes
-from live_faults import first_alarm, rows_of, watchdog_of
+from live_faults import RATE, first_alarm, rows_of, watchdog_of
 from scipy.stats import betabinom
 from tabulate import tabulate
 
@@ -26,7 +26,6 @@ from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.alarms import quantile_rank
 from oodd_eval.names import select
 
-RATE = 50.0  # Hz
 MINUTES = 3.0
 ONE = 100  # rows in which alarms are one
 
@@ -63,9 +62,7 @@ def main():
         episodes = len(split.environment(environment).calibration) // (2 if halves else 1)
         rank = quantile_rank(episodes, watchdog.alpha)
         most = betabinom.ppf(0.975, n, episodes + 1 - rank, rank)
-        endless = watchdog_of(
-            environment, options.detector, options.kept, hours=MINUTES / 60, rate=RATE
-        )
+        endless = watchdog_of(environment, options.detector, options.kept, hours=MINUTES / 60)
         hours, count = without_end(endless, fresh)
         promised, mean = endless.run_length, hours / max(count, 1)
         # No alarm at all says that the mean time is hardly below the hours that were seen.

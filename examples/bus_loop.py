@@ -4,7 +4,8 @@
 
 Every sensor of Gymnasium's CartPole publishes to a topic of its own. The loop wakes up 50 times a
 second, takes what has come since it last did, and hands that to the watchdog: a sensor from which
-nothing new came in time is missing. From a chosen step on one topic has a fault.
+nothing new came in time is missing. From a chosen step on one topic has a fault, or the loop is too
+slow and sees only every second message, which their time stamps show.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.live import TerminalMonitor, Watchdog
 
 RATE = 50
+FAULTS = ("silent", "stuck", "nan", "skipping")
 
 
 class Bus:
@@ -44,25 +46,25 @@ class Robot:
     """A cart with its controller, which publishes what its sensors measure, or a fault instead."""
 
     def __init__(self, bus, sensors, fault, topic, onset, seed):
-        self.bus, self.sensors, self.fault, self.topic, self.onset = (
-            bus,
-            sensors,
-            fault,
-            topic,
-            onset,
-        )
+        self.bus, self.sensors = bus, sensors
+        self.fault, self.topic, self.onset = fault, topic, onset
         self.env, self.policy = gymnasium.make("CartPole-v1"), load_policy("cartpole")
         self.observation, _ = self.env.reset(seed=seed)
         self.t, self.command, self.over, self._stuck = 0, None, False, 0.0
         self._publish()
 
     def step(self):
-        """Let 20 ms pass."""
+        """Let 20 ms pass, or 40 where the loop skips a message."""
+        self._act()
+        if self.fault == "skipping" and self.t >= self.onset and not self.over:
+            self._act()
+        self._publish()
+
+    def _act(self):
         action = self.policy.act(self.observation)
         self.command = np.eye(2, dtype=np.float32)[action]
         self.observation, _, self.over, *_ = self.env.step(action)
         self.t += 1
-        self._publish()
 
     def _publish(self):
         for topic, value in zip(self.sensors, self.observation.tolist(), strict=True):
@@ -79,7 +81,7 @@ def main(arguments=None):
     """Watch one episode; return the reading that raised the alarm, or None."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--detector", default="pe-a")
-    parser.add_argument("--fault", choices=("silent", "stuck", "nan", "none"), default="stuck")
+    parser.add_argument("--fault", choices=(*FAULTS, "none"), default="stuck")
     parser.add_argument("--topic", default="pole angle", help="the sensor with the fault")
     parser.add_argument("--onset", type=int, default=100)
     parser.add_argument("--steps", type=int, default=200)
@@ -88,7 +90,9 @@ def main(arguments=None):
     parser.add_argument("--monitor", action="store_true", help="show the readings as they come")
     options = parser.parse_args(arguments)
     data = load_split("mini").environment("cartpole")
-    watchdog = Watchdog.fit(options.detector, data.train, data.calibration, sensors=data.sensors)
+    watchdog = Watchdog.fit(
+        options.detector, data.train, data.calibration, rate=RATE, sensors=data.sensors
+    )
     bus = Bus()
     robot = Robot(bus, watchdog.sensors, options.fault, options.topic, options.onset, options.seed)
     late = 0
@@ -96,8 +100,8 @@ def main(arguments=None):
     with monitor as shown:
         start = time.monotonic()
         for tick in range(options.steps):
-            readings = bus.newer(watchdog.sensors, tick)
-            reading = watchdog.update(readings or None, robot.command)
+            readings = bus.newer(watchdog.sensors, robot.t)
+            reading = watchdog.update(readings or None, robot.command, time=robot.t / RATE)
             if shown:
                 shown.update(reading)
             if reading.alarm or robot.over:

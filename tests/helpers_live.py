@@ -8,26 +8,34 @@ SENSOR_FAULTS = ("nan", "infinite", "frozen", "swapped")
 FAULTS = (*SENSOR_FAULTS, "silent", "lost", "dropped", "doubled", "late")
 
 
-def rows_of(x):
-    return [(o.copy(), a) for o, a in zip(x.observations, [None, *x.actions], strict=True)]
+def rows_of(x, rate=None):
+    """Arguments of `Watchdog.update` for each row, with time stamps where there is a rate."""
+    rows = zip(x.observations, [None, *x.actions], strict=True)
+    stamps = [(t / rate, (t - 1) / rate) if rate else (None, None) for t in range(len(x))]
+    return [(o.copy(), a, *stamps[t]) for t, (o, a) in enumerate(rows)]
 
 
-def with_fault(kind, x, at, sensors, rng):
+def with_fault(kind, x, at, sensors, rng, rate=None):
     """Rows of an episode with a fault from a row on, and the sensors whose fault it is."""
-    rows, (d, e) = rows_of(x), rng.choice(sensors, 2, replace=False)
+    rows, (d, e) = rows_of(x, rate), rng.choice(sensors, 2, replace=False)
     before, after = rows[:at], rows[at:]
     stuck = rows[at - 1][0][d]
-    if kind == "silent":
-        return before + [(None, a) for _, a in after], set()
-    if kind == "lost":
-        return before + [(None if i % 3 == 0 else o, a) for i, (o, a) in enumerate(after)], set()
+    if kind in {"silent", "lost"}:
+        gone = [kind == "silent" or i % 3 == 0 for i in range(len(after))]
+        return before + [
+            (None if g else o, *rest) for g, (o, *rest) in zip(gone, after, strict=True)
+        ], set()
     if kind == "dropped":
         return before + [row for i, row in enumerate(after) if i % 3], set()
     if kind == "doubled":
         return before + [row for i, row in enumerate(after) for _ in range(1 + (i % 3 == 0))], set()
     if kind == "late":
-        return before + [(o, rows[max(at + i - 3, 1)][1]) for i, (o, _) in enumerate(after)], set()
-    for o, _ in after:
+        older = [rows[max(at + i - 3, 1)] for i in range(len(after))]
+        return before + [
+            (o, a, time, acted)
+            for (o, _, time, _), (_, a, _, acted) in zip(after, older, strict=True)
+        ], set()
+    for o, *_ in after:
         if kind == "swapped":
             o[[d, e]] = o[[e, d]]
         else:

@@ -1,10 +1,13 @@
 """Faults in the stream of a robot's sensors: no exception, an alarm soon, the right name."""
 
+import math
+
 import numpy as np
 import pytest
 from helpers_live import FAULTS, SENSOR_FAULTS, first_alarm, rows_of, walk, with_fault
 
 from oodd_eval import Trajectory, load_split
+from oodd_eval.errors import UsageError
 from oodd_eval.live import Watchdog
 from oodd_eval.live.stream import Stream, StreamLimits
 
@@ -93,6 +96,45 @@ def test_an_action_that_does_not_come_is_the_last_one_and_a_fault(stream):
     for i in range(2, 7):
         assert stream.take(row(i), None if i % 2 else [np.nan])[1] == np.float32(0.7)
     assert stream.faults == {"action": "missing"}
+
+
+def stamped(*stamps, rate=50.0):
+    """The faults after rows with these time stamps, and actions as old as the rows before."""
+    stream = Stream(StreamLimits.fit(TRAIN), rate)
+    for i, time in enumerate(stamps):
+        stream.take(row(i), [0.0], time, time and time - 0.02)
+    return stream.faults
+
+
+@pytest.mark.parametrize(
+    ("stamps", "faults"),
+    [
+        (np.arange(20) * 0.02 + 1e9, {}),
+        (np.arange(20) * 0.027, {}),
+        (np.arange(20) * 0.04, {"observation": "irregular"}),
+        (np.arange(20) * 0.008, {"observation": "irregular"}),
+        ([0.0, 0.02, *[math.nan] * 4], {"observation": "irregular", "action": "late"}),
+        ([0.0, None, None, 0.06, None, 0.1, None, None, None, 0.18], {}),
+        ([0.0, 0.02, 5.0, 5.02, 5.04, 5.06, 5.08], {}),
+    ],
+)
+def test_rows_come_one_interval_after_the_other(stamps, faults):
+    assert stamped(*stamps) == faults
+
+
+def test_actions_from_before_the_row_before_are_late():
+    watchdog = Watchdog.fit("mewma-a", TRAIN, TRAIN, 0.1, rate=10)
+    for i in range(8):
+        reading = watchdog.update(row(i), [0.0], 0.1 * i, 0.1 * i - 0.2)
+    assert reading.faults == {"action": "late"}
+    assert reading.alarm
+
+
+@pytest.mark.parametrize(("rate", "stamps"), [(None, {"time": 1.0}), (50, {"acted": 1.0})])
+def test_time_stamps_need_a_rate_and_those_of_actions_both(rate, stamps):
+    watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1, rate=rate)
+    with pytest.raises(UsageError, match="time stamps need a watchdog fitted with rate="):
+        watchdog.update(row(0), **stamps)
 
 
 def test_a_single_sensor_is_its_own_fault():

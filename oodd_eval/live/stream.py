@@ -1,9 +1,10 @@
-"""What comes from the sensors: readings that are missing, no numbers, frozen or repeated.
+"""What comes from the sensors: readings that are missing, no numbers, frozen, repeated or late.
 
 Such readings are evidence by themselves and nothing that a detector can judge. They are counted,
 and in their place the detector is handed the last good reading.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Final
@@ -33,6 +34,9 @@ MARGIN: Final = 0.25
 """Share of its range in training by which a reading may leave it."""
 CONSTANT: Final = 0.5
 """Share of an episode that a sensor stands still for, from which on standing still is normal."""
+
+TOLERANCE: Final = 0.5
+"""Share of the interval between two rows by which a time stamp may be off."""
 
 NEVER: Final = np.iinfo(np.int64).max
 
@@ -116,16 +120,24 @@ class Stream:
     Attributes
     ----------
     faults
-        What is beyond its limit: ``"missing"``, ``"frozen"``, ``"out of range"`` or ``"repeated"``
-        by the number of a sensor, `OBSERVATION` or `ACTION`.
+        What is beyond its limit: ``"missing"``, ``"frozen"``, ``"out of range"``, ``"repeated"``,
+        ``"irregular"`` or ``"late"`` by the number of a sensor, `OBSERVATION` or `ACTION`.
     suspects
         Rows since when a sensor does what it never did in nominal episodes, by its number: below
         the limit, but where it would be found if there is an alarm.
     """
 
-    def __init__(self, limits: StreamLimits) -> None:
-        self.limits = limits
+    def __init__(self, limits: StreamLimits, rate: float | None = None) -> None:
+        self.limits, self.rate = limits, rate
         self._moving = np.isfinite(limits.still)
+        # Of what all sensors or the actions do; the first that is beyond its limit is told.
+        self._most = {
+            (OBSERVATION, "missing"): MISSING,
+            (OBSERVATION, "repeated"): 2 * float(limits.repeated) + 1,
+            (OBSERVATION, "irregular"): MISSING,
+            (ACTION, "missing"): MISSING,
+            (ACTION, "late"): MISSING,
+        }
         self.reset()
 
     def reset(self) -> None:
@@ -139,15 +151,24 @@ class Stream:
         # Infinite before the first good reading, which equals no other.
         self._last = np.full(len(limits.mean), np.inf, np.float32)
         self._runs, self._missing, self._beyond = np.zeros((3, len(limits.mean)))
-        self._repeated = self._silent = self._idle = 0.0
+        self._counts = dict.fromkeys(self._most, 0.0)
+        self._stamp: float | None = None
+        self._rows = 0  # since that stamp
         self._quiet = True
         self._since = np.full(len(limits.mean), NEVER)
 
     def take(
-        self, observation: ArrayLike | None, action: ArrayLike | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Take the next row; return finite values for a detector: (D,), and (A,) or None."""
+        self, observation: ArrayLike | None, action: ArrayLike | None = None,
+        time: float | None = None, acted: float | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:  # fmt: skip
+        """Take the next row; return finite values for a detector: (D,), and (A,) or None.
+
+        `time` and `acted` are the time stamps of the two in seconds, compared with the rate.
+        """
         self._t += 1
+        self._rows += 1
+        if time is not None and self.rate is not None:
+            self._compare_stamps(time, acted, self.rate)
         row = self._read("observation", observation, len(self._good))
         near = np.abs(row - self.limits.mean) <= FAR * self.limits.std  # False for NaN, too
         equal = near & self._moving & (row == self._last)
@@ -161,8 +182,8 @@ class Stream:
         self._last = np.where(near, row, self._last)
         silent = len(near) > 1 and not near.any()
         repeated = not silent and bool(_repeats((equal | ~near)[None], self._moving)[0])
-        self._silent = _counted(self._silent, silent)
-        self._repeated = _counted(self._repeated, repeated)
+        self._count(OBSERVATION, "missing", happened=silent)
+        self._count(OBSERVATION, "repeated", happened=repeated)
         # What all sensors do at once is no fault of any.
         if not silent and not repeated:
             self._runs = np.where(equal, self._runs + 1, np.where(near, 0.0, self._runs))
@@ -177,10 +198,26 @@ class Stream:
             return None
         found = self._read("action", action, len(self._action))
         usable = bool(np.isfinite(found).all())
-        self._idle = _counted(self._idle, not usable)
-        self._quiet = self._quiet and not self._idle
+        self._count(ACTION, "missing", happened=not usable)
         self._action = found if usable else self._action
         return self._action
+
+    def _compare_stamps(self, time: float, acted: float | None, rate: float) -> None:
+        """Count what does not come one row after the other; NaN is never in time."""
+        if self._stamp is not None:
+            off = abs(rate * (time - self._stamp) - self._rows)
+            self._count(OBSERVATION, "irregular", happened=not off <= TOLERANCE)
+        if math.isfinite(time):
+            self._stamp, self._rows = time, 0
+        if acted is not None:
+            # Commanded since the row before.
+            late = not rate * (time - acted) <= 1 + TOLERANCE
+            self._count(ACTION, "late", happened=late)
+
+    def _count(self, what: str, fault: str, *, happened: bool) -> None:
+        count = _counted(self._counts[what, fault], happened)
+        self._counts[what, fault] = count
+        self._quiet = self._quiet and not count
 
     def _read(self, what: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
         """Return values as float32, NaN for what is missing."""
@@ -198,25 +235,15 @@ class Stream:
     def _judge(self) -> None:
         """Compare the counts with their limits."""
         limits = self.limits
-        counts = (
-            self._repeated,
-            self._silent,
-            self._idle,
-            *self._runs,
-            *self._missing,
-            *self._beyond,
-        )
+        counts = *self._counts.values(), *self._runs, *self._missing, *self._beyond
         self._quiet = not any(counts)
         wild = self._beyond > MISSING
         odd = (self._missing > 0) | (self._runs > limits.still) | wild
         self._since = np.where(odd, np.minimum(self._since, self._t), NEVER)
         whole: dict[int | str, str] = {}
-        if self._silent > MISSING:
-            whole[OBSERVATION] = "missing"
-        elif self._repeated > 2 * limits.repeated + 1:
-            whole[OBSERVATION] = "repeated"
-        if self._idle > MISSING:
-            whole[ACTION] = "missing"
+        for (what, fault), count in self._counts.items():
+            if count > self._most[what, fault]:
+                whole.setdefault(what, fault)
         self.suspects, self.faults = {}, whole
         if not odd.any():
             return

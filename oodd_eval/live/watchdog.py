@@ -47,7 +47,8 @@ class Reading:
         The row with which the anomaly would have begun, as seen now; None where nothing is known.
     faults
         Sensors with a fault, by name: ``"missing"``, ``"frozen"`` or ``"out of range"``; for all at
-        once ``{"observation": "missing"}`` or ``{"observation": "repeated"}``.
+        once ``{"observation": "missing"}``, ``"repeated"`` or ``"irregular"``; for actions
+        ``{"action": "missing"}`` or ``"late"``.
     """
 
     t: int
@@ -99,14 +100,14 @@ class Watchdog:
 
     def __init__(
         self, made: Made, rule: GuaranteedAlarm, limits: StreamLimits, sensors: Sequence[str], *,
-        alpha: float, run_length: RunLength | None, latch: bool, hold_off: int,
+        alpha: float, run_length: RunLength | None, rate: float | None, latch: bool, hold_off: int,
     ) -> None:  # fmt: skip
         self._made, self.rule, self._limits, self.sensors = made, rule, limits, list(sensors)
-        self.alpha, self.run_length = alpha, run_length
+        self.alpha, self.run_length, self.rate = alpha, run_length, rate
         self.latch, self.hold_off = latch, hold_off
         self._live = streaming(made.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
-        self._monitor, self._stream = Monitor(rule), Stream(limits)
+        self._monitor, self._stream = Monitor(rule), Stream(limits, rate)
         self.reset()
 
     @classmethod
@@ -130,9 +131,10 @@ class Watchdog:
             happened, for the threshold.
         alpha
             Largest share of nominal episodes with an alarm.
-        hours, rate
-            For operation without end, in place of alpha: mean time between false alarms, and
-            observations in a second.
+        hours
+            For operation without end, in place of alpha: mean time between false alarms.
+        rate
+            Observations in a second; needed for `hours`, and for time stamps in `update`.
         sensors
             Names, or quantities with names as those of a split; default "sensor 0" and so on.
         latch
@@ -156,7 +158,7 @@ class Watchdog:
         """
         made = Made.make(detector, statistic, seed, horizon, parameters or {})
         training, others = list(train), list(calibration)
-        if hours is not None and not (hours > 0 and rate is not None and rate > 0):
+        if (hours is not None and not (hours > 0 and rate)) or not (rate is None or rate > 0):
             raise UsageError(
                 f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
                 "in hours and in observations per second, above 0"
@@ -190,7 +192,7 @@ class Watchdog:
             rule = replace(unbounded, threshold=threshold)
         return cls(
             made, rule, limits, names or [f"sensor {d}" for d in range(width)], alpha=alpha,
-            run_length=run_length, latch=latch, hold_off=hold_off,
+            run_length=run_length, rate=rate, latch=latch, hold_off=hold_off,
         )  # fmt: skip
 
     @property
@@ -227,8 +229,9 @@ class Watchdog:
             self._monitor.reset()
 
     def update(
-        self, observation: ArrayLike | Mapping[str, float] | None, action: ArrayLike | None = None
-    ) -> Reading:
+        self, observation: ArrayLike | Mapping[str, float] | None, action: ArrayLike | None = None,
+        time: float | None = None, acted: float | None = None,
+    ) -> Reading:  # fmt: skip
         """Judge the next row.
 
         Parameters
@@ -238,6 +241,9 @@ class Watchdog:
             from that sensor in time; None: from none.
         action : array of shape (A,), optional
             Commanded since the row before; None at the first row.
+        time, acted
+            Time stamps of the two, in seconds of one clock; they need a `rate`. Observations that
+            do not come one interval after the other are a fault, and so are older actions.
 
         Returns
         -------
@@ -247,11 +253,18 @@ class Watchdog:
         ------
         TrajectoryError
             For an array of another length, which is a mistake of the caller and no fault.
+        UsageError
+            For a time stamp without a rate, or one of an action alone.
         """
+        if (time is not None and not self.rate) or (acted is not None and time is None):
+            raise UsageError(
+                f"time={time!r}, acted={acted!r}, rate={self.rate!r}: time stamps need a watchdog "
+                "fitted with rate=, observations in a second, and acted needs time"
+            )
         self._t += 1
         if isinstance(observation, Mapping):
             observation = [observation.get(name, math.nan) for name in self.sensors]
-        row, command = self._stream.take(observation, action)
+        row, command = self._stream.take(observation, action, time, acted)
         score = float(self._live.update(row, command if self._made.actions else None))
         above = self._monitor.update(score)
         faults = {str(d): fault for d, fault in self._stream.faults.items()
@@ -323,7 +336,7 @@ class Watchdog:
             "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
             "standardization": nominal and [nominal.mean, nominal.std],
             "run_length": self.run_length and list(astuple(self.run_length)),
-            "latch": self.latch, "hold_off": self.hold_off,
+            "rate": self.rate, "latch": self.latch, "hold_off": self.hold_off,
         }  # fmt: skip
         (place / FILE).write_text(json.dumps(told, indent=1), encoding="utf-8")
 
@@ -360,7 +373,8 @@ class Watchdog:
             length = told["run_length"]
             run_length = None if length is None else RunLength(*map(float, length))
             names = [str(name) for name in told["sensors"]]
-            rest = {"alpha": float(told["alpha"]), "latch": bool(told["latch"]),
+            rate = told["rate"] and float(told["rate"])
+            rest = {"alpha": float(told["alpha"]), "rate": rate, "latch": bool(told["latch"]),
                     "hold_off": int(told["hold_off"])}  # fmt: skip
         except UsageError:
             raise
