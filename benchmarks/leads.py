@@ -11,19 +11,9 @@ import argparse
 
 from tabulate import tabulate
 
-from oodd_eval.metrics.catalogue import RANKING
-from oodd_eval.metrics.ranking import rank
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.tables.board import contribution, grouped
-
-
-def row_of(records):
-    """Return what `rank` takes: by detector seed and cell, the terms of matched AUC."""
-    seeds = grouped(records, lambda r: r.seed)
-    return {
-        seed: {(r.environment, r.anomaly): contribution(r, RANKING) for r in own}
-        for seed, own in seeds.items()
-    }
+from oodd_eval.results.paired import compare
+from oodd_eval.results.tables.board import grouped
 
 
 def main():
@@ -35,11 +25,8 @@ def main():
     plain = [r for r in every if r.ok and r.horizon == 1 and not r.overrides]
     table = []
     for environment, own in grouped(plain, lambda r: r.environment).items():
-        by_row = {name: row_of(of) for name, of in grouped(own, lambda r: r.detector).items()}
-        leads = []
-        for other in by_row.keys() - {options.row}:
-            pair = {name: by_row[name] for name in (options.row, other)}
-            leads += [t for t in rank(pair).comparisons if t.first == options.row]
+        others = {r.detector for r in own} - {options.row}
+        leads = [compare(own, options.row, other) for other in others]
         leads.sort(key=lambda t: t.low)
         unsure = ", ".join(t.second for t in leads if t.low <= 0) or "none"
         low = leads[0]

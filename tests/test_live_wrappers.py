@@ -146,6 +146,13 @@ def test_a_loop_on_a_bus_names_the_topic_with_a_fault(fault, told, monkeypatch, 
     assert f"pole angle {told}, since row 100" in capsys.readouterr().out
 
 
+def test_a_loop_that_skips_messages_is_found():
+    loop = run_example("bus_loop.py")
+    # Random scores: only the time stamps tell.
+    reading = loop.main(["--detector", "random", "--fault", "skipping", "--fast"])
+    assert str(reading) == "row 103: alarm, observation irregular"
+
+
 def test_a_loop_on_a_bus_is_quiet_without_a_fault():
     assert (
         run_example("bus_loop.py").main(["--detector", "mewma", "--fault", "none", "--fast"])

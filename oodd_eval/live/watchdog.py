@@ -72,12 +72,12 @@ class Reading:
         return next(iter(self.sensors), "")
 
     def __str__(self) -> str:
-        """Return one line: the state, what is at fault, since when."""
+        """Return one line: the state, and in an alarm what is at fault and since when."""
         told = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
         told += [f"{name} {fault}" for name, fault in self.faults.items()]
-        if self.sensor and self.sensor not in self.faults:
+        if self.alarm and self.sensor and self.sensor not in self.faults:
             told.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
-        if self.onset is not None:
+        if self.alarm and self.onset is not None:
             told.append(f"since row {self.onset}")
         return ", ".join(told)
 
