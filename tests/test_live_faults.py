@@ -56,6 +56,15 @@ def test_what_is_no_measurement_is_the_last_good_one_for_the_detector(stream, va
     assert stream.suspects == {1: 1}
 
 
+def test_a_constant_sensor_may_have_any_reading_that_is_one():
+    episodes = [Trajectory(np.pad(x.observations, ((0, 0), (0, 1)))) for x in TRAIN]
+    stream = Stream(StreamLimits.fit(episodes))
+    for value, faults in ((5.0, {}), (1e30, {3: "missing"})):
+        stream.reset()
+        taken(stream, *[[*row(i), value] for i in range(6)])
+        assert stream.faults == faults
+
+
 def test_before_the_first_good_reading_it_is_the_mean(stream):
     (found,) = taken(stream, None)
     np.testing.assert_allclose(found, stream.limits.mean, rtol=1e-6)

@@ -130,6 +130,8 @@ class Stream:
     def __init__(self, limits: StreamLimits, rate: float | None = None) -> None:
         self.limits, self.rate = limits, rate
         self._moving = np.isfinite(limits.still)
+        self._low = np.maximum(limits.low, limits.mean - FAR * limits.std)
+        self._high = np.minimum(limits.high, limits.mean + FAR * limits.std)
         # Of what all sensors or the actions do; the first that is beyond its limit is told.
         self._most = {
             (OBSERVATION, "missing"): MISSING,
@@ -170,13 +172,17 @@ class Stream:
         if time is not None and self.rate is not None:
             self._compare_stamps(time, acted, self.rate)
         row = self._read("observation", observation, len(self._good))
-        near = np.abs(row - self.limits.mean) <= FAR * self.limits.std  # False for NaN, too
-        equal = near & self._moving & (row == self._last)
         command = self._command(action)
-        beyond = near & ((row < self.limits.low) | (row > self.limits.high))
-        if self._quiet and near.all() and not (equal | beyond).any():
+        limits = self.limits
+        # False for NaN, too.
+        inside = (row >= self._low) & (row <= self._high)
+        equal = (row == self._last) & self._moving
+        if self._quiet and inside.all() and not equal.any():
             self._good = self._last = row
             return row, command
+        near = np.abs(row - limits.mean) <= FAR * limits.std
+        beyond = near & ~inside
+        equal &= near
         self._beyond = np.where(beyond, self._beyond + 1, np.maximum(self._beyond - FORGOTTEN, 0))
         self._good = np.where(near, row, self._good)
         self._last = np.where(near, row, self._last)

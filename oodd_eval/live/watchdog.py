@@ -41,10 +41,10 @@ class Reading:
     alarm
         Whether there is an alarm.
     sensors
-        Share of each sensor in the evidence, by name, the largest first; empty where nothing is
-        known.
+        In an alarm, share of each sensor in the evidence, by name, the largest first; empty where
+        nothing is known.
     onset
-        The row with which the anomaly would have begun, as seen now; None where nothing is known.
+        In an alarm, the row with which the anomaly began, as seen now; None where nothing is known.
     faults
         Sensors with a fault, by name: ``"missing"``, ``"frozen"`` or ``"out of range"``; for all at
         once ``{"observation": "missing"}``, ``"repeated"`` or ``"irregular"``; for actions
@@ -75,9 +75,9 @@ class Reading:
         """Return one line: the state, and in an alarm what is at fault and since when."""
         told = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
         told += [f"{name} {fault}" for name, fault in self.faults.items()]
-        if self.alarm and self.sensor and self.sensor not in self.faults:
+        if self.sensor and self.sensor not in self.faults:
             told.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
-        if self.alarm and self.onset is not None:
+        if self.onset is not None:
             told.append(f"since row {self.onset}")
         return ", ".join(told)
 
@@ -85,8 +85,8 @@ class Reading:
 class Watchdog:
     """A fitted detector with a threshold, fed one observation at a time; made by `fit` or `load`.
 
-    An alarm is raised when the statistic of the scores exceeds the threshold, or when the readings
-    of a sensor are no measurements any more. Nothing that a sensor sends is an exception.
+    An alarm is raised when the statistic of the scores exceeds the threshold, or when readings are
+    no measurements any more. Nothing that a sensor sends is an exception.
 
     Attributes
     ----------
@@ -275,10 +275,11 @@ class Watchdog:
         self._held = max(0, self._held - 1)
         if self.raised and not self.latch and not new:
             self.raised, self._held = None, self.hold_off
-        sensors, onset = self._blamed()
+        alarm = bool(new or self.raised)
+        sensors, onset = self._blamed() if alarm else ({}, None)  # takes as long as a score
         reading = Reading(
             self._t, math.nan if math.isnan(score) else score, self._monitor.statistic,
-            self.rule.threshold, bool(new or self.raised), sensors, onset,
+            self.rule.threshold, alarm, sensors, onset,
             {self._name(d): fault for d, fault in self._stream.faults.items() if str(d) in faults},
         )  # fmt: skip
         if new and not self.raised:
