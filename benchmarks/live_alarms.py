@@ -1,12 +1,13 @@
 """False alarms of a watchdog on fresh nominal episodes: by episode, and in operation without end.
 
-``python benchmarks/live_alarms.py [--env NAMES] [--detector pe-a] [--episodes 200] [--kept DIR]``,
-about three minutes an environment; with ``--kept`` fitted watchdogs are saved there and taken from
-there.
+``python benchmarks/live_alarms.py [--env NAMES] [--detector pe-a] [--split mini] [--confidence P]
+[--episodes 200] [--seed-base 41] [--kept DIR]``, about three minutes an environment; with
+``--kept`` fitted watchdogs are saved there and taken from there.
 
-Both watchdogs are fitted to split mini. One promises an alarm in at most 5 % of the episodes;
-printed is the share that has one, with the largest that the promise allows for one calibration
-(97.5 % quantile of the beta-binomial distribution). The other promises a mean time of three minutes
+Both watchdogs are fitted to the split. One promises an alarm in at most 5 % of the episodes, on
+average over calibrations or with a confidence; printed is the share that has one, with the largest
+that the promise allows for one calibration (97.5 % quantile of the beta-binomial distribution; with
+a confidence 5 %). The other promises a mean time of three minutes
 at 50 Hz between false alarms: the episodes are handed over one after the other, each after a reset,
 as those that it was calibrated on; alarms less than two seconds apart are one. Printed is the mean
 time with its 95 % interval (of a Poisson process) beside that of the promise. Exit code 1 where an
@@ -52,17 +53,22 @@ def main():
     parser.add_argument("--env", default="all")
     parser.add_argument("--detector", default="pe-a")
     parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--split", default="mini")
+    parser.add_argument("--confidence", type=float)
+    parser.add_argument("--seed-base", type=int, default=41, help="of the fresh episodes")
     parser.add_argument("--kept", type=Path)
     options = parser.parse_args()
-    split, table, wrong = load_split("mini"), [], False
+    split, table, wrong = load_split(options.split), [], False
     cap, n = split.manifest["definition"]["episode_cap"], options.episodes
     for environment in select("environment", options.env, ENVIRONMENTS):
-        fresh = fresh_episodes(environment, n, 41, cap)
-        watchdog = watchdog_of(environment, options.detector, options.kept)
+        fresh = fresh_episodes(environment, n, options.seed_base, cap)
+        given = environment, options.detector, options.kept, options.split
+        sure = {"confidence": options.confidence} if options.confidence else {}
+        watchdog = watchdog_of(*given, **sure)
         alarms = sum(first_alarm(watchdog, rows_of(x)) is not None for x in fresh)
         halves = watchdog.rule.standardization is not None
         episodes = len(split.environment(environment).calibration) // (2 if halves else 1)
-        rank = quantile_rank(episodes, watchdog.alpha)
+        rank = quantile_rank(episodes, watchdog.settings.alpha)
         most = betabinom.ppf(0.975, n, episodes + 1 - rank, rank)
         endless = watchdog_of(environment, options.detector, options.kept, hours=MINUTES / 60)
         hours, count = without_end(endless, fresh)

@@ -9,6 +9,7 @@ import pytest
 from helpers_records import make_record
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binom
 
 from oodd_eval.data.parts import CALIBRATION
 from oodd_eval.data.split import load_split
@@ -16,6 +17,7 @@ from oodd_eval.metrics.alarms import (
     GuaranteedAlarm,
     Monitor,
     guaranteed_contributions,
+    least_episodes,
     offered_levels,
     quantile_rank,
 )
@@ -47,6 +49,17 @@ def test_the_rank_is_the_smallest_that_keeps_the_level():
         for n in range(1, 300):
             promising = [k for k in range(1, n + 2) if 100 * (n + 1 - k) <= percent * (n + 1)]
             assert quantile_rank(n, level) == promising[0]
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
+def test_the_rank_with_a_confidence_is_the_smallest_that_so_many_calibrations_keep(confidence):
+    for level in (0.01, 0.05, 0.2):
+        for n in range(1, 120):
+            chances = binom.sf(np.arange(n), n, 1 - level)  # of at least k quiet episodes
+            enough = [k for k, p in enumerate(chances, 1) if p <= 1 - confidence]
+            assert quantile_rank(n, level, confidence) == (enough or [n + 1])[0]
+            for kind, episodes in (("score", n), ("cusum", 2 * n)):
+                assert bool(enough) == (least_episodes(level, kind, confidence) <= episodes)
 
 
 @pytest.mark.parametrize(

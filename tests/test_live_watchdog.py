@@ -183,7 +183,9 @@ def test_a_promise_beyond_what_was_observed_says_so_and_has_a_wide_interval():
     [
         ({"alpha": 0.01}, "alpha=0.01 takes 99 calibration episodes, got 40"),
         ({"alpha": 0.02, "statistic": "cusum"}, "takes 98 calibration episodes"),
-        ({"alpha": 0}, "expected a share of episodes between 0 and 1"),
+        ({"confidence": 0.9}, "alpha=0.05 takes 45 calibration episodes, got 40"),
+        ({"confidence": 1.0}, "confidence=1.0: expected shares between 0 and 1"),
+        ({"alpha": 0}, "expected shares between 0 and 1"),
         ({"hours": 8}, "needs both"),
         ({"hours": 1e-5, "rate": 50}, "promise more"),
         ({"sensors": ["x"]}, r"1 names of sensors \['x'\], expected 3"),
@@ -238,7 +240,7 @@ def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
         assert (other.rule, other.run_length, other.promise) == (
             one.rule, one.run_length, one.promise
         )  # fmt: skip
-        assert (other.sensors, other.latch, other.hold_off) == (one.sensors, one.latch, 0)
+        assert (other.sensors, other.settings) == (one.sensors, one.settings)
         one.reset()
         for row in rows_of(walk(3, push=1.0)):
             assert other.update(*row) == one.update(*row)

@@ -7,13 +7,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from oodd_eval.live.reading import Reading
     from oodd_eval.live.terminal import TerminalMonitor
-    from oodd_eval.live.watchdog import Reading, Watchdog
+    from oodd_eval.live.watchdog import Watchdog
     from oodd_eval.live.wrappers import VectorWatchdogWrapper, WatchdogWrapper
 
 __all__ = ["Reading", "TerminalMonitor", "VectorWatchdogWrapper", "Watchdog", "WatchdogWrapper"]
 
-_HOMES = {"Reading": "watchdog", "TerminalMonitor": "terminal", "Watchdog": "watchdog",
+_HOMES = {"Reading": "reading", "TerminalMonitor": "terminal", "Watchdog": "watchdog",
           "VectorWatchdogWrapper": "wrappers", "WatchdogWrapper": "wrappers"}  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import copy
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -15,8 +15,9 @@ from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import FittedStateError, UsageError
 from oodd_eval.live.endless import RunLength
 from oodd_eval.live.made import Made, streaming
+from oodd_eval.live.reading import Reading
 from oodd_eval.live.stream import ACTION, OBSERVATION, Stream, StreamLimits
-from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, quantile_rank
+from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, least_episodes
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Detector, StorableDetector
 from oodd_eval.plugins.state import load_state, save_state
@@ -28,58 +29,15 @@ DETECTOR: Final = "detector"
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Reading:
-    """What a `Watchdog` says of one row.
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The arguments of `Watchdog.fit` that operation and promise need."""
 
-    Attributes
-    ----------
-    t
-        The row, counted from 0 at the latest ``reset``.
-    score, statistic, threshold
-        Of the detector, NaN where undefined; what is compared with the threshold.
-    alarm
-        Whether there is an alarm.
-    sensors
-        In an alarm, share of each sensor in the evidence, by name, the largest first; empty where
-        nothing is known.
-    onset
-        In an alarm, the row with which the anomaly began, as seen now; None where nothing is known.
-    faults
-        Sensors with a fault, by name: ``"missing"``, ``"frozen"`` or ``"out of range"``; for all at
-        once ``{"observation": "missing"}``, ``"repeated"`` or ``"irregular"``; for actions
-        ``{"action": "missing"}`` or ``"late"``.
-    """
-
-    t: int
-    score: float
-    statistic: float
-    threshold: float
-    alarm: bool
-    sensors: dict[str, float]
-    onset: int | None
-    faults: dict[str, str]
-
-    def __eq__(self, other: object) -> bool:
-        # Tuples take a NaN, which is always this one, for equal to itself.
-        return isinstance(other, Reading) and astuple(self) == astuple(other)
-
-    __hash__ = None  # type: ignore[assignment]
-
-    @property
-    def sensor(self) -> str:
-        """The sensor that is named first; empty where none is."""
-        return next(iter(self.sensors), "")
-
-    def __str__(self) -> str:
-        """Return one line: the state, and in an alarm what is at fault and since when."""
-        told = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
-        told += [f"{name} {fault}" for name, fault in self.faults.items()]
-        if self.sensor and self.sensor not in self.faults:
-            told.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
-        if self.onset is not None:
-            told.append(f"since row {self.onset}")
-        return ", ".join(told)
+    alpha: float
+    confidence: float | None
+    rate: float | None
+    latch: bool
+    hold_off: int
 
 
 class Watchdog:
@@ -99,22 +57,21 @@ class Watchdog:
     """
 
     def __init__(
-        self, made: Made, rule: GuaranteedAlarm, limits: StreamLimits, sensors: Sequence[str], *,
-        alpha: float, run_length: RunLength | None, rate: float | None, latch: bool, hold_off: int,
+        self, made: Made, rule: GuaranteedAlarm, limits: StreamLimits, sensors: Sequence[str],
+        settings: Settings, run_length: RunLength | None,
     ) -> None:  # fmt: skip
         self._made, self.rule, self._limits, self.sensors = made, rule, limits, list(sensors)
-        self.alpha, self.run_length, self.rate = alpha, run_length, rate
-        self.latch, self.hold_off = latch, hold_off
+        self.settings, self.run_length = settings, run_length
         self._live = streaming(made.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
-        self._monitor, self._stream = Monitor(rule), Stream(limits, rate)
+        self._monitor, self._stream = Monitor(rule), Stream(limits, settings.rate)
         self.reset()
 
     @classmethod
     def fit(
         cls, detector: str | Detector, train: Sequence[Trajectory],
         calibration: Sequence[Trajectory], alpha: float = 0.05, *,
-        hours: float | None = None, rate: float | None = None,
+        confidence: float | None = None, hours: float | None = None, rate: float | None = None,
         sensors: Sequence[Any] | None = None, latch: bool = True, hold_off: int = 0,
         statistic: str | None = None, seed: int = 0, horizon: int = 1,
         parameters: Mapping[str, Any] | None = None,
@@ -131,6 +88,9 @@ class Watchdog:
             happened, for the threshold.
         alpha
             Largest share of nominal episodes with an alarm.
+        confidence
+            Chance that this calibration keeps the promise, such as 0.9. By default it is kept on
+            average over calibrations: in half of them somewhat more episodes alarm.
         hours
             For operation without end, in place of alpha: mean time between false alarms.
         rate
@@ -163,8 +123,15 @@ class Watchdog:
                 f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
                 "in hours and in observations per second, above 0"
             )
-        if hours is None:
-            _must_suffice(len(others), alpha, halves=made.alarm == "cusum")
+        if not (0 < alpha < 1 and 0 < (confidence or 0.5) < 1):
+            expected = "shares between 0 and 1"
+            raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
+        least = least_episodes(alpha, made.alarm, confidence) if hours is None else 1
+        if len(others) < least:
+            raise UsageError(
+                f"alpha={alpha!r} takes {least} calibration episodes, got {len(others)}: record "
+                "more, or promise less"
+            )
         names = [str(getattr(s, "name", s)) for s in sensors or ()]
         width = training[0].observation_dim if training else 0
         if sensors is not None and (len(names) != width or len({*names}) != width):
@@ -179,7 +146,7 @@ class Watchdog:
             # An episode with a fault alarms at any threshold. Those that standardize stay.
             scores = [np.array([np.inf]) if f and (made.alarm == "score" or i % 2) else s
                       for i, (f, s) in enumerate(zip(faulty, scores, strict=True))]  # fmt: skip
-            rule = GuaranteedAlarm.fit(scores, alpha, made.alarm)
+            rule = GuaranteedAlarm.fit(scores, alpha, made.alarm, confidence)
         else:
             unbounded = GuaranteedAlarm(
                 Standardization.fit(scores) if made.alarm == "cusum" else None, math.inf
@@ -190,16 +157,17 @@ class Watchdog:
             largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
             threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate or 0))
             rule = replace(unbounded, threshold=threshold)
-        return cls(
-            made, rule, limits, names or [f"sensor {d}" for d in range(width)], alpha=alpha,
-            run_length=run_length, rate=rate, latch=latch, hold_off=hold_off,
-        )  # fmt: skip
+        names = names or [f"sensor {d}" for d in range(width)]
+        settings = Settings(alpha, confidence, rate, latch, hold_off)
+        return cls(made, rule, limits, names, settings, run_length)
 
     @property
     def promise(self) -> str:
         """How rare false alarms are, in words."""
         if (r := self.run_length) is None:
-            return f"at most {100 * self.alpha:.3g} % of nominal episodes raise an alarm"
+            alpha, confidence = self.settings.alpha, self.settings.confidence
+            sure = f", with {100 * confidence:.3g} % confidence" if confidence else ""
+            return f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}"
         interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
         beyond = "" if r.hours <= r.observed else ", by the shape of the tail"
         return (
@@ -224,7 +192,7 @@ class Watchdog:
         A sum of scores starts again.
         """
         self.raised = None
-        self._known, self._held = self._causes, self.hold_off
+        self._known, self._held = self._causes, self.settings.hold_off
         if self.rule.standardization is not None:
             self._monitor.reset()
 
@@ -256,9 +224,10 @@ class Watchdog:
         UsageError
             For a time stamp without a rate, or one of an action alone.
         """
-        if (time is not None and not self.rate) or (acted is not None and time is None):
+        rate = self.settings.rate
+        if (time is not None and not rate) or (acted is not None and time is None):
             raise UsageError(
-                f"time={time!r}, acted={acted!r}, rate={self.rate!r}: time stamps need a watchdog "
+                f"time={time!r}, acted={acted!r}, rate={rate!r}: time stamps need a watchdog "
                 "fitted with rate=, observations in a second, and acted needs time"
             )
         self._t += 1
@@ -273,8 +242,8 @@ class Watchdog:
         self._known &= self._causes
         new = bool(self._causes - self._known) and not self._held
         self._held = max(0, self._held - 1)
-        if self.raised and not self.latch and not new:
-            self.raised, self._held = None, self.hold_off
+        if self.raised and not self.settings.latch and not new:
+            self.raised, self._held = None, self.settings.hold_off
         alarm = bool(new or self.raised)
         sensors, onset = self._blamed() if alarm else ({}, None)  # takes as long as a score
         reading = Reading(
@@ -333,11 +302,11 @@ class Watchdog:
         save_state(place, kind=KIND, settings={}, arrays=self._limits.arrays())
         nominal = self.rule.standardization
         told = {
-            "made": self._made.told(), "sensors": self.sensors, "alpha": self.alpha,
+            "made": self._made.told(), "sensors": self.sensors,
             "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
             "standardization": nominal and [nominal.mean, nominal.std],
             "run_length": self.run_length and list(astuple(self.run_length)),
-            "rate": self.rate, "latch": self.latch, "hold_off": self.hold_off,
+            "settings": asdict(self.settings),
         }  # fmt: skip
         (place / FILE).write_text(json.dumps(told, indent=1), encoding="utf-8")
 
@@ -374,9 +343,7 @@ class Watchdog:
             length = told["run_length"]
             run_length = None if length is None else RunLength(*map(float, length))
             names = [str(name) for name in told["sensors"]]
-            rate = told["rate"] and float(told["rate"])
-            rest = {"alpha": float(told["alpha"]), "rate": rate, "latch": bool(told["latch"]),
-                    "hold_off": int(told["hold_off"])}  # fmt: skip
+            settings = Settings(**told["settings"])
         except UsageError:
             raise
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -385,17 +352,4 @@ class Watchdog:
         if not isinstance(made.detector, StorableDetector) or len(names) != len(limits.mean):
             raise FittedStateError(f"{str(place)!r} does not fit {type(made.detector).__name__}")
         made.detector.load(place / DETECTOR)
-        return cls(made, rule, limits, names, run_length=run_length, **rest)  # type: ignore[arg-type]
-
-
-def _must_suffice(episodes: int, alpha: float, *, halves: bool) -> None:
-    """Raise `UsageError` unless so many calibration episodes can promise alpha."""
-    if not 0 < alpha < 1:
-        raise UsageError(f"alpha={alpha!r}, expected a share of episodes between 0 and 1")
-    n = episodes // 2 if halves else episodes
-    if quantile_rank(n, alpha) > n:
-        least = math.ceil(1 / alpha - 1e-9) - 1
-        raise UsageError(
-            f"alpha={alpha!r} takes {2 * least if halves else least} calibration episodes, got "
-            f"{episodes}: record more, or promise less"
-        )
+        return cls(made, rule, limits, names, settings, run_length)

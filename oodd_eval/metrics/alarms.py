@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
+from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, LEVELS
 from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
@@ -51,8 +52,9 @@ class GuaranteedAlarm:
 
     @classmethod
     def fit(
-        cls, calibration: Sequence[Floats], level: float, kind: AlarmKind = "cusum"
-    ) -> "GuaranteedAlarm":
+        cls, calibration: Sequence[Floats], level: float, kind: AlarmKind = "cusum",
+        confidence: float | None = None,
+    ) -> "GuaranteedAlarm":  # fmt: skip
         """Find the threshold on the scores of nominal episodes, kept apart from the fit.
 
         Parameters
@@ -65,20 +67,23 @@ class GuaranteedAlarm:
             ``"cusum"``: the CUSUM, without a new start after an alarm, of scores that the episodes
             number 0, 2, 4, ... standardize; the threshold is from the others. ``"score"``: the
             score itself, for a detector that accumulates by itself; the threshold is from all.
+        confidence
+            See `quantile_rank`.
         """
-        return cls.fits(calibration, [level], kind)[0]
+        return cls.fits(calibration, [level], kind, confidence)[0]
 
     @classmethod
     def fits(
-        cls, calibration: Sequence[Floats], levels: Sequence[float], kind: AlarmKind = "cusum"
-    ) -> "list[GuaranteedAlarm]":
+        cls, calibration: Sequence[Floats], levels: Sequence[float], kind: AlarmKind = "cusum",
+        confidence: float | None = None,
+    ) -> "list[GuaranteedAlarm]":  # fmt: skip
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
         unbounded, episodes = cls(None, math.inf), calibration
         if kind == "cusum":
             unbounded = cls(Standardization.fit(calibration[0::2]), math.inf)
             episodes = calibration[1::2]
         largest = np.sort([unbounded.largest(scores) for scores in episodes])
-        ranks = [quantile_rank(len(largest), level) for level in levels]
+        ranks = [quantile_rank(len(largest), level, confidence) for level in levels]
         return [
             cls(unbounded.standardization,
                 float(largest[rank - 1]) if rank <= len(largest) else math.inf)
@@ -101,15 +106,39 @@ class GuaranteedAlarm:
         return int(above.argmax()) if above.any() else None
 
 
-def quantile_rank(n: int, level: float) -> int:
+def quantile_rank(n: int, level: float, confidence: float | None = None) -> int:
     """Return the rank, from 1, of the threshold among n largest statistics.
 
-    It is the smallest k with ``1 - k / (n + 1) <= level``; above n no number of the n will do.
+    It is the smallest k with ``1 - k / (n + 1) <= level``: on average over calibrations, no larger
+    share of nominal episodes alarms. With a confidence, such as 0.9, it is the smallest k with
+    which that holds in this share of the calibrations (Vovk, "Conditional validity of inductive
+    conformal predictors", 2012). Above n no number of the n will do.
 
     >>> quantile_rank(19, 0.05), quantile_rank(18, 0.05), quantile_rank(20, 0.10)
     (19, 19, 19)
+    >>> quantile_rank(45, 0.05, 0.9), quantile_rank(44, 0.05, 0.9)
+    (45, 45)
     """
-    return n + 1 - math.floor((n + 1) * level + _ROUNDING)
+    if confidence is None:
+        return n + 1 - math.floor((n + 1) * level + _ROUNDING)
+    # Of n episodes at least k are quiet with this chance, if the share of alarms is the level.
+    chances = (incomplete_beta(k, n + 1 - k, 1 - level) for k in range(1, n + 1))
+    return next((k for k, p in enumerate(chances, 1) if p <= 1 - confidence + _ROUNDING), n + 1)
+
+
+def least_episodes(level: float, kind: AlarmKind, confidence: float | None = None) -> int:
+    """Return how many calibration episodes a level takes, those that standardize included.
+
+    >>> least_episodes(0.05, "score"), least_episodes(0.05, "cusum")
+    (19, 38)
+    >>> least_episodes(0.05, "score", 0.9)
+    45
+    """
+    if confidence is None:
+        n = math.ceil(1 / level - _ROUNDING) - 1
+    else:
+        n = math.ceil(math.log(1 - confidence) / math.log(1 - level) - _ROUNDING)
+    return 2 * n if kind == "cusum" else n
 
 
 def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
