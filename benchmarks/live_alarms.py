@@ -68,9 +68,11 @@ def main():
         alarms = sum(first_alarm(watchdog, rows_of(x)) is not None for x in fresh)
         halves = watchdog.rule.standardization is not None
         episodes = len(split.environment(environment).calibration) // (2 if halves else 1)
-        rank = quantile_rank(episodes, watchdog.settings.alpha)
-        most = betabinom.ppf(0.975, n, episodes + 1 - rank, rank)
-        endless = watchdog_of(environment, options.detector, options.kept, hours=MINUTES / 60)
+        alpha = watchdog.settings.alpha
+        rank = quantile_rank(episodes, alpha)
+        chance = betabinom.ppf(0.975, n, episodes + 1 - rank, rank)
+        most = n * alpha if sure else chance
+        endless = watchdog_of(*given, hours=MINUTES / 60)
         hours, count = without_end(endless, fresh)
         promised = endless.run_length
         most_often = 2 * hours / chi2.ppf(0.975, 2 * count + 2)
