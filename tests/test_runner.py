@@ -473,13 +473,14 @@ def test_selecting_nothing_is_an_error(patterns):
         ("ant or hopper and not rf", "mini/ant/iid::rf[h=1,seed=0]", True),
         ("not (ant or hopper)", "mini/ant/iid::rf[h=1,seed=0]", False),
         ("not not ant", "mini/ant/iid::rf[h=1,seed=0]", True),
+        ("", "mini/ant/iid::rf[h=1,seed=0]", True),
     ],
 )
 def test_expressions_select_cells(text, cell, wanted):
     assert expression(text)(cell) is wanted
 
 
-@pytest.mark.parametrize("text", ["", "and", "a and", "a b", "(a", "a)", "not", "()"])
+@pytest.mark.parametrize("text", [" ", "and", "a and", "a b", "(a", "a)", "not", "()"])
 def test_broken_expressions_are_refused(text):
     with pytest.raises(UsageError, match=r"-k .* cannot be read"):
         expression(text)
