@@ -402,6 +402,9 @@ def test_two_rows_of_one_run_are_compared(run):
     assert code == 0
     assert re.search(r"matched AUC: range \S+, clock 50.0 %, difference \S+ \[.*\], p = ", out)
     assert "16 cells: " in out
+    # A board that has neither row does not matter.
+    run("run", "--detector", "clock,random", "--env", "all", "--split", "tiny", "--limit", "2")
+    assert run("compare", "oodd-results", "range", "clock")[1] == out
     for wrong, message in (
         (["range"], "rows 'range', expected two"),
         (["range", "clock", "random"], "rows 'range clock random', expected two"),

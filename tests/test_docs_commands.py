@@ -67,6 +67,8 @@ KNOWN = dict(
             rules=(
                 Rule(r"(?<=--jobs 2) --timeout 10m", "a busy machine", " --timeout 30m"),
                 Rule(r"--detector mewma,rf\b", "fits in no time", "--detector mewma,random"),
+                Rule(r"(?<=mewma) rf\b", "instead of it", " random"),
+                Rule(r"rf and drift", "instead of it", "random and drift"),
                 Rule(r"--horizon 1,10 --seed 0,1", "two fits show what four do", "--seed 0,1"),
             ),
         ),

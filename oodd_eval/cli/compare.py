@@ -5,7 +5,7 @@ from pathlib import Path
 
 from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import make_console
-from oodd_eval.errors import OutputError, UsageError
+from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES, RANKING
 from oodd_eval.names import expression
 from oodd_eval.results import paired, regression
@@ -69,11 +69,22 @@ def _rows(now: RecordSet, options: argparse.Namespace) -> int:
     if len(options.rows) != 2 or options.against or options.write_reference:
         given = " ".join(options.rows)
         raise UsageError(f"rows {given!r}, expected two, without --against or --write-reference")
+    if not now.boards:
+        return say(f"no record of {options.results} is selected", 5)
     first, second = options.rows
+    found = []
+    unknown: UnknownNameError | None = None
     for conditions, cells in now.boards.items():
-        print(conditions)
-        print(paired.compare(list(cells.values()), first, second, options.metric))
-    return 0 if now.boards else say(f"no record of {options.results} is selected", 5)
+        try:
+            compared = paired.compare(list(cells.values()), first, second, options.metric)
+            found.append(f"{conditions}\n{compared}")
+        except UnknownNameError as error:
+            unknown = unknown or error
+    if unknown and not found:
+        raise unknown
+    # A directory may also hold boards, runs with --limit say, without these rows.
+    print("\n".join(found))
+    return 0
 
 
 def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) -> int:

@@ -117,7 +117,22 @@ class Results(Sequence[Record]):
     def compare(self, first: str, second: str, metric: str = RANKING) -> PairedComparison:
         """Tell whether one row is better than another, by the paired bootstrap over test seeds.
 
-        See `oodd_eval.results.paired.compare`, for its parameters, too.
+        Parameters
+        ----------
+        first, second
+            Names of the rows.
+        metric
+            Any metric that is a mean over trajectories.
+
+        Returns
+        -------
+        PairedComparison
+            Difference, interval, p-value and verdict.
+
+        Raises
+        ------
+        UsageError, ResultsError
+            As `oodd_eval.results.paired.compare`.
         """
         return paired.compare(self.records, first, second, metric)
 
@@ -180,7 +195,15 @@ class Results(Sequence[Record]):
     ) -> Figure:
         """Draw an episode: the sensors that leave their twin's course, and the statistic.
 
-        Parameters and errors are those of `scores`; `MissingExtraError` without matplotlib.
+        Parameters
+        ----------
+        environment, anomaly, i, row, seed
+            As those of `scores`.
+
+        Raises
+        ------
+        MissingExtraError
+            Without matplotlib; other errors are those of `scores`.
         """
         return plots.trajectory(self.scores(environment, anomaly, i, row=row, seed=seed))
 
@@ -189,7 +212,7 @@ class Results(Sequence[Record]):
 
         Parameters
         ----------
-        *rows
+        rows
             Names of rows; by default all.
         """
         chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})

@@ -50,8 +50,12 @@ class ScoredEpisode:
     def delay(self, *, of_twin: bool = False) -> float:
         """Return rows from the effect to the first alarm, infinite without one.
 
-        NaN where that precedes the effect, or no row follows it. With `of_twin` it is an alarm of
-        the twin, which is a false one.
+        NaN where that precedes the effect, or no row follows it.
+
+        Parameters
+        ----------
+        of_twin
+            Whether it is an alarm of the twin, which is a false one.
         """
         scores = self.twin_scores if of_twin else self.scores
         first = self.rule.first(scores) if self.rule else None
