@@ -613,7 +613,7 @@ class HalfStreaming(Good):
 @breaks(
     "short-trajectories",
     "score of an episode of 1 observation raised IndexError: <...> (broken_detectors.py:<n>)",
-    also={"prefix", "streaming"},
+    also={"prefix", "streaming", "explain"},
 )
 class NeedsTwo(Good):
     def score(self, x):

@@ -455,7 +455,10 @@ def test_improvements_are_exit_code_1_only_when_both_sides_count(run):
         ),
         (("same", "--against", "same", "--fail", "auc:+1"), "higher is better"),
         (("same", "--against", "same", "--fail", "auc:1", "--fail", "auc:2"), "two tolerances for"),
-        (("same",), "nothing to do: expected --against REFERENCE or --write-reference FILE"),
+        (
+            ("same",),
+            "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE",
+        ),
         (("same", "--against", "same", "--by", "x"), "invalid choice: 'x'"),
         (("same", "--against", "same", "--junit", "no/j.xml"), "'no/j.xml' cannot be written"),
     ],

@@ -47,7 +47,15 @@ def finish(text, executor, *, kept="", results=True, **settings):
     found = _as_they_finish(
         jobs_of(text), executor, RunSettings(**settings), Results(kept) if results else None
     )
-    return [index for index, _ in found]
+    began, finished = [], []
+    for index, scored in found:
+        if scored is None:
+            began.append(index)
+        else:
+            # Told before it is finished, and only once.
+            assert began.count(index) == 1
+            finished.append(index)
+    return finished
 
 
 def test_units_begin_in_the_order_of_the_plan():
@@ -121,9 +129,9 @@ def test_scores_of_a_few_units_are_in_memory_at_a_time():
     jobs = jobs_of(" ".join(f"{n:02d}" for n in range(50)))
     for job in jobs:
         job.unit.fit_key = job.name
-    for _ in _as_they_finish(jobs, executor, RunSettings(), None):
-        taken += 1
-        time.sleep(0.002)
+    for _, scored in _as_they_finish(jobs, executor, RunSettings(), None):
+        taken += scored is not None
+        time.sleep(0.001)
     assert taken == 50
     assert most <= 2 * executor.jobs + 1  # the one that the caller has in its hands
 

@@ -28,8 +28,10 @@ from oodd_eval.scoring.unit import groups
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
 
 SEED = 424242
-# Names that no docstring in the worker has, nor Python (its easter egg is "antigravity").
+# Names that no docstring in the worker has, nor the package's metadata, in which the README is, nor
+# Python (its easter egg is "antigravity").
 CHOSEN = "wind-l2r,wind-r2l"
+ENVIRONMENT = "lunarlander"
 
 
 class Secrets:
@@ -37,17 +39,17 @@ class Secrets:
 
     def __init__(self, directory):
         self.path = make_split(
-            directory / "verysecret", ("cartpole",), train=2, calibration=2, test=2,
+            directory / "verysecret", (ENVIRONMENT,), train=2, calibration=2, test=2,
             length=9000, seed_base=871,
         )  # fmt: skip
         split = load_split(self.path)
-        data = split.environment("cartpole")
+        data = split.environment(ENVIRONMENT)
         onsets = [int(n) for n in data.anomalous("wind-l2r").onsets]
         # Who was handed a trajectory knows its length.
         lengths = {n + known for n in (9000, 9001, 9002) for known in (0, 1)}
         seeds = [871_000_000 + offset + i for offset in (300_000, 600_000) for i in range(2)]
         self.texts = [
-            *CHOSEN.split(","), "cartpole", "verysecret", "test/nominal", split.digest,
+            *CHOSEN.split(","), ENVIRONMENT, "verysecret", "test/nominal", split.digest,
             *map(str, seeds),
         ]  # fmt: skip
         self.numbers = {*seeds, *(n for n in onsets if n > 1000)} - lengths
@@ -93,7 +95,7 @@ def findings(secrets, tmp_path_factory):
         for anomalies in (CHOSEN.partition(",")[0], CHOSEN):
             subprocess.run(
                 [sys.executable, "-m", "oodd_eval", "run", "--detector", "spy", "--env",
-                 "cartpole", "--anomaly", anomalies, "--split", secrets.path, "--seed", str(SEED)],
+                 ENVIRONMENT, "--anomaly", anomalies, "--split", secrets.path, "--seed", str(SEED)],
                 env={**os.environ, "PYTHONPATH": str(place / "plugin"), "OODD_EVAL_PLUGINS": "spy",
                      "OODD_EVAL_DATA": str(secrets.path.parent)},
                 capture_output=True, text=True, check=True, timeout=300,
@@ -132,10 +134,10 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
     send, popen = isolation._send, subprocess.Popen
 
     def told(child, request, *trajectories):
-        leak = {"environment": "cartpole", "onsets": secrets.onsets}
+        leak = {"environment": ENVIRONMENT, "onsets": secrets.onsets}
         send(child, request | leak, *trajectories)
 
-    with (secrets.path / "cartpole.h5").open("rb") as split:
+    with (secrets.path / f"{ENVIRONMENT}.h5").open("rb") as split:
 
         def start(command, **settings):
             if "oodd_eval.plugins.isolation.worker" in command:
@@ -147,14 +149,16 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
 
         monkeypatch.setattr(isolation, "_send", told)
         monkeypatch.setattr(isolation.subprocess, "Popen", start)
-        records = evaluate("spy", split=secrets.path, environments="cartpole", anomalies="wind-l2r")
+        records = evaluate(
+            "spy", split=secrets.path, environments=ENVIRONMENT, anomalies="wind-l2r"
+        )
     assert [record.status for record in records] == ["ok"], records[0].reason
     found = secrets.seen_in(Findings(spying))
     onsets = {n for n in secrets.onsets if n > 1000}
     assert onsets
-    assert found["frames"] >= {"cartpole", *onsets}
-    assert found["objects"] >= {"cartpole", "verysecret", *onsets}
-    assert found["memory"] >= {"cartpole", "verysecret"}
+    assert found["frames"] >= {ENVIRONMENT, *onsets}
+    assert found["objects"] >= {ENVIRONMENT, "verysecret", *onsets}
+    assert found["memory"] >= {ENVIRONMENT, "verysecret"}
     for place in ("arguments", "environment", "descriptors", "directory"):
         assert "verysecret" in found[place]
 
@@ -166,7 +170,7 @@ def test_the_spy_finds_arrays_of_secrets_in_memory(secrets, monkeypatch, tmp_pat
     np.savez(tmp_path / "planted.npz", **arrays)
     planted = f"KEPT = dict(np.load({str(tmp_path / 'planted.npz')!r}))\n"
     seen = spy_in(tmp_path, monkeypatch, planted)
-    evaluate("spy", split=secrets.path, environments="cartpole", anomalies="wind-l2r")
+    evaluate("spy", split=secrets.path, environments=ENVIRONMENT, anomalies="wind-l2r")
     found = secrets.seen_in(Findings(seen))
     assert found["memory"] >= {"onsets as int64", "seeds as int64", "rewards as float32"}
     assert found["objects"] == {871_600_000, 871_600_001, *(n for n in secrets.onsets if n > 1000)}
@@ -187,14 +191,14 @@ def mini(tmp_path_factory):
     for i in range(3):
         with pytest.MonkeyPatch.context() as patch:
             seen = spy_in(tmp_path_factory.mktemp(f"mini{i}"), patch)
-            evaluate("spy", environments="cartpole")
+            evaluate("spy", environments=ENVIRONMENT)
         found.append(Findings(seen))
     return found
 
 
 @pytest.fixture(scope="module")
 def sets():
-    return parts_of(load_split("mini").environment("cartpole"), tuple(ANOMALIES))
+    return parts_of(load_split("mini").environment(ENVIRONMENT), tuple(ANOMALIES))
 
 
 def arrived(findings, sets):
@@ -253,7 +257,7 @@ def test_one_group_has_prefixes_of_different_seeds_and_no_run_those_of_another(m
 
 
 def test_training_trajectories_arrive_in_the_order_of_the_split(mini):
-    train = load_split("mini").environment("cartpole").train
+    train = load_split("mini").environment(ENVIRONMENT).train
     assert [found for found, *_ in mini[0].arrived("fit")] == [digest(x) for x in train]
 
 

@@ -30,7 +30,7 @@ def oodd_run_started(plan: Plan) -> None:
 
 @hookspec
 def oodd_unit_started(unit: Unit) -> None:
-    """Observe that a unit begins. Called once for every unit, before a fit or its kept scores.
+    """Observe that a unit begins. Called once for every unit, before its cells.
 
     Parameters
     ----------

@@ -144,6 +144,9 @@ def _as_they_finish(
             for future in [f for f in running if f in finished]:
                 index = running.pop(future)
                 waiting.done(index)
+                if index not in told:  # it began and finished since jobs were last told
+                    told.add(index)
+                    yield index, None
                 yield index, future.result()
     finally:
         executor.stop()
