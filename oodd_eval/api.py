@@ -25,7 +25,7 @@ from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
 
 Tried: TypeAlias = str | DetectorSpec | Detector | Callable[..., Detector]
-"""What `evaluate` takes as a detector."""
+"""A detector for `evaluate`: a name, a spec, a class or function that makes one, an instance."""
 
 
 def evaluate(

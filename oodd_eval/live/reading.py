@@ -1,11 +1,11 @@
-"""What a watchdog says of one row."""
+"""The reading of a watchdog: score, alarm and what is at fault in one row."""
 
 from dataclasses import astuple, dataclass
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What a `Watchdog` says of one row.
+    """The state of a `Watchdog` after one row.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What comes from the sensors: readings that are missing, no numbers, frozen, repeated or late.
+"""Faults of sensors: readings that are missing, no numbers, frozen, repeated or late.
 
 Such readings are evidence by themselves and nothing that a detector can judge. They are counted,
 and in their place the detector is handed the last good reading.
@@ -27,7 +27,7 @@ ACTION: Final = "action"
 MISSING: Final = 3.0
 """Unusable readings of a sensor that are no alarm yet."""
 FORGOTTEN: Final = 0.05
-"""What a good reading takes off a count: faults that come and go are counted, too."""
+"""Taken off a count by a good reading: faults that come and go are counted, too."""
 FAR: Final = 1e6
 """Training standard deviations beyond which a reading is no measurement but a broken number."""
 MARGIN: Final = 0.25
@@ -43,7 +43,7 @@ NEVER: Final = np.iinfo(np.int64).max
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamLimits:
-    """What D sensors and A actions do in nominal episodes; arrays of float64.
+    """Limits of what D sensors and A actions do in nominal episodes; arrays of float64.
 
     Attributes
     ----------

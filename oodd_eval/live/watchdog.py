@@ -118,12 +118,19 @@ class Watchdog:
         """
         made = Made.make(detector, statistic, seed, horizon, parameters or {})
         training, others = list(train), list(calibration)
-        if (hours is not None and not (hours > 0 and rate)) or not (rate is None or rate > 0):
+        if rate is not None and not rate > 0:
+            raise UsageError(f"rate={rate!r}, expected observations in a second, above 0")
+        if hours is not None and not (hours > 0 and rate):
             raise UsageError(
                 f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
                 "in hours and in observations per second, above 0"
             )
-        if not (0 < alpha < 1 and 0 < (confidence or 0.5) < 1):
+        if hours is not None and confidence is not None:
+            raise UsageError(
+                f"hours={hours!r} and confidence={confidence!r}: a confidence is of a share of "
+                "episodes, alpha; a mean time between false alarms has its interval, `run_length`"
+            )
+        if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
             expected = "shares between 0 and 1"
             raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
         least = least_episodes(alpha, made.alarm, confidence) if hours is None else 1
