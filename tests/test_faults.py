@@ -336,4 +336,4 @@ def test_wind_of_table_1_and_a_graded_wind_are_one(monkeypatch):
 
 
 def test_every_plain_kind_has_a_maker():
-    assert {*faults._MAKERS} == {kind for kind in PLAIN}
+    assert {*faults._MAKERS} == set(PLAIN)
