@@ -2,9 +2,9 @@
 
     python benchmarks/ladder_fresh.py --env cartpole,acrobot --episodes 200
 
-prints, per environment, how many rungs keep a share inside their 95 % interval, and the rungs that do
-not. Rungs of a kind share their seeds, so that those outside come in groups. The exit code is 1 where
-fewer than nine in ten are inside.
+prints, per environment, how many rungs keep a share inside their 95 % interval, and the rungs that
+do not. Rungs of a kind share their seeds, so that those outside come in groups. The exit code is 1
+where fewer than nine in ten are inside.
 """
 
 import argparse
@@ -26,7 +26,7 @@ def fresh(task):
     environment, kind, name, strength, count = task
     nominal = np.array([return_of(twin) for twin in twins_of(environment, FIRST_SEED, count)])
     returns = np.array(measure(environment, kind, strength, FIRST_SEED, count))
-    # The standard error of a fresh mean: a short check is not to blame the ladder for its own noise.
+    # The standard error of a fresh mean: the noise of the check itself is not the ladder's.
     error = (returns - nominal).std(ddof=1) / np.sqrt(count) / abs(nominal.mean())
     return environment, kind, name, float(kept_shares(returns, nominal)), float(error)
 
