@@ -80,11 +80,11 @@ def crossing(shares: Floats, strengths: Floats) -> Floats:
     """
     logs = np.log(strengths)
     few = (shares < HALF - _ROUNDING).sum(axis=0)
-    above = np.clip(few, 1, max(len(logs) - 1, 1)) % len(logs)  # a single rung is above itself
+    above = np.minimum(np.maximum(few, 1), len(logs) - 1)
     below = np.maximum(above - 1, 0)
     low, high = (np.take_along_axis(shares, k[None], axis=0)[0] for k in (below, above))
-    part = (HALF - low) / np.where(high > low, high - low, 1.0)
-    found = logs[below] + np.clip(part, 0.0, 1.0) * (logs[above] - logs[below])
+    part = np.clip((HALF - low) / np.maximum(high - low, _ROUNDING), 0.0, 1.0)
+    found = logs[below] + part * (logs[above] - logs[below])
     return np.where(few == 0, -np.inf, np.where(few == len(logs), np.inf, found))
 
 

@@ -108,7 +108,7 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
 def ladder(
     curves: Mapping[str, Sequence[Point]], nulls: Mapping[str, Sequence[Point]], metric: MetricInfo
 ) -> Figure:
-    """Draw a metric against the strength and against the return that it costs, a line a row.
+    """Draw a metric against the strength and against the return that it costs, one line a detector.
 
     What chance or false alarms alone give is dotted.
     """
@@ -117,14 +117,17 @@ def ladder(
     for (name, points), colour in zip(curves.items(), COLOURS * 9, strict=False):
         for drawn, style in ((points, "o-"), (nulls.get(name, ()), ":")):
             label = name if style == "o-" else None
-            for axis, x in ((left, [p.strength for p in drawn]), (right, [p.lost for p in drawn])):
+            for axis, x in (
+                (left, [p.strength for p in drawn]),
+                (right, [100 * p.lost for p in drawn]),
+            ):
                 known = ~np.isnan(x)
                 y = percent * np.array([p.value for p in drawn])
                 axis.plot(np.array(x)[known], y[known], style, color=colour, markersize=3,
                           linewidth=1.2 if label else 0.8, label=label)  # fmt: skip
     left.set_xscale("log")
     left.set_xlabel("strength (1: costs 1 % of the return)")
-    right.set_xlabel("share of the return lost")
+    right.set_xlabel("return lost (%)")
     left.set_ylabel(metric.title + (" (%)" if metric.unit == "percent" else ""))
     if metric.unit == "percent":
         left.set_ylim(0, 102)

@@ -90,7 +90,8 @@ def _overview(board: Board, found: Thresholds) -> Table:
     note = (
         f"{_RULE} Shown is its geometric mean as a multiple {over}, over pairs of environment and "
         "anomaly, with its 95 % interval. In so many pairs it lies below or above the ladder, and "
-        f"counts as the end of the ladder. {_RUNGS}"
+        "counts as the end of the ladder: then the true multiple is farther from that of other "
+        f"rows than the one shown. {_RUNGS}"
     )
     title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
     return Table(title, header, rows, note=note)
