@@ -216,7 +216,8 @@ def test_thresholds_come_as_flat_rows():
     row = next(r for r in rows if r["row"] == "rf" and r["anomaly"] == "gravity")
     assert row == {
         "row": "rf", "environment": "ant", "anomaly": "gravity", "threshold": math.inf,
-        "low": pytest.approx(4 ** (2 / 3)), "high": math.inf, "weakest": 0.25, "strongest": 4.0, "kept99": 1.0,
+        "low": pytest.approx(4 ** (2 / 3)), "high": math.inf, "weakest": 0.25, "strongest": 4.0,
+        "kept99": 1.0,
     }  # fmt: skip
 
 
