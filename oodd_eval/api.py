@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import select
@@ -96,9 +95,9 @@ def evaluate(
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
     plan = make_plan(
-        plugins, split=opened.name, split_digest=opened.digest, detectors=names,
+        plugins, split=opened, detectors=names,
         environments=select("environment", _listed(environments), opened.environments),
-        anomalies=select("anomaly", _listed(anomalies), ANOMALIES), horizons=[horizon],
+        anomalies=select("anomaly", _listed(anomalies), opened.anomalies), horizons=[horizon],
         seeds=[seed] if isinstance(seed, int) else list(seed), parameters=given, limit=limit,
     )  # fmt: skip
     place = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)

@@ -10,7 +10,6 @@ from typing import Any
 from oodd_eval import cli
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
-from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UsageError
@@ -65,10 +64,10 @@ def run(options: argparse.Namespace) -> int:
     plugins = discovered(options)
     split = load_split(options.split)
     plan = make_plan(
-        plugins, split=split.name, split_digest=split.digest,
+        plugins, split=split,
         detectors=plugins.select(options.detector),
         environments=select("environment", options.env, split.environments),
-        anomalies=select("anomaly", options.anomaly, ANOMALIES),
+        anomalies=select("anomaly", options.anomaly, split.anomalies),
         horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
         device=options.device, limit=options.limit,
     )  # fmt: skip

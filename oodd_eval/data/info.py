@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData
 from oodd_eval.data.split import Split
 
-_KINDS = ("nominal", *ANOMALIES)
+_KINDS = ("nominal", *TABLE1)
 HEADER: Final = ("group", "trajectories", "transitions", "length", "onset", "effect", "tail",
                  "redraws", "return")  # fmt: skip
 Rows = list[list[str]]

@@ -250,7 +250,7 @@ def write_manifest(
     generator: int, versions: Mapping[str, str],
 ) -> None:  # fmt: skip
     """Write ``manifest.json`` in one step from the entries of environments, in their order."""
-    recipe = dataclasses.asdict(definition)
+    recipe = definition.recipe
     manifest = {
         "schema": SCHEMA, "name": definition.name, "definition": recipe, "generator": generator,
         "environments": environments, "digest": split_digest(environments, recipe),

@@ -13,7 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity
+from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, join_condition
+from oodd_eval.data.ladder import RUNGS
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
@@ -22,7 +23,12 @@ TRAIN: Final = "train"
 CALIBRATION: Final = "calibration"
 TWINS: Final = "test/nominal"
 
-PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
+CONDITIONS: Final = tuple(
+    join_condition(anomaly, strength) for anomaly in ANOMALIES for strength in ("", *RUNGS)
+)
+"""Every anomaly, at every strength that a suite may have, in the benchmark's order."""
+
+PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{condition}" for condition in CONDITIONS))
 """All parts in the benchmark's order. Each is a group of the environment's file."""
 
 NAMES: Final = "names"  # the group that names the columns of observations and actions
@@ -128,15 +134,16 @@ class EnvironmentData:
     """The verified content of one environment: `id` is its name, `digest` that of all its parts.
 
     `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
-    calibrate alarms, `twins` those of the test seeds. `anomalies` are the names of those in this
-    split. `sensors` and `actions` are names and units of the columns of observations and actions.
+    calibrate alarms, `twins` those of the test seeds. `anomalies` are the conditions of this split:
+    names of anomalies, with ``@`` and the strength where there are several, as in ``iid@kept99``.
+    `sensors` and `actions` are names and units of the columns of observations and actions.
     """
 
     def __init__(self, environment: str, file: h5py.File, digest: str) -> None:
         self.id, self.digest, self._file = environment, digest, file
         nominal = (TrajectorySet(file, part) for part in (TRAIN, CALIBRATION, TWINS))
         self.train, self.calibration, self.twins = nominal
-        self.anomalies = tuple(a for a in ANOMALIES if f"test/{a}" in file)
+        self.anomalies = tuple(c for c in CONDITIONS if f"test/{c}" in file)
         self.sensors, self.actions = (
             tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, file[kind][:]))
             for kind in (f"{NAMES}/sensors", f"{NAMES}/actions")
@@ -155,10 +162,14 @@ class EnvironmentData:
         UnknownNameError, SplitError
             When the benchmark has no such anomaly, or this split has no such part.
         """
-        check_known("anomaly", ANOMALIES, anomaly)
+        check_known("anomaly", CONDITIONS, anomaly)
         if f"test/{anomaly}" not in self._file:
             raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
         return AnomalousSet(self._file, f"test/{anomaly}")
+
+    def arrays(self, part: str) -> dict[str, NDArray[Any]]:
+        """Return the datasets of a part as they are stored."""
+        return {name: dataset[:] for name, dataset in self._file[part].items()}
 
     def close(self) -> None:
         """Close the file."""

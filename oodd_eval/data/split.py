@@ -12,9 +12,9 @@ from typing import Any
 import h5py
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, split_condition
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import NAMES, PARTS, EnvironmentData
+from oodd_eval.data.parts import CONDITIONS, NAMES, PARTS, TRAIN, EnvironmentData
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
 from oodd_eval.names import check_known
 
@@ -98,6 +98,22 @@ class Split:
     def environments(self) -> tuple[str, ...]:
         """Names of the environments, in the benchmark's order."""
         return tuple(e for e in ENVIRONMENTS if e in self.manifest["environments"])
+
+    def conditions(self, environment: str) -> tuple[str, ...]:
+        """Return the anomalies of an environment, each with its strength if it has several."""
+        groups = self.manifest["environments"][environment]["groups"]
+        return tuple(c for c in CONDITIONS if f"test/{c}" in groups)
+
+    @property
+    def anomalies(self) -> tuple[str, ...]:
+        """Names by which anomalies of any environment can be chosen: kinds, and conditions."""
+        every = [c for e in self.environments for c in self.conditions(e)]
+        kinds = (split_condition(condition)[0] for condition in every)
+        return tuple(dict.fromkeys((*kinds, *every)))
+
+    def train_digest(self, environment: str) -> str:
+        """Return the digest of an environment's training part: what a fit depends on."""
+        return str(self.manifest["environments"][environment]["groups"][TRAIN]["sha256"])
 
     def environment(self, name: str) -> EnvironmentData:
         """Open one environment after verifying every group's digest.

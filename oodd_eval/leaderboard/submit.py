@@ -117,7 +117,7 @@ def selected(
     if complete:
         chosen, left_out = _complete(chosen)
     order = {name: i for i, name in enumerate((*ENVIRONMENTS, *ANOMALIES))}
-    chosen.sort(key=lambda r: (order[r.environment], order[r.anomaly]))
+    chosen.sort(key=lambda r: (order[r.environment], order[r.anomaly], r.strength))
     chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
     return [_publishable(r) for r in chosen], left_out
 
@@ -126,7 +126,7 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Leave out the seeds of rows that lack cells which any row here has."""
     cells: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for r in records:
-        cells[r.cell.label].add((r.environment, r.anomaly))
+        cells[r.cell.label].add(r.place)
     every = set().union(*cells.values())
     partial = {label: len(own) for label, own in sorted(cells.items()) if own != every}
     if len(partial) == len(cells):
