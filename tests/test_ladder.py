@@ -9,8 +9,8 @@ from rich.console import Console
 
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
-from oodd_eval.data.ladder import Rung, rungs_of, strength_of
-from oodd_eval.errors import ResultsError, UnknownNameError
+from oodd_eval.data.ladder import Rung
+from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
 from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import ladder as of_records
 from oodd_eval.results.collection import Results
@@ -30,9 +30,11 @@ def small_ladder(monkeypatch):
     """Three places; in ant no gravity costs half of the return."""
 
     def small(environment, kind):
-        unit = UNITS.get((environment, kind))
+        if (environment, kind) not in UNITS:
+            raise SplitError(f"no strengths of {kind} are calibrated in {environment}")
+        unit = UNITS[environment, kind]
         names = [n for n in TIMES if (environment, kind, n) != ("ant", "gravity", "kept50")]
-        return {n: Rung(unit * TIMES[n][0], kept=TIMES[n][1]) for n in names} if unit else {}
+        return {n: Rung(unit * TIMES[n][0], kept=TIMES[n][1]) for n in names}
 
     monkeypatch.setattr(of_records, "rungs_of", small)
 
@@ -162,6 +164,8 @@ def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
     # A rung that was not run is missing.
     fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
     assert {r.environment for r in at_rung(fewer, "kept50")} == {"ant"}
+    fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
+    assert not at_rung(fewer, "kept50")
 
 
 def test_strengths_that_no_ladder_has_are_left_out():
@@ -253,9 +257,3 @@ def test_what_cannot_be_drawn_is_told():
         Results(RECORDS).plot_ladder(anomalies="fog")
     with pytest.raises(UnknownNameError, match="unknown metric 'auk'"):
         Results(RECORDS).plot_ladder(metric="auk")
-
-
-def test_a_place_without_a_ladder_has_no_rungs():
-    assert not rungs_of("nowhere", "iid")
-    with pytest.raises(UnknownNameError, match="kept99"):
-        strength_of("nowhere", "iid", "kept99")

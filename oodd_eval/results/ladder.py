@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from oodd_eval.data.ladder import Rung, rungs_of
+from oodd_eval.data.ladder import RUNGS, Rung, rungs_of
+from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE
 from oodd_eval.metrics.threshold import DetectionThreshold
@@ -22,9 +23,6 @@ FOUND: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 
 UNIT: Final = "kept99"
 """The rung whose strength is the unit where strengths of several places are put together."""
-
-RUNGS: Final = ("64th", "16th", "4th", UNIT, "kept95", "kept90", "kept75", "kept50")
-"""Names of rungs, the weakest first."""
 
 Place = tuple[str, str]
 Thresholds = dict[Setting, dict[Place, DetectionThreshold]]
@@ -38,9 +36,12 @@ def ladders(records: Iterable[Record]) -> dict[Place, dict[str, Rung]]:
             names.setdefault((r.environment, r.anomaly), set()).add(r.strength)
     found = {}
     for place, own in names.items():
-        known = rungs_of(*place)
+        try:
+            known = rungs_of(*place)
+        except (SplitError, UnknownNameError):  # nothing is calibrated: a place of somebody's own
+            continue
         order = sorted(own & known.keys(), key=lambda name: known[name].strength)
-        if order and UNIT in known:
+        if order:
             found[place] = {name: known[name] for name in order}
     return found
 
@@ -51,9 +52,9 @@ def unit(place: Place) -> float:
 
 
 def rung_names(records: Iterable[Record]) -> list[str]:
-    """Return the names of all rungs with records, the weakest first, unusual names last."""
+    """Return the names of all rungs with records, the weakest first."""
     found = {name for rungs in ladders(records).values() for name in rungs}
-    return [*(n for n in RUNGS if n in found), *sorted(found - {*RUNGS})]
+    return [name for name in RUNGS if name in found]
 
 
 def at_rung(records: Sequence[Record], name: str) -> list[Record]:
@@ -63,10 +64,10 @@ def at_rung(records: Sequence[Record], name: str) -> list[Record]:
     below it, and the records are those at its end.
     """
     chosen = {}
-    for place, rungs in ladders(records).items():
-        last = max(rungs, key=lambda n: rungs[n].strength)
-        beyond = {*RUNGS[RUNGS.index(last) + 1 :]} if last in RUNGS else set()
-        chosen[place] = last if name in beyond - rungs_of(*place).keys() else name
+    for place in ladders(records):
+        known = list(rungs_of(*place))
+        beyond = name not in known and RUNGS.index(name) > RUNGS.index(known[-1])
+        chosen[place] = known[-1] if beyond else name
     return [r for r in records if r.strength and r.strength == chosen.get(_place(r))]
 
 
