@@ -89,8 +89,8 @@ def test_the_overview_has_multiples_of_riqns_thresholds_the_lowest_first():
     rows = rows_of(table_of(RECORDS, "Detection thresholds, lower"))
     assert list(rows) == ["pe", "riqn", "rf"]
     assert rows["riqn"]["threshold"] == "1 [1, 1]"
-    assert rows["pe"]["threshold"].startswith("0.0625 [")  # a quarter of a unit against four
-    assert rows["rf"]["threshold"].startswith("1.59 [")  # 2, 2, and 4 units against 4: 4 ** (1/3)
+    assert rows["pe"]["threshold"].startswith("≤0.0625 [")  # a quarter of a unit against four
+    assert rows["rf"]["threshold"].startswith(">1.59 [")  # 2, 2, and 4 units against 4: 4 ** (1/3)
     assert [rows["rf"][c] for c in ("pairs", "below", "above")] == ["3", "0", "1"]
     assert [rows["pe"][c] for c in ("pairs", "below", "above")] == ["3", "3", "0"]
     # Where no gravity costs half of the return, the largest counts: 0.75, 0.75 and 0.25.
@@ -100,7 +100,7 @@ def test_the_overview_has_multiples_of_riqns_thresholds_the_lowest_first():
 
 def test_without_riqn_thresholds_are_in_units_of_what_costs_one_percent():
     table = table_of([r for r in RECORDS if r.detector != "riqn"], "Detection thresholds, lower")
-    assert rows_of(table)["rf"]["threshold"].startswith("6.35 [")  # (8 * 8 * 4) ** (1/3)
+    assert rows_of(table)["rf"]["threshold"].startswith(">6.35 [")  # (8 * 8 * 4) ** (1/3)
     assert "of the strength that costs 1 % of the return" in table.note
 
 

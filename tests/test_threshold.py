@@ -178,7 +178,7 @@ def test_the_mean_ratio_has_the_interval_of_a_plain_joint_bootstrap(two_environm
     made = {(who, e): DetectionThreshold.of(e, strengths[e], *outcomes[who, e])
             for who, e in outcomes}  # fmt: skip
     own, other = ([made[who, e] for e in strengths] for who in ("own", "other"))
-    mean = geometric_mean(own, [t.within for t in other])
+    mean = geometric_mean(own, other)
     logs = np.zeros(2000)
     for e, ends in strengths.items():
         least, most = math.log(ends[0]), math.log(ends[-1])
@@ -201,15 +201,21 @@ def test_a_censored_threshold_counts_as_the_end_of_its_ladder_and_is_counted():
         threshold([1, 1], [1, 1], [1, 1]), threshold([0, 0], [0, 0], [0, 0]),
         threshold([0, 0], [1, 0], [1, 1]),
     )  # fmt: skip
-    mean = geometric_mean([below, above, between, above], [0.0, math.log(2), math.log(4), 0.0])
+    mean = geometric_mean([below, above, between, above], [1.0, 2.0, 4.0, 1.0])
     assert mean.value == pytest.approx((1 * 16 / 2 * 4 / 4 * 16) ** 0.25)
-    assert mean[3:] == (4, 1, 2)
+    assert mean[3:] == (4, 1, 2, "~")
+    others = below, above, between, 1.0
+    for own, sides in ((below, ["", "≤", "≤", "≤"]), (above, [">", "", ">", ">"]),
+                       (between, [">", "≤", "", ""])):  # fmt: skip
+        assert [geometric_mean([own], [other]).side for other in others] == sides
+    # Both below: either may be the lower one.
+    assert geometric_mean([below], [threshold([1, 1], [1, 1], [1, 1])]).side == "~"
 
 
 def test_a_row_is_its_own_multiple_without_doubt():
     rng = np.random.default_rng(0)
     own = of("ant", STRENGTHS, drawn_at(rng, rng.normal(size=9), STRENGTHS))
-    assert geometric_mean([own], [own.within])[:3] == (1, 1, 1)
+    assert geometric_mean([own], [own])[:3] == (1, 1, 1)
 
 
 def test_episodes_are_drawn_together_for_all_detectors():
@@ -220,9 +226,7 @@ def test_episodes_are_drawn_together_for_all_detectors():
     other = drawn_at(rng, taken + 0.5, strengths, noise=0.1)
     shuffled = other[:, :, rng.permutation(30)]
     own = of("ant", strengths, found)
-    paired, apart = (
-        geometric_mean([own], [of("ant", strengths, x).within]) for x in (other, shuffled)
-    )
+    paired, apart = (geometric_mean([own], [of("ant", strengths, x)]) for x in (other, shuffled))
     assert paired.value == apart.value
     assert math.log(paired.high / paired.low) < 0.75 * math.log(apart.high / apart.low)
 

@@ -154,6 +154,11 @@ class DetectionThreshold:
         return math.exp(low), math.exp(high)
 
     @property
+    def beyond(self) -> int:
+        """-1 where it is below the ladder, 1 where it is above it, else 0."""
+        return int(np.sign(self.logs[0])) if np.isinf(self.logs[0]) else 0
+
+    @property
     def within(self) -> Floats:
         """`logs`, those beyond the ladder replaced by the end that they are beyond."""
         return np.clip(self.logs, math.log(self.weakest), math.log(self.strongest))
@@ -174,7 +179,8 @@ class MeanThreshold(NamedTuple):
     """The geometric mean of thresholds, each over a unit of its own, with its 95 % interval.
 
     `below` and `above` of its `pairs` of environment and anomaly are censored, and count as the
-    end of the ladder that they are beyond.
+    end of the ladder that they are beyond. `side` says what that makes of the mean: ``"≤"`` where
+    the true one is at most this, ``">"`` where it is more, ``"~"`` where it may be either.
     """
 
     value: float
@@ -183,10 +189,20 @@ class MeanThreshold(NamedTuple):
     pairs: int
     below: int
     above: int
+    side: str
+
+    def text(self, *, interval: bool = True) -> str:
+        """Return the mean as printed.
+
+        >>> MeanThreshold(0.5, 0.25, 1.0, pairs=7, below=1, above=0, side="≤").text()
+        '≤0.5 [0.25, 1]'
+        """
+        ends = f" [{self.low:.3g}, {self.high:.3g}]" if interval else ""
+        return f"{self.side}{self.value:.3g}{ends}"
 
 
 def geometric_mean(
-    thresholds: Sequence[DetectionThreshold], units: Sequence[Floats | float]
+    thresholds: Sequence[DetectionThreshold], units: Sequence[DetectionThreshold | float]
 ) -> MeanThreshold:
     """Return the geometric mean of the ratios of thresholds to units.
 
@@ -195,16 +211,21 @@ def geometric_mean(
     thresholds
         At least one, none of them undefined.
     units
-        Logarithms of the units: strengths, or `DetectionThreshold.within` of another detector at
-        the same places, whose resamples are then paired with these.
+        As many strengths, or thresholds of another detector at the same places, whose resamples are
+        then paired with these.
     """
-    pairs = zip(thresholds, units, strict=True)
-    logs = np.mean([own.within - unit for own, unit in pairs], axis=0)
-    first = np.array([own.logs[0] for own in thresholds])
+    ratios, censored, sides = [], [], set()
+    for own, unit in zip(thresholds, units, strict=True):
+        other = unit.within if isinstance(unit, DetectionThreshold) else math.log(unit)
+        ratios.append(own.within - other)
+        censored.append(own.beyond)
+        if unit is not own:
+            sides |= {own.beyond, -unit.beyond if isinstance(unit, DetectionThreshold) else 0}
+    logs = np.mean(ratios, axis=0)
     low, high = _ends(logs)
     return MeanThreshold(
-        math.exp(logs[0]), math.exp(low), math.exp(high), len(first),
-        int((first == -np.inf).sum()), int((first == np.inf).sum()),
+        math.exp(logs[0]), math.exp(low), math.exp(high), len(ratios), censored.count(-1),
+        censored.count(1), "~" if {-1, 1} <= sides else "≤" * (-1 in sides) + ">" * (1 in sides),
     )  # fmt: skip
 
 

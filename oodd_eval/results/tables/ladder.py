@@ -27,6 +27,9 @@ _RULE: Final = (
     "The threshold is the weakest strength that a detector finds within 100 rows in half of the "
     "episodes, where at most 5 % of nominal episodes have an alarm."
 )
+_SIDES: Final = (
+    "What that hides is marked: the true mean is at most this (≤), more (>), or either (~)."
+)
 _RUNGS: Final = (
     "At keptN the policy keeps N % of its return; 4th, 16th and 64th are those parts of kept99's "
     "strength. A ladder that ends below a rung counts there with its strongest one."
@@ -83,15 +86,15 @@ def _overview(board: Board, found: Thresholds) -> Table:
         mean = means[entry]
         figures = [UNDEFINED, "0", "", ""]
         if mean:
-            figures = [_text(mean) + "*" * (mean.pairs < most), *map(str, mean[3:])]
+            counts = mean.pairs, mean.below, mean.above
+            figures = [mean.text() + "*" * (mean.pairs < most), *map(str, counts)]
         rows.append([str(entry), *figures, *shares[entry]])
     over = f"of {REFERENCE}'s" if reference else "of the strength that costs 1 % of the return"
     header = ["detector", "threshold", "pairs", "below", "above", *names]
     note = (
         f"{_RULE} Shown is its geometric mean as a multiple {over}, over pairs of environment and "
         "anomaly, with its 95 % interval. In so many pairs it lies below or above the ladder, and "
-        "counts as the end of the ladder: then the true multiple is farther from that of other "
-        f"rows than the one shown. {_RUNGS}"
+        f"counts as the end of the ladder. {_SIDES} {_RUNGS}"
     )
     title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
     return Table(title, header, rows, note=note)
@@ -111,12 +114,12 @@ def _by_kind(board: Board, found: Thresholds, *, intervals: bool) -> Table:
     kinds = [k for k in board.anomalies if any(k == kind for p in found.values() for _, kind in p)]
     rows = []
     for entry in (e for e in board.entries if e in found):
-        own = [{p: t for p, t in found[entry].items() if p[1] == k} for k in kinds]
-        rows.append([str(entry), *(_bounded(_mean(o, {}), intervals=intervals) for o in own)])
+        own = (_mean({p: t for p, t in found[entry].items() if p[1] == k}, {}) for k in kinds)
+        rows.append([str(entry), *(mean.text(interval=intervals) if mean else "" for mean in own)])
     title = "Detection thresholds by anomaly, in units of the strength that costs 1 % of the return"
     note = (
-        f"{_RULE} Geometric means over environments; ≤ marks a mean with thresholds below the "
-        "ladder, which is at most this, > one with some above it, ~ one with both."
+        f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts as "
+        f"its end. {_SIDES}"
     )
     return Table(title, ["detector", *kinds], rows, note=note)
 
@@ -137,21 +140,8 @@ def _mean(
 ) -> MeanThreshold | None:
     """Return the mean over the places of a reference, or over all, in units, without one."""
     chosen = [p for p in own if p in reference] if reference else [*own]
-    units = [reference[p].within if reference else math.log(unit(p)) for p in chosen]
+    units = [reference[p] if reference else unit(p) for p in chosen]
     return geometric_mean([own[p] for p in chosen], units) if chosen else None
-
-
-def _text(mean: MeanThreshold) -> str:
-    return f"{mean.value:.3g} [{mean.low:.3g}, {mean.high:.3g}]"
-
-
-def _bounded(mean: MeanThreshold | None, *, intervals: bool) -> str:
-    """Return a mean with what its censored thresholds make of it; nothing without one."""
-    if mean is None:
-        return ""
-    mark = {(False, False): "", (True, False): "≤", (False, True): ">", (True, True): "~"}
-    text = _text(mean) if intervals else f"{mean.value:.3g}"
-    return mark[mean.below > 0, mean.above > 0] + text
 
 
 def _single(own: DetectionThreshold | None, *, intervals: bool) -> str:
