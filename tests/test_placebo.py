@@ -1,11 +1,9 @@
 """An anomaly that changes nothing is found as little as its twin, by every offered detector."""
 
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import torch
-from helpers_split import make_group
+from helpers_split import make_group, make_split
 from test_conformance import PLUGINS, SMALL
 
 from oodd_eval import evaluate
@@ -48,11 +46,8 @@ def placebo(tmp_path_factory):
     return directory
 
 
-@pytest.mark.parametrize("name", PLUGINS.offers)
-def test_what_equals_its_twin_is_found_exactly_as_often(name, placebo):
-    (record,) = evaluate(
-        PLUGINS.offer(name).spec, placebo, anomalies="gravity", parameters=SMALL.get(name)
-    )
+def must_be_like_its_twins(record):
+    """Every metric of a cell is what its nominal twins give, episode by episode."""
     assert record.ok
     for metric in ("auc_matched", "auc_smoothed"):
         values, counted = map(np.array, record.per_trajectory[metric])
@@ -65,26 +60,20 @@ def test_what_equals_its_twin_is_found_exactly_as_often(name, placebo):
     assert record.value("auc_unpaired") == record.value("auc_placebo")
 
 
+@pytest.mark.parametrize("name", PLUGINS.offers)
+def test_what_equals_its_twin_is_found_exactly_as_often(name, placebo):
+    settings = {"anomalies": "gravity", "parameters": SMALL.get(name)}
+    (record,) = evaluate(PLUGINS.offer(name).spec, placebo, **settings)
+    must_be_like_its_twins(record)
+
+
 def test_some_of_these_twins_raise_alarms(placebo):
     (record,) = evaluate("persistence", placebo, anomalies="gravity")
-    found = record.value("found_within_100_at_5pct")
-    assert found == record.value("found_within_100_null_at_5pct") > 0
+    assert record.value("found_within_100_null_at_5pct") > 0
 
 
-class Remembering:
-    """Scores an episode higher when it comes again; its memory is outside of the fitted state."""
-
-    seen: ClassVar = set()
-
-    def fit(self, nominal):
-        self.seen.clear()
-
-    def score(self, x):
-        again = x.observations.tobytes() in self.seen
-        self.seen.add(x.observations.tobytes())
-        return np.abs(x.observations).max(axis=1).astype(float) + again
-
-
-def test_a_detector_that_remembers_is_caught(placebo):
-    (record,) = evaluate(Remembering(), placebo, anomalies="gravity")
-    assert record.value("auc_matched") != 0.5
+def test_what_differs_from_its_twin_is_not_taken_for_it(tmp_path):
+    split = make_split(tmp_path / "plain", [ENVIRONMENT], calibration=40)
+    (record,) = evaluate("persistence", split, anomalies="gravity")
+    with pytest.raises(AssertionError):
+        must_be_like_its_twins(record)
