@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.monotone import isotonic
 from oodd_eval.metrics.bootstrap import LEVEL, drawn_seeds, shared_weights
 
 Floats = NDArray[np.float64]
@@ -27,34 +28,6 @@ HALF: Final = 0.5
 
 _NOTHING: Final = 1e-9  # weight of a rung without episodes: it takes the share of the rung below
 _ROUNDING: Final = 1e-8  # what such weights may take off a share
-
-
-def isotonic(found: Floats, total: Floats) -> Floats:
-    """Return the non-decreasing shares that are nearest to `found` / `total`, weighted by `total`.
-
-    Parameters
-    ----------
-    found, total
-        Numbers of episodes in which an anomaly was found, and of all, by rung: shape (K, ...). A
-        total may not be 0.
-
-    Returns
-    -------
-    Floats
-        Of shape (K, ...): at rung k the largest, over the rungs i up to k, of the smallest pooled
-        share of i to j, over the rungs j from k on. That is what pooling adjacent violators gives.
-
-    Examples
-    --------
-    >>> isotonic(np.array([1.0, 3.0, 1.0, 4.0]), np.array([4.0, 4.0, 4.0, 4.0])).tolist()
-    [0.25, 0.5, 0.5, 1.0]
-    """
-    shares = np.zeros_like(found)
-    for i in range(len(shares)):
-        pooled = found[i:].cumsum(axis=0) / total[i:].cumsum(axis=0)
-        smallest = np.minimum.accumulate(pooled[::-1], axis=0)[::-1]
-        np.maximum(shares[i:], smallest, out=shares[i:])
-    return shares
 
 
 def crossing(shares: Floats, strengths: Floats) -> Floats:
