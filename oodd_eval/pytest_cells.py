@@ -177,7 +177,8 @@ def _plan(
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
     plan = make_plan(
         plugins, split=split.name, split_digest=split.digest, detectors=names,
-        environments=environments, horizons=sorted(horizons) or [1], seeds=sorted(seeds) or [0],
+        environments=environments, anomalies=[*split.anomalies(*environments)],
+        held=split.anomalies, horizons=sorted(horizons) or [1], seeds=sorted(seeds) or [0],
     )  # fmt: skip
     labels = {cell.label for cell in cells}
     wanted = {str(cell) for cell in plan.cells if not reference or cell.label in labels}

@@ -57,14 +57,14 @@ def _detectors(plugins: Plugins) -> Rows:
 
 def _splits() -> Rows:
     # Listing is quick: these need numpy.
-    from oodd_eval.data.layout import read_manifest
+    from oodd_eval.data.layout import part_sizes, read_manifest
     from oodd_eval.data.split import split_directories
 
     here = split_directories()
     for name in dict.fromkeys([*SPLITS, *here]):
         if name in here:
             manifest = read_manifest(here[name])
-            sizes, digest = manifest["definition"], manifest["digest"][:12]
+            sizes, digest = part_sizes(manifest), manifest["digest"][:12]
             where = f"{len(manifest['environments'])} environments, digest {digest}"
         else:
             sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"

@@ -6,7 +6,7 @@ The module needs neither simulators nor data. Values of the paper are from Danes
 import functools
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -121,11 +121,31 @@ SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 OWN_SEED_BASES: Final = range(10, 900)
 """Seed bases for splits of one's own: published splits have those below, policies those above."""
 
+NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
+"""Names of environments and anomalies: they become names of files and groups."""
+
 BRIEF_TAIL: Final = 20
 """A part whose episodes last fewer transitions beyond their onsets, in the median, is *brief*."""
 
 PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
 """Seed offset of each part within the million seeds of a split's base."""
+
+
+def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
+    """Return names, each once: known ones in their order, then the others as they come.
+
+    A condition, such as ``"iid@kept90"``, has the place of its anomaly.
+
+    >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
+    ['cartpole', 'hopper', 'mine']
+    """
+    place = {name: i for i, name in enumerate(known)}
+    return sorted(dict.fromkeys(names), key=lambda n: place.get(n.partition("@")[0], len(place)))
+
+
+def title_of(environment: str) -> str:
+    """Return the paper's title of an environment; of one's own, its name."""
+    return ENVIRONMENTS[environment].title if environment in ENVIRONMENTS else environment
 
 
 @functools.cache

@@ -13,21 +13,33 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity
+from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, in_order
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
-from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
 TRAIN: Final = "train"
 CALIBRATION: Final = "calibration"
 TWINS: Final = "test/nominal"
 
-PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
-"""All parts in the benchmark's order. Each is a group of the environment's file."""
+NOMINAL: Final = (TRAIN, CALIBRATION, TWINS)
+"""The nominal parts, which every environment has. Each part is a group of its file."""
 
 NAMES: Final = "names"  # the group that names the columns of observations and actions
 _ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
+
+
+def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
+    """Return the anomalies among groups such as ``"test/iid"``, in the benchmark's order."""
+    tests = (group.removeprefix("test/") for group in groups if group not in NOMINAL)
+    return tuple(in_order(sorted(tests), ANOMALIES))
+
+
+def groups_in(file: h5py.File) -> list[str]:
+    """Return the parts that an environment's file has."""
+    tests = file.get("test")
+    inner = [f"test/{name}" for name in tests] if isinstance(tests, h5py.Group) else []
+    return [*(part for part in (TRAIN, CALIBRATION) if part in file), *inner]
 
 
 class TrajectorySet(TrajectorySequence):
@@ -129,14 +141,17 @@ class EnvironmentData:
 
     `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
     calibrate alarms, `twins` those of the test seeds. `anomalies` are the names of those in this
-    split. `sensors` and `actions` are names and units of the columns of observations and actions.
+    split. `sensors` and `actions` are names and units of the columns of observations and actions;
+    an action that is `discrete` is a one-hot row.
     """
 
-    def __init__(self, environment: str, file: h5py.File, digest: str) -> None:
-        self.id, self.digest, self._file = environment, digest, file
-        nominal = (TrajectorySet(file, part) for part in (TRAIN, CALIBRATION, TWINS))
+    def __init__(
+        self, environment: str, file: h5py.File, digest: str, *, discrete: bool = False
+    ) -> None:
+        self.id, self.digest, self.discrete, self._file = environment, digest, discrete, file
+        nominal = (TrajectorySet(file, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
-        self.anomalies = tuple(a for a in ANOMALIES if f"test/{a}" in file)
+        self.anomalies = anomalies_in(groups_in(file))
         self.sensors, self.actions = (
             tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, file[kind][:]))
             for kind in (f"{NAMES}/sensors", f"{NAMES}/actions")
@@ -152,12 +167,10 @@ class EnvironmentData:
 
         Raises
         ------
-        UnknownNameError, SplitError
-            When the benchmark has no such anomaly, or this split has no such part.
+        UnknownNameError
+            When this split has no such anomaly.
         """
-        check_known("anomaly", ANOMALIES, anomaly)
-        if f"test/{anomaly}" not in self._file:
-            raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
+        check_known(f"anomaly of {Path(self._file.filename).name}", self.anomalies, anomaly)
         return AnomalousSet(self._file, f"test/{anomaly}")
 
     def close(self) -> None:

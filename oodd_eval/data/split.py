@@ -12,11 +12,17 @@ from typing import Any
 import h5py
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, Group, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import NAMES, PARTS, EnvironmentData
-from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
-from oodd_eval.names import check_known
+from oodd_eval.data.parts import NAMES, EnvironmentData, groups_in
+from oodd_eval.errors import (
+    DigestError,
+    SplitError,
+    SplitNotFoundError,
+    UnknownNameError,
+    UsageError,
+)
+from oodd_eval.names import check_known, select
 
 SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
 
@@ -96,8 +102,43 @@ class Split:
 
     @property
     def environments(self) -> tuple[str, ...]:
-        """Names of the environments, in the benchmark's order."""
-        return tuple(e for e in ENVIRONMENTS if e in self.manifest["environments"])
+        """Names of the environments: the benchmark's in its order, then others in theirs."""
+        return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
+
+    def anomalies(self, *environments: str) -> dict[str, Group]:
+        """Return the groups of all anomalies by name, in the order of `environments`.
+
+        Parameters
+        ----------
+        *environments
+            Those whose anomalies are wanted; by default all.
+
+        Returns
+        -------
+        dict
+            Empty for a split with nominal episodes only.
+        """
+        entries = self.manifest["environments"]
+        found: dict[str, Group] = {}
+        for environment in environments or self.environments:
+            found |= layout.anomaly_groups(entries[environment])
+        return {name: found[name] for name in in_order(found, ANOMALIES)}
+
+    def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
+        """Return the environments and anomalies that comma lists, globs or ``"all"`` select.
+
+        Raises
+        ------
+        UsageError
+            When something is unknown, or the environments have nominal episodes only.
+        """
+        chosen = select("environment", environments, self.environments)
+        if not (known := self.anomalies(*chosen)):
+            raise UsageError(
+                f"split {self.name} has no anomalous episodes of {', '.join(chosen)}, expected "
+                "some to evaluate detectors on: import them, or fit a watchdog on what there is"
+            )
+        return chosen, select("anomaly", anomalies, known)
 
     def environment(self, name: str) -> EnvironmentData:
         """Open one environment after verifying every group's digest.
@@ -130,8 +171,10 @@ class Split:
                     "fetch it again"
                 )
             stack.pop_all()
-        digest = layout.environment_digest(self.manifest["environments"][name])
-        return EnvironmentData(name, file, digest)
+        entry = self.manifest["environments"][name]
+        digest = layout.environment_digest(entry)
+        discrete = layout.discrete_actions(name, entry)
+        return EnvironmentData(name, file, digest, discrete=discrete)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
@@ -165,8 +208,8 @@ class Split:
         short = Path(file.filename).name
         entry = self.manifest["environments"][name]
         expected = {group: str(found["sha256"]) for group, found in entry["groups"].items()}
-        held = [part for part in PARTS if part in file]
-        if {*held, *expected} != {*expected} & {*PARTS}:
+        held = groups_in(file)
+        if {*held} - {*expected}:
             raise SplitError(f"{short} holds the groups {held}, expected {[*expected]}")
         for group, digest in (expected | {NAMES: layout.names_digest(entry)}).items():
             if group not in file:

@@ -3,11 +3,11 @@
 From names to a plan: settings are resolved and keys are made here, once.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
-from oodd_eval.data.facts import ANOMALIES, PROTOCOL
+from oodd_eval.data.facts import ANOMALIES, PROTOCOL, Group
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
 from oodd_eval.plugins.discovery import Offer, Plugins
@@ -17,6 +17,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.scoring.keys import fit_key, scores_key, source_digest
 
 DEVICES: Final = ("auto", "cpu", "cuda")
+_GROUPS: Final[Mapping[str, Group]] = {a.id: a.group for a in ANOMALIES.values()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +56,15 @@ class Unit:
 class Plan:
     """All units of a run, in the order in which they are begun and recorded.
 
-    Of each part the first `limit` trajectories are used; None means all.
+    Of each part the first `limit` trajectories are used; None means all. `groups` are those of
+    anomalies by name.
     """
 
     split: str
     split_digest: str
     units: tuple[Unit, ...]
     limit: int | None = None
+    groups: Mapping[str, Group] = field(default_factory=lambda: _GROUPS)
 
     @property
     def cells(self) -> list[Cell]:
@@ -88,7 +91,7 @@ class Plan:
             plugin_source=unit.source, parameters=dict(unit.shown),
             overrides=unit.setting.overrides, inputs=unit.inputs, alarm=unit.alarm,
             deterministic=unit.deterministic, environment=unit.environment, anomaly=anomaly,
-            group=ANOMALIES[anomaly].group,
+            group=self.groups[anomaly],
             split=self.split, split_digest=self.split_digest, limit=self.limit,
             scores=unit.scores_key, protocol=PROTOCOL, **outcome,
         )  # fmt: skip
@@ -99,9 +102,12 @@ def make_plan(
     environments: Sequence[str], anomalies: Sequence[str] = tuple(ANOMALIES),
     horizons: Sequence[int] = (1,), seeds: Sequence[int] = (0,),
     parameters: Mapping[str, Any] | None = None, limit: int | None = None,
-    device: str | None = None,
+    device: str | None = None, held: Callable[..., Mapping[str, Group]] = lambda *_: _GROUPS,
 ) -> Plan:  # fmt: skip
     """Lay out every unit, environments outermost; the cells are the product of all names.
+
+    `held` is `Split.anomalies` of the split: what an environment lacks is left out. By default
+    each has the benchmark's.
 
     `device` is the value of the parameter ``device`` for those detectors that have it. What is
     unknown or refused, and a device that no detector has, raises `UsageError`.
@@ -117,13 +123,14 @@ def make_plan(
         names = ", ".join(offer.spec.name for offer in offers)
         raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
     units = tuple(
-        make_unit(offer, own, environment, anomalies, horizon, seed, split_digest, limit)
+        make_unit(offer, own, environment, wanted, horizon, seed, split_digest, limit)
         for environment in environments
+        if (wanted := [a for a in anomalies if a in held(environment)])
         for offer, own in zip(offers, given, strict=True)
         for horizon in horizons
         for seed in seeds
     )
-    return Plan(split, split_digest, units, limit)
+    return Plan(split, split_digest, units, limit, held(*environments))
 
 
 def make_unit(

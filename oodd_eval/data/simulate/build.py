@@ -28,7 +28,7 @@ from oodd_eval.data import layout
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, PART_OFFSETS, SplitDefinition
 from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.layout import Blocks
-from oodd_eval.data.parts import PARTS, TWINS
+from oodd_eval.data.parts import NOMINAL, TWINS
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import (
     GENERATOR_VERSION,
@@ -104,7 +104,8 @@ def build_split(
         todo = {e: planned + further[e] for e, planned in todo.items()}
     for environment, chunks in todo.items():
         files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
-        groups = ((part, _joined(part, files[part.split("/")[0]])) for part in PARTS)
+        parts = *NOMINAL, *(f"test/{anomaly}" for anomaly in ANOMALIES)
+        groups = ((part, _joined(part, files[part.split("/")[0]])) for part in parts)
         target = directory / f"{environment}.h5"
         info = ENVIRONMENTS[environment]
         entries[environment] = layout.write_environment(

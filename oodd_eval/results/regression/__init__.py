@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
@@ -356,7 +356,9 @@ def write_reference(records: Iterable[Record], path: Path | str) -> None:
 
     Records stand in the order of the benchmark, whatever the order in which cells ran.
     """
-    environments, anomalies = list(ENVIRONMENTS), list(ANOMALIES)
+    records = list(records)
+    environments = in_order((r.environment for r in records), ENVIRONMENTS)
+    anomalies = in_order((r.anomaly for r in records), ANOMALIES)
 
     def order(r: Record) -> tuple[str, str, int, int, str]:
         place = environments.index(r.environment), anomalies.index(r.anomaly)
