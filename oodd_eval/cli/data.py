@@ -1,19 +1,26 @@
-"""``oodd-eval data``: build, verify, fetch and export splits, and describe them."""
+"""``oodd-eval data``: build, import, verify, fetch and export splits, and describe them."""
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from oodd_eval.cli import Parser, at_least
+from oodd_eval.cli import Parser, at_least, value
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.data.export import export as export_split
-from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
+from oodd_eval.data.facts import (
+    ENVIRONMENTS,
+    OWN_SEED_BASES,
+    SPLITS,
+    Quantity,
+    SplitDefinition,
+)
 from oodd_eval.data.fetch import fetch as fetch_split
+from oodd_eval.data.importing import import_data
 from oodd_eval.data.info import describe
-from oodd_eval.data.simulate.build import build_split
+from oodd_eval.data.logs import FORMATS, quantity
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import select
+from oodd_eval.names import assignment, select
 
 
 def define(parser: Parser) -> None:
@@ -35,6 +42,27 @@ def define(parser: Parser) -> None:
     add("--seed-base", type=int, metavar="K", help="base of the seeds, apart from published ones")
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
     add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
+    add("--output", type=Path, metavar="DIR", help=place)
+    add = action("import", "import logs of your own as an environment of a split").options(
+        import_logs,
+        "data import plant --env pump --format csv --train logs/a --calibration logs/b",
+    )
+    add("name", help="of a split of your own; one that was imported gets a further environment")
+    add("--env", required=True, metavar="NAME", help="name of the environment")
+    add("--format", required=True, choices=[*FORMATS], help="of the files")
+    add("--train", required=True, type=Path, metavar="PLACE", help="nominal episodes to fit on")
+    add("--calibration", required=True, type=Path, metavar="PLACE",
+        help="nominal episodes for the thresholds of alarms")
+    add("--test", type=Path, metavar="DIR",
+        help="the place 'nominal' of twins, and one for each anomaly, named as the anomaly")
+    add("--sensors", type=value(_quantities), default=(), metavar="NAME[UNIT],...",
+        help="names of the sensors, if the files do not name them")
+    add("--actions", type=value(_quantities), default=(), metavar="NAME[UNIT],...",
+        help="names of the actions")
+    add("--discrete", type=at_least(1), default=0, metavar="N",
+        help="actions are whole numbers from 0 to N - 1")
+    add("--group", action="append", default=[], metavar="ANOMALY=sensor|dynamics",
+        type=value(assignment), help="group of an anomaly of your own (default: dynamics)")
     add("--output", type=Path, metavar="DIR", help=place)
     action("verify", "compare a split with its digests").options(
         verify, "data verify mini"
@@ -68,6 +96,9 @@ def record_split(
     environments: Sequence[str] = tuple(ENVIRONMENTS), output: Path | None = None,
 ) -> None:  # fmt: skip
     """Record a split, by default of all environments and where splits are found."""
+    # Other actions need no simulators.
+    from oodd_eval.data.simulate.build import build_split
+
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
     build_split(definition, directory, environments=environments, jobs=options.jobs,
@@ -98,6 +129,23 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
     if not name.isprintable() or set(name) & set("/@: "):
         raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
     return SplitDefinition(name, train, calibration, test, cap, seed_base)
+
+
+def import_logs(options: argparse.Namespace) -> int:
+    """Carry out ``data import``."""
+    notes = make_console(quiet=options.verbosity < 0)
+    split = import_data(
+        options.name, options.env, form=options.format, train=options.train,
+        calibration=options.calibration, test=options.test, sensors=options.sensors,
+        actions=options.actions, discrete=options.discrete, groups=dict(options.group),
+        output=options.output, progress=lambda part: notes.print(f"{options.env} {part}"),
+    )  # fmt: skip
+    make_console().print(f"split {split.name}, digest {split.digest}, in {split.path}")
+    return 0
+
+
+def _quantities(text: str) -> tuple[Quantity, ...]:
+    return tuple(map(quantity, text.split(",")))
 
 
 def verify(options: argparse.Namespace) -> int:

@@ -168,7 +168,7 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
     """Raise unless a file is whole in itself, and all in it is what the manifest says."""
     split.environment(environment).close()
     with h5py.File(file, "r") as stored:
-        if elsewhere := stored.visititems_links(_elsewhere) or stored.visititems(_elsewhere):
+        if elsewhere := pointing_elsewhere(stored):
             raise SplitError(f"{file.name} {elsewhere}: refused")
         for name, group in entry["groups"].items():
             found = (len(stored[name]["seeds"]), int(stored[name]["offsets"][-1]))
@@ -178,6 +178,12 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
                     f"{file.name}, {name} has {found[0]} trajectories with {found[1]} transitions, "
                     f"expected {named[0]} with {named[1]}"
                 )
+
+
+def pointing_elsewhere(file: h5py.File) -> str | None:
+    """Say what in a file leads out of it; None where nothing does."""
+    found: str | None = file.visititems_links(_elsewhere) or file.visititems(_elsewhere)
+    return found
 
 
 def _elsewhere(name: str, item: object) -> str | None:

@@ -265,7 +265,7 @@ def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: 
     dataset = group.create_dataset(name, content.shape, dtype, track_times=False, **packing)
     # Whole chunks, so that each is compressed once.
     step, start = dataset.chunks[0] if dataset.chunks else 1, 0
-    for block in content.of_length(step * max(1, _BLOCK // (row * step))):
+    for block in content.of_length(step * max(1, _BLOCK // max(1, row * step))):
         dataset[start : start + len(block)] = block.astype(dtype, copy=False)
         start += len(block)
 
