@@ -13,7 +13,7 @@ from oodd_riqn import riqn
 from tabulate import tabulate
 
 from oodd_eval import load_split
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import TABLE1
 
 UPDATES = 30
 
@@ -29,7 +29,7 @@ def main():
     split, table = load_split("mini"), []
     for name in ("cartpole", "acrobot", "hopper"):
         data = split.environment(name)
-        train, test = list(data.train), [t for a in ANOMALIES for t in data.anomalous(a)]
+        train, test = list(data.train), [t for a in TABLE1 for t in data.anomalous(a)]
         steps = sum(t.transitions for t in test)
         made = {
             t: riqn(seed=0, horizon=1, trunk=t, updates=UPDATES) for t in ("shared", "per-feature")

@@ -26,7 +26,7 @@ from oodd_torch.forecast import Forecaster, arrange
 from tabulate import tabulate
 
 from oodd_eval import load_split
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.metrics.auc import auc_same_times
 from oodd_eval.names import select
 
@@ -82,7 +82,7 @@ def evaluated(data, detector, samples):
 
     twins = scored(data.twins)
     cells = []
-    for anomaly in ANOMALIES:
+    for anomaly in TABLE1:
         group = data.anomalous(anomaly)
         pairs = zip(scored(group), twins, strict=True)
         effects = list(group.effects)

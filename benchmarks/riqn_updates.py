@@ -19,7 +19,7 @@ from riqn_scores import matched_auc
 from tabulate import tabulate
 
 from oodd_eval import load_split
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.names import select
 
 
@@ -27,7 +27,7 @@ def auc_of(detector, data):
     """Return the mean over anomalies of matched AUC (%)."""
     twins = detector.score_many(list(data.twins))
     cells = []
-    for anomaly in ANOMALIES:
+    for anomaly in TABLE1:
         group = data.anomalous(anomaly)
         effects = [max(e, 1) for e in group.effects]
         cells.append(matched_auc(detector.score_many(list(group)), twins, effects))

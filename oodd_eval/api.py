@@ -95,8 +95,8 @@ def evaluate(
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
     where, kinds = opened.select(_listed(environments), _listed(anomalies))
     plan = make_plan(
-        plugins, split=opened.name, split_digest=opened.digest, detectors=names,
-        environments=where, anomalies=kinds, held=opened.anomalies, horizons=[horizon],
+        plugins, split=opened, detectors=names, environments=where, anomalies=kinds,
+        horizons=[horizon],
         seeds=[seed] if isinstance(seed, int) else list(seed), parameters=given, limit=limit,
     )  # fmt: skip
     place = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)

@@ -176,9 +176,8 @@ def _plan(
         environments = select("environment", envs, split.environments)
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
     plan = make_plan(
-        plugins, split=split.name, split_digest=split.digest, detectors=names,
-        environments=environments, anomalies=[*split.anomalies(*environments)],
-        held=split.anomalies, horizons=sorted(horizons) or [1], seeds=sorted(seeds) or [0],
+        plugins, split=split, detectors=names, environments=environments,
+        horizons=sorted(horizons) or [1], seeds=sorted(seeds) or [0],
     )  # fmt: skip
     labels = {cell.label for cell in cells}
     wanted = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
@@ -187,7 +186,7 @@ def _plan(
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
     found = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
-    options = {"detector": record.detector, "env": record.environment, "anomaly": record.anomaly,
+    options = {"detector": record.detector, "env": record.environment, "anomaly": record.condition,
                "split": record.split, "horizon": record.horizon, "seed": record.seed}  # fmt: skip
     command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
     return f"{found}\nthe reference is {where}; to run this cell alone:\n{command}"

@@ -7,7 +7,7 @@ Nothing is simulated, so a split takes milliseconds.
 
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SplitDefinition
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
 from oodd_eval.data.layout import (
     pack_parameters,
     write_environment,
@@ -84,7 +84,7 @@ def make_split(
         }
         groups = {p: make_group(environment, seeds[p], length) for p in ("train", "calibration")}
         groups[TWINS] = make_group(environment, seeds["test"], length)
-        for anomaly in ANOMALIES:
+        for anomaly in TABLE1:
             groups[f"test/{anomaly}"] = make_group(environment, seeds["test"], length, anomaly)
         info = ENVIRONMENTS[environment]
         entries[environment] = write_environment(

@@ -32,7 +32,7 @@ def records(tmp_path_factory):
         install_adversaries(patched, tmp_path_factory.mktemp("adversaries"), code)
         split = load_split("mini")
         plan = make_plan(
-            discover(), split=split.name, split_digest=split.digest,
+            discover(), split=split,
             detectors=list(adversaries.ADVERSARIES), environments=[ENVIRONMENT],
         )  # fmt: skip
         found = run(plan, split, discover(), RunSettings(), None).records

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from oodd_eval import load_split
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, PROTOCOL
+from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
 from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression
@@ -664,7 +664,7 @@ def test_the_references_of_this_project_are_of_the_split_that_ships(name):
     whole = {
         f"mini/{e}/{a}::{detector}[h=1,seed=0]"
         for e in ENVIRONMENTS
-        for a in ANOMALIES
+        for a in TABLE1
         for detector in REFERENCES[name][1]
     }
     assert whole == set(map(str, cells))
@@ -689,7 +689,7 @@ def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
             ran |= {
                 f"mini/{e}/{a}::{detector}[h=1,seed=0]"
                 for e in names
-                for a in ANOMALIES
+                for a in TABLE1
                 for detector in options.detector.split(",")
             }
         else:

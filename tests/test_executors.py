@@ -33,7 +33,7 @@ def job(tiny_split):
     """The clock's unit on cartpole."""
     split, plugins = load_split(tiny_split), discover()
     plan = make_plan(
-        plugins, split=split.name, split_digest=split.digest, detectors=["clock"],
+        plugins, split=split, detectors=["clock"],
         environments=["cartpole"], anomalies=["iid"],
     )  # fmt: skip
     data = split.environment("cartpole")

@@ -87,7 +87,7 @@ def log(monkeypatch, tmp_path):
 def go(directory, out, detectors=("mean",), *, fresh=False, jobs=1, **settings):
     split = load_split(directory)
     plan = make_plan(
-        discover(), split=split.name, split_digest=split.digest, detectors=detectors,
+        discover(), split=split, detectors=detectors,
         environments=split.environments[:1], **settings,
     )  # fmt: skip
     made = RunSettings(jobs=jobs, limits=Limits(60, None), fresh=fresh)

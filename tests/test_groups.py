@@ -255,7 +255,7 @@ def test_a_worker_that_lies_ends_its_own_cells_only(
 
 def limited(detector, split, memory):
     opened = load_split(split)
-    plan = make_plan(discover(), split=opened.name, split_digest=opened.digest,
+    plan = make_plan(discover(), split=opened,
                      detectors=[detector], environments=["hopper"], anomalies=["iid"])  # fmt: skip
     settings = RunSettings(jobs=1, limits=Limits(60, memory))
     return run(plan, opened, discover(), settings, None).records[0]

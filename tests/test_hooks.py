@@ -57,7 +57,7 @@ def watched(tiny_split):
         recorder = Recorder()
         split = load_split(tiny_split)
         plan = make_plan(
-            plugins, split=split.name, split_digest=split.digest, detectors=["clock"],
+            plugins, split=split, detectors=["clock"],
             environments=["cartpole"], anomalies=["iid", "gravity"],
         )  # fmt: skip
         done = run(plan, split, plugins, RunSettings(jobs=1), observers=[recorder, *observers])
@@ -126,7 +126,7 @@ def test_a_detector_from_a_spec_runs_in_a_worker(watched, monkeypatch, tmp_path,
     split = load_split(tiny_split)
     plugins = discover()
     plan = make_plan(
-        plugins, split=split.name, split_digest=split.digest, detectors=plugins.select("mine:07"),
+        plugins, split=split, detectors=plugins.select("mine:07"),
         environments=["cartpole"], anomalies=["iid"],
     )  # fmt: skip
     results = ResultsDirectory(tmp_path / "out")

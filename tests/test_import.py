@@ -112,7 +112,7 @@ def split(root, form):
 
 def test_an_import_holds_what_was_logged(split):
     data = split.environment("pump")
-    assert split.anomalies() == {"clog": "dynamics", "fog": "sensor"}
+    assert split.groups == {"clog": "dynamics", "fog": "sensor"}
     assert data.sensors == NAMED
     assert [q.name for q in data.actions] == ["valve"]
     sizes = [len(part) for part in (data.train, data.calibration, data.twins)]

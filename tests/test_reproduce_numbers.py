@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers_records import make_record
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.bootstrap import bootstrap_weights
 from oodd_eval.metrics.catalogue import UNDEFINED
@@ -47,11 +47,11 @@ def everywhere(detector, auc, *, environments=("ant", "hopper"), **settings):
     return [
         make_record(detector, e, a, values={"auc": auc}, **settings)
         for e in environments
-        for a in ANOMALIES
+        for a in TABLE1
     ]
 
 
-def side(setting, weight=1.0, anomalies=tuple(ANOMALIES)):
+def side(setting, weight=1.0, anomalies=TABLE1):
     return Side(weight, (setting,), anomalies)
 
 

@@ -150,7 +150,7 @@ def run_tiny(split, detectors=("clock",), output=None, *, environments=("cartpol
     opened = load_split(split)
     plugins = plugins or discover()
     plan = make_plan(
-        plugins, split=opened.name, split_digest=opened.digest, detectors=list(detectors),
+        plugins, split=opened, detectors=list(detectors),
         environments=list(environments), anomalies=list(anomalies), limit=limit,
     )  # fmt: skip
     results = ResultsDirectory(output) if output else None
@@ -528,12 +528,10 @@ def tuned(monkeypatch, tmp_path):
     return discover()
 
 
-def tuned_unit(plugins, digest="dd", **changes):
+def tuned_unit(plugins, split="mini", **changes):
     asked = {"environments": ["ant"], "anomalies": ["iid"], "horizons": [10], "seeds": [3],
              "parameters": {"size": 7, "kind": "a"}, **changes}  # fmt: skip
-    (unit,) = make_plan(
-        plugins, split="mini", split_digest=digest, detectors=["tuned"], **asked
-    ).units
+    (unit,) = make_plan(plugins, split=load_split(split), detectors=["tuned"], **asked).units
     return unit
 
 
@@ -546,7 +544,7 @@ def test_cells_name_what_is_not_a_default(tuned):
 @pytest.mark.parametrize(
     ("change", "scores", "fit"),
     [
-        ({"digest": "ee"}, True, True),
+        ({"split": "tiny"}, True, True),
         ({"seeds": [4]}, True, True),
         ({"environments": ["hopper"]}, True, True),
         ({"limit": 3}, True, True),
@@ -569,13 +567,13 @@ def test_the_device_reaches_the_detector_and_makes_no_row_of_its_own(tuned):
     assert unit.setting == tuned_unit(tuned).setting
     assert "device" not in unit.shown
     with pytest.raises(UsageError, match="none of the detectors has a device"):
-        make_plan(tuned, split="mini", split_digest="", detectors=["clock"], environments=["ant"],
+        make_plan(tuned, split=load_split("mini"), detectors=["clock"], environments=["ant"],
                   device="cuda")  # fmt: skip
 
 
 def test_filtering_a_plan_drops_units_without_cells():
     plan = make_plan(
-        discover(), split="mini", split_digest="", detectors=["clock", "random"],
+        discover(), split=load_split("mini"), detectors=["clock", "random"],
         environments=["ant", "hopper"],
     )  # fmt: skip
     assert len(plan.cells) == 2 * 2 * 8

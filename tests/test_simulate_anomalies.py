@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.simulate.anomalies import VALUES, Draw, draw
 from oodd_eval.data.simulate.environments import make
 from oodd_eval.errors import UnknownNameError
@@ -41,7 +41,7 @@ def draws(request):
     simulator = make(environment)
     simulator.reset(0)
     rng = np.random.default_rng(1)
-    found = {a: [draw(environment, a, simulator, rng) for _ in range(300)] for a in ANOMALIES}
+    found = {a: [draw(environment, a, simulator, rng) for _ in range(300)] for a in TABLE1}
     nominal = {name: simulator.get(name) for name in RANGES[environment]}
     simulator.close()
     return environment, nominal, found

@@ -13,7 +13,7 @@ from helpers_simulate import SEEDS, Reflex, record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.simulate import record as recording
 from oodd_eval.data.simulate.anomalies import Draw
 from oodd_eval.data.simulate.record import TwinTooShortError, record_nominal, record_seed
@@ -38,7 +38,7 @@ def episodes(request):
     """(environment, {None: twin, anomaly: episode}) of one seed."""
     environment = request.param
     policy = Reflex(environment)
-    found = record_seed(environment, SEEDS[environment], ANOMALIES, policy=policy, episode_cap=CAP)
+    found = record_seed(environment, SEEDS[environment], TABLE1, policy=policy, episode_cap=CAP)
     return environment, found
 
 
@@ -46,8 +46,8 @@ def test_episodes_equal_their_twin_bit_for_bit_before_the_effect_and_differ_at_i
     environment, found = episodes
     twin = found[None].trajectory
     assert (found[None].onset, found[None].effect) == (None, None)
-    assert set(found) == {None, *ANOMALIES}
-    for anomaly in ANOMALIES:
+    assert set(found) == {None, *TABLE1}
+    for anomaly in TABLE1:
         onset, effect = found[anomaly].onset, found[anomaly].effect
         x = found[anomaly].trajectory
         assert 30 <= onset <= int(0.6 * twin.transitions), anomaly

@@ -6,7 +6,7 @@ import helpers_browser
 import helpers_site
 import pytest
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
@@ -596,7 +596,7 @@ def test_all_cells_of_a_large_site_open(window, large):
     window.console()
     window.requests()
     open_row(window, "detector-1")
-    cells = [f"{e}/{a}" for e, a in itertools.product(ENVIRONMENTS, ANOMALIES)]
+    cells = [f"{e}/{a}" for e, a in itertools.product(ENVIRONMENTS, TABLE1)]
     shown = window.run(
         """
         const start = location.hash;
@@ -617,7 +617,7 @@ def test_all_cells_of_a_large_site_open(window, large):
     )
     assert shown == [
         [f"{ENVIRONMENTS[e].title}, {ANOMALIES[a].title}", 3]
-        for e, a in itertools.product(ENVIRONMENTS, ANOMALIES)
+        for e, a in itertools.product(ENVIRONMENTS, TABLE1)
     ]
     assert window.console() == []
     assert len(window.texts(".heat td a")) == len(cells) == 56

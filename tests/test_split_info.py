@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.info import (
     collect_returns,
     column_lines,
@@ -14,7 +14,7 @@ from oodd_eval.data.info import (
 from oodd_eval.data.parts import AnomalousSet
 from oodd_eval.data.split import load_split
 
-KINDS = ("nominal", *ANOMALIES)
+KINDS = ("nominal", *TABLE1)
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def cartpole(tiny_split):
 def test_every_group_has_a_row_with_sizes_lengths_and_returns(cartpole):
     rows = group_rows(cartpole)
     assert [row[0] for row in rows][:3] == ["train", "calibration", "test/nominal"]
-    assert [row[0] for row in rows][3:] == [f"test/{a}" for a in ANOMALIES]
+    assert [row[0] for row in rows][3:] == [f"test/{a}" for a in TABLE1]
     # Rewards are 1 per nominal and 0.5 per anomalous step; lengths 60, 61, 62; s.d. sqrt(2/3).
     assert rows[2] == ["test/nominal", "3", "183", "60..62", *[""] * 4, "61.0 ± 0.8"]
     onsets = cartpole.anomalous("iid").onsets

@@ -16,7 +16,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data import layout as splits_format
 from oodd_eval.data import parts
 from oodd_eval.data import split as splits
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.layout import check_layout, content_digest, write_environment
 from oodd_eval.data.parts import TWINS, TrajectorySet
 from oodd_eval.data.split import load_split
@@ -45,7 +45,7 @@ def edit_manifest(directory, change):
 def test_what_was_written_is_read_back(tiny_split):
     data = load_split(tiny_split).environment("hopper")
     seeds = range(9_600_000, 9_600_003)
-    for anomaly in ANOMALIES:
+    for anomaly in TABLE1:
         found, wrote = data.anomalous(anomaly), make_group("hopper", seeds, 60, anomaly)
         assert found.seeds.tolist() == list(seeds)
         assert found.onsets.tolist() == wrote["onsets"].tolist()
@@ -64,7 +64,7 @@ def test_lengths_returns_and_sizes_of_the_parts(tiny_split):
     assert data.twins.returns.tolist() == [60.0, 61.0, 62.0]
     assert data.anomalous("iid").returns.tolist() == [30.0, 30.5, 31.0]
     assert data.twins.terminated.tolist() == [False] * 3
-    assert data.anomalies == tuple(ANOMALIES)
+    assert data.anomalies == TABLE1
 
 
 def test_twins_are_identical_before_the_onset_only(tiny_split):
@@ -85,7 +85,7 @@ def brute_force_effect(x, twin):
 
 def test_the_effect_is_the_first_row_that_differs_from_the_twin(tiny_split):
     data = load_split(tiny_split).environment("cartpole")
-    for anomaly in ANOMALIES:
+    for anomaly in TABLE1:
         part = data.anomalous(anomaly)
         expected = [brute_force_effect(*pair) for pair in zip(part, data.twins, strict=True)]
         assert part.effects.tolist() == expected

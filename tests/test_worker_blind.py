@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_split
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.parts import parts_of
 from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.isolation import supervisor as isolation
@@ -198,7 +198,7 @@ def mini(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sets():
-    return parts_of(load_split("mini").environment(ENVIRONMENT), tuple(ANOMALIES))
+    return parts_of(load_split("mini").environment(ENVIRONMENT), TABLE1)
 
 
 def arrived(findings, sets):
@@ -220,7 +220,7 @@ def test_groups_arrive_in_an_order_that_no_two_runs_share(mini, sets):
     orders = [arrived(findings, sets) for findings in mini]
     calibration = len(sets["calibration"]) // len(sets["test/nominal"])
     every = Counter({None: 1, "test/nominal": 1, "calibration": calibration})
-    every += Counter(f"test/{a}" for a in ANOMALIES)
+    every += Counter(f"test/{a}" for a in TABLE1)
     assert all(Counter(order) == every for order in orders)
     assert len(set(map(tuple, orders))) == 3
 

@@ -8,6 +8,7 @@ from oodd_eval.cli import Parser, at_least, value
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.data.export import export as export_split
 from oodd_eval.data.facts import (
+    ANOMALIES,
     ENVIRONMENTS,
     OWN_SEED_BASES,
     SPLITS,
@@ -73,6 +74,14 @@ def define(parser: Parser) -> None:
     add("place", metavar="FILE|DIR|URL", help="a split's directory, or a tar or zip archive of it")
     add("--digest", metavar="SHA256", help="the split's digest; another one is refused")
     add("--output", type=Path, metavar="DIR", help=place)
+    add = action("calibrate", "find the strengths of the ladder (extra sim)").options(
+        calibrate, "data calibrate --env cartpole --output ladder.json"
+    )
+    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    add("--anomaly", default="all", metavar="NAMES", help="kinds of anomalies (default: all)")
+    add("--output", required=True, type=Path, metavar="FILE", help="strengths, as JSON")
+    add("--work", type=Path, metavar="FILE", help="measured returns (default: OUTPUT.work)")
+    add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
     add = action("export", "write a split in another project's format").options(
         export, "data export mini --format minari --output datasets"
     )
@@ -160,6 +169,24 @@ def verify(options: argparse.Namespace) -> int:
     good = f"{sum(check.ok for check in checks)} of {len(checks)} groups as they should be"
     console.print(f"split {split.name}, digest {split.digest}: {good}")
     return int(not all(check.ok for check in checks))
+
+
+def calibrate(options: argparse.Namespace) -> int:
+    """Carry out ``data calibrate``; returns that an earlier call has measured are kept."""
+    from oodd_eval.data.simulate.calibrate import calibrate as find_strengths
+
+    notes = make_console(quiet=options.verbosity < 0)
+    work = options.work or options.output.with_name(options.output.name + ".work")
+    found = find_strengths(
+        options.output, work, environments=select("environment", options.env, ENVIRONMENTS),
+        kinds=select("anomaly", options.anomaly, ANOMALIES), jobs=options.jobs,
+        progress=notes.print,
+    )  # fmt: skip
+    count = sum(map(len, found.values()))
+    make_console().print(
+        f"strengths of {count} kinds in {len(found)} environments: {options.output}"
+    )
+    return 0
 
 
 def fetch(options: argparse.Namespace) -> int:

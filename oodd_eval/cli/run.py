@@ -65,9 +65,8 @@ def run(options: argparse.Namespace) -> int:
     split = load_split(options.split)
     environments, anomalies = split.select(options.env, options.anomaly)
     plan = make_plan(
-        plugins, split=split.name, split_digest=split.digest,
-        detectors=plugins.select(options.detector), environments=environments,
-        anomalies=anomalies, held=split.anomalies,
+        plugins, split=split, detectors=plugins.select(options.detector),
+        environments=environments, anomalies=anomalies,
         horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
         device=options.device, limit=options.limit,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import functools
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -69,12 +69,34 @@ class AnomalyInfo:
     summary: str
 
 
+Suite = Literal["table1", "ladder", "paper"]
+
+
+def split_condition(condition: str) -> tuple[str, str]:
+    """Return the anomaly and the strength of a condition; the strength may be empty.
+
+    >>> split_condition("iid@kept99"), split_condition("iid")
+    (('iid', 'kept99'), ('iid', ''))
+    """
+    anomaly, _, strength = condition.partition("@")
+    return anomaly, strength
+
+
+def join_condition(anomaly: str, strength: str) -> str:
+    """Return the text of an anomaly and its strength, where it has one."""
+    return f"{anomaly}@{strength}" if strength else anomaly
+
+
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
     """The recipe of a split: trajectories of each part, longest episode, seeds.
 
     `episode_cap` None means the simulator's own limit. Trajectory seeds are
-    ``seed_base * 10**6 + offset of the part + index``.
+    ``seed_base * 10**6 + offset of the part + index``. `suite` says which anomalies there are:
+    those of the paper's Table 1; all kinds at several strengths; or the kinds of the paper at the
+    strength at which its policies lost what its Table 2 says. `base` is the split whose training
+    and calibration parts, and test seeds, are taken, if any. `noise` is that of every sensor in
+    nominal operation, in shares of its spread.
     """
 
     name: str
@@ -83,7 +105,18 @@ class SplitDefinition:
     test: int
     episode_cap: int | None
     seed_base: int
+    suite: Suite = "table1"
+    base: str = ""
+    noise: float = 0.0
 
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All fields that were given: a manifest's ``definition``."""
+        every = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {n: v for n, v in every.items() if n not in _LATER or v != _LATER[n]}
+
+
+_LATER: Final = {"suite": "table1", "base": "", "noise": 0.0}  # older manifests lack these
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -102,7 +135,10 @@ ENVIRONMENTS: Final = MappingProxyType(
 """Environments by id, in the order of the paper's tables."""
 
 ANOMALIES: Final = MappingProxyType({row["id"]: AnomalyInfo(**row) for row in _TABLES["anomaly"]})
-"""Anomaly types by id, in the order of the paper's Table 2."""
+"""Kinds of anomalies by id: those of the paper in the order of its Table 2, then further ones."""
+
+TABLE1: Final = tuple(ANOMALIES)[:8]
+"""The kinds of the paper's Table 1."""
 
 GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
 
@@ -113,6 +149,12 @@ _SPLITS: Final = (
     # The first trajectories of standard: its seed base, the same episodes.
     SplitDefinition("reduced", 500, 50, 20, None, 5),
     SplitDefinition("paper", 10_000, 1_000, 1_000, None, 6),
+    # The training and calibration episodes of others, so that a fit serves both.
+    SplitDefinition("ladder", 40, 40, 10, 300, 4, "ladder", "mini"),
+    SplitDefinition("mini-paper", 40, 40, 10, 300, 4, "paper", "mini"),
+    SplitDefinition("reduced-paper", 500, 50, 20, None, 5, "paper", "reduced"),
+    SplitDefinition("noisy-1", 40, 40, 10, 300, 7, noise=0.01),
+    SplitDefinition("noisy-5", 40, 40, 10, 300, 8, noise=0.05),
 )
 
 SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
@@ -134,13 +176,16 @@ PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "tes
 def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     """Return names, each once: known ones in their order, then the others as they come.
 
-    A condition, such as ``"iid@kept90"``, has the place of its anomaly.
+    A condition that is not known, such as ``"iid@0.5"``, has the place of its anomaly.
 
     >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
     ['cartpole', 'hopper', 'mine']
     """
     place = {name: i for i, name in enumerate(known)}
-    return sorted(dict.fromkeys(names), key=lambda n: place.get(n.partition("@")[0], len(place)))
+    last = len(place)
+    return sorted(
+        dict.fromkeys(names), key=lambda n: place.get(n, place.get(n.partition("@")[0], last))
+    )
 
 
 def title_of(environment: str) -> str:

@@ -41,7 +41,8 @@ def describe(split: Split) -> str:
             lines += ["", _table(title, HEADER, group_rows(data)), "", *column_lines(data)]
             returns[name] = collect_returns(data)
     title = "Table 2: mean return of the policies, nominal and under each anomaly"
-    kinds = ["nominal", *split.anomalies()]
+    found = {kind for own in returns.values() for kind in own}
+    kinds = ["nominal", *(name for name in split.anomalies if name in found and "@" not in name)]
     return "\n".join(
         [*lines, "", _table(title, ["Environment", "", *kinds], return_rows(returns, kinds))]
     )

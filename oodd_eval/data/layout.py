@@ -28,6 +28,7 @@ from oodd_eval.data.facts import (
     Group,
     Quantity,
     SplitDefinition,
+    split_condition,
 )
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.data.parts import (
@@ -184,7 +185,7 @@ def own_facts(environment: str, *, discrete: bool, groups: Mapping[str, Group]) 
 
     `groups` are those of all anomalies in the environment's file.
     """
-    kinds = {name.partition("@")[0]: group for name, group in groups.items()}
+    kinds = {split_condition(name)[0]: group for name, group in groups.items()}
     kinds = {kind: group for kind, group in kinds.items() if kind not in ANOMALIES}
     if environment in ENVIRONMENTS and not kinds:
         return {}
@@ -196,11 +197,11 @@ def discrete_actions(environment: str, entry: Mapping[str, Any]) -> bool:
     return bool(entry["own"]["discrete"] if "own" in entry else ENVIRONMENTS[environment].discrete)
 
 
-def anomaly_groups(entry: Mapping[str, Any]) -> dict[str, Group]:
-    """Return the anomalies of a manifest entry in the benchmark's order, with their groups."""
+def groups_of(entry: Mapping[str, Any]) -> dict[str, Group]:
+    """Return the groups of the anomalies of a manifest entry, by kind."""
     own = entry["own"]["anomalies"] if "own" in entry else {}
-    kinds = ((name, name.partition("@")[0]) for name in anomalies_in(entry["groups"]))
-    return {name: ANOMALIES[kind].group if kind in ANOMALIES else own[kind] for name, kind in kinds}
+    kinds = (split_condition(condition)[0] for condition in anomalies_in(entry["groups"]))
+    return {kind: ANOMALIES[kind].group if kind in ANOMALIES else own[kind] for kind in kinds}
 
 
 def names_digest(entry: Mapping[str, Any]) -> str:
@@ -317,9 +318,7 @@ def write_manifest(
 
     A split that was not recorded has no definition, but a mapping with its name.
     """
-    if isinstance(definition, SplitDefinition):
-        definition = dataclasses.asdict(definition)
-    recipe = dict(definition)
+    recipe = definition.recipe if isinstance(definition, SplitDefinition) else dict(definition)
     manifest = {
         "schema": SCHEMA, "name": recipe["name"], "definition": recipe, "generator": generator,
         "environments": environments, "digest": split_digest(environments, recipe),
@@ -353,7 +352,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise SplitError(f"{file} cannot be read as a split's manifest: {error}") from error
     for environment, entry in manifest["environments"].items():
         said = entry["own"]["anomalies"] if "own" in entry else {}
-        kinds = {group.partition("@")[0] for group in anomalies_in(entry["groups"])}
+        kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
         if environment not in ENVIRONMENTS and "own" not in entry:
             raise SplitError(f"{file} has an unknown environment {environment!r}, of which it says "
                              "nothing: build or import it again")  # fmt: skip

@@ -13,7 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, in_order
+from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, in_order, join_condition
+from oodd_eval.data.ladder import RUNGS
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.names import check_known
 
@@ -24,6 +25,11 @@ TWINS: Final = "test/nominal"
 NOMINAL: Final = (TRAIN, CALIBRATION, TWINS)
 """The nominal parts, which every environment has. Each part is a group of its file."""
 
+CONDITIONS: Final = tuple(
+    join_condition(anomaly, strength) for anomaly in ANOMALIES for strength in ("", *RUNGS)
+)
+"""Every anomaly of the benchmark, at every strength that a suite may have, in its order."""
+
 NAMES: Final = "names"  # the group that names the columns of observations and actions
 _ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
@@ -32,7 +38,7 @@ _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
     """Return the anomalies among groups such as ``"test/iid"``, in the benchmark's order."""
     tests = (group.removeprefix("test/") for group in groups if group not in NOMINAL)
-    return tuple(in_order(sorted(tests), ANOMALIES))
+    return tuple(in_order(sorted(tests), CONDITIONS))
 
 
 def groups_in(file: h5py.File) -> list[str]:
@@ -140,9 +146,10 @@ class EnvironmentData:
     """The verified content of one environment: `id` is its name, `digest` that of all its parts.
 
     `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
-    calibrate alarms, `twins` those of the test seeds. `anomalies` are the names of those in this
-    split. `sensors` and `actions` are names and units of the columns of observations and actions;
-    an action that is `discrete` is a one-hot row.
+    calibrate alarms, `twins` those of the test seeds. `anomalies` are the conditions of this split:
+    names of anomalies, with ``@`` and the strength where there are several, as in ``iid@kept99``.
+    `sensors` and `actions` are names and units of the columns of observations and actions; an
+    action that is `discrete` is a one-hot row.
     """
 
     def __init__(
@@ -172,6 +179,10 @@ class EnvironmentData:
         """
         check_known(f"anomaly of {Path(self._file.filename).name}", self.anomalies, anomaly)
         return AnomalousSet(self._file, f"test/{anomaly}")
+
+    def arrays(self, part: str) -> dict[str, NDArray[Any]]:
+        """Return the datasets of a part as they are stored."""
+        return {name: dataset[:] for name, dataset in self._file[part].items()}
 
     def close(self) -> None:
         """Close the file."""

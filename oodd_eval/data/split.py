@@ -12,9 +12,9 @@ from typing import Any
 import h5py
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, Group, in_order
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order, split_condition
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import NAMES, EnvironmentData, groups_in
+from oodd_eval.data.parts import CONDITIONS, NAMES, TRAIN, EnvironmentData, anomalies_in, groups_in
 from oodd_eval.errors import (
     DigestError,
     SplitError,
@@ -105,24 +105,22 @@ class Split:
         """Names of the environments: the benchmark's in its order, then others in theirs."""
         return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
-    def anomalies(self, *environments: str) -> dict[str, Group]:
-        """Return the groups of all anomalies by name, in the order of `environments`.
+    def conditions(self, environment: str) -> tuple[str, ...]:
+        """Return the anomalies of an environment, each with its strength if it has several."""
+        return anomalies_in(self.manifest["environments"][environment]["groups"])
 
-        Parameters
-        ----------
-        *environments
-            Those whose anomalies are wanted; by default all.
+    @property
+    def anomalies(self) -> tuple[str, ...]:
+        """Names by which anomalies of any environment can be chosen: kinds, and conditions."""
+        return self._names(*self.environments)
 
-        Returns
-        -------
-        dict
-            Empty for a split with nominal episodes only.
-        """
-        entries = self.manifest["environments"]
+    @property
+    def groups(self) -> dict[str, Group]:
+        """Groups of all anomalies, by kind."""
         found: dict[str, Group] = {}
-        for environment in environments or self.environments:
-            found |= layout.anomaly_groups(entries[environment])
-        return {name: found[name] for name in in_order(found, ANOMALIES)}
+        for entry in self.manifest["environments"].values():
+            found |= layout.groups_of(entry)
+        return found
 
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
         """Return the environments and anomalies that comma lists, globs or ``"all"`` select.
@@ -133,12 +131,21 @@ class Split:
             When something is unknown, or the environments have nominal episodes only.
         """
         chosen = select("environment", environments, self.environments)
-        if not (known := self.anomalies(*chosen)):
+        if not (known := self._names(*chosen)):
             raise UsageError(
                 f"split {self.name} has no anomalous episodes of {', '.join(chosen)}, expected "
                 "some to evaluate detectors on: import them, or fit a watchdog on what there is"
             )
         return chosen, select("anomaly", anomalies, known)
+
+    def _names(self, *environments: str) -> tuple[str, ...]:
+        every = in_order((c for e in environments for c in self.conditions(e)), CONDITIONS)
+        kinds = (split_condition(condition)[0] for condition in every)
+        return tuple(dict.fromkeys((*kinds, *every)))
+
+    def train_digest(self, environment: str) -> str:
+        """Return the digest of an environment's training part: what a fit depends on."""
+        return str(self.manifest["environments"][environment]["groups"][TRAIN]["sha256"])
 
     def environment(self, name: str) -> EnvironmentData:
         """Open one environment after verifying every group's digest.

@@ -98,7 +98,7 @@ def _primary(
     found = {row.detector: row for row in primary_settings(records)}
     cells: dict[Setting, set[tuple[str, str]]] = {}
     for r in records:
-        cells.setdefault(r.setting, set()).add((r.environment, r.anomaly))
+        cells.setdefault(r.setting, set()).add(r.place)
     declared: dict[str, Setting] = {}
     for row, entry in ((row, entry) for row, own in sources.items() for entry in own):
         if str(row) not in entry.meta.primary:

@@ -118,7 +118,8 @@ def selected(
         chosen, left_out = _complete(chosen)
     environments = in_order((r.environment for r in chosen), ENVIRONMENTS)
     anomalies = in_order((r.anomaly for r in chosen), ANOMALIES)
-    chosen.sort(key=lambda r: (environments.index(r.environment), anomalies.index(r.anomaly)))
+    places = environments.index, anomalies.index
+    chosen.sort(key=lambda r: (places[0](r.environment), places[1](r.anomaly), r.strength))
     chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
     return [_publishable(r) for r in chosen], left_out
 
@@ -127,7 +128,7 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Leave out the seeds of rows that lack cells which any row here has."""
     cells: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for r in records:
-        cells[r.cell.label].add((r.environment, r.anomaly))
+        cells[r.cell.label].add(r.place)
     every = set().union(*cells.values())
     partial = {label: len(own) for label, own in sorted(cells.items()) if own != every}
     if len(partial) == len(cells):

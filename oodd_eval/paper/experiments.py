@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, paper_tables
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, paper_tables
 from oodd_eval.errors import OoddError, ResultsError
 from oodd_eval.names import check_known
 from oodd_eval.results.identity import Setting
@@ -115,11 +115,11 @@ class Tier:
 def scope(name: str) -> Scope:
     """Return a mean over anomalies by its id: ``all``, a group, or an anomaly."""
     if name in GROUPS:
-        within = tuple(a.id for a in ANOMALIES.values() if a.group == name)
+        within = tuple(a for a in TABLE1 if ANOMALIES[a].group == name)
         return Scope(name, f"{name.capitalize()}-injected", within)
     if name == "all":
-        return Scope(name, "All anomalies", tuple(ANOMALIES))
-    check_known("scope", ("all", *GROUPS, *ANOMALIES), name)
+        return Scope(name, "All anomalies", TABLE1)
+    check_known("scope", ("all", *GROUPS, *TABLE1), name)
     return Scope(name, ANOMALIES[name].title, (name,))
 
 

@@ -12,7 +12,7 @@ from typing import Final
 
 from pydantic import TypeAdapter
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.files import GZIP, write_bytes
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
@@ -24,7 +24,7 @@ from oodd_eval.results.record import Record
 HEADER: Final = "reproduction.json"
 RETURNS: Final = "returns.json"
 SCHEMA: Final = 1
-KINDS: Final = ("nominal", *ANOMALIES)
+KINDS: Final = ("nominal", *TABLE1)
 
 Returns = Mapping[str, Mapping[str, Sequence[float]]]  # by environment and kind
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, paper_tables
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.paper.claims import NOT_RUN, Ruling, claims_csv, claims_table, rulings, summary
 from oodd_eval.paper.estimates import Estimate, Estimator, Numbers, compute, mean_return
@@ -178,7 +178,7 @@ def numbers_csv(numbers: Numbers) -> list[list[str]]:
 
 def returns_tables(returns: Returns) -> tuple[Table, list[list[str]]]:
     """Return Table 2, ours with intervals and the paper's below it, and its lines of CSV."""
-    header = ["Environment", "Policy", "", "Nominal", *(a.title for a in ANOMALIES.values())]
+    header = ["Environment", "Policy", "", "Nominal", *(ANOMALIES[a].title for a in TABLE1)]
     rows = []
     lines = [["environment", "kind", "group", "value", "low", "high", "n", "paper"]]
     for environment in (e for e in ENVIRONMENTS if e in returns):

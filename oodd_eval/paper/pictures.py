@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, NamedTuple
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.paper.estimates import Estimate, Numbers, mean_return
@@ -122,7 +122,7 @@ def _dots(
 def returns_picture(returns: Returns) -> Picture:
     """Return Table 2 as changes in percent of the nominal return, ours and the paper's."""
     panels = []
-    names = tuple(SHORT.get(a, a) for a in ANOMALIES)
+    names = tuple(SHORT.get(a, a) for a in TABLE1)
     for environment in (e for e in ENVIRONMENTS if e in returns):
         paper = paper_tables()["table2_policy_return"][environment]
         nominal, first = mean_return(returns, environment, "nominal").value, float(paper["nominal"])

@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.data.parts import TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.paper.experiments import CONTROLS, Experiment, Tier, settings_of
@@ -43,13 +42,13 @@ def lay_out(
     device: str | None = None,
 ) -> list[Unit]:  # fmt: skip
     """Return every unit that some experiments need, cheap and informative ones first."""
-    found, names, all_anomalies = [], list(split.environments), tuple(ANOMALIES)
+    found, names = [], list(split.environments)
     for setting in settings_of(experiments):
         offer, given = plugins.offer(setting.detector), setting.overrides
         if device is not None and "device" in parameters_of(offer.spec.parameters):
             given["device"] = device
-        found += [make_unit(offer, given, name, all_anomalies, setting.horizon, seed,
-                            split.digest, None)
+        found += [make_unit(offer, given, split, name, split.conditions(name), setting.horizon,
+                            seed, None)
                   for name in names for seed in tier.seeds(setting)]  # fmt: skip
     return sorted(found, key=lambda unit: (stage_of(unit), names.index(unit.environment)))
 
@@ -68,7 +67,7 @@ def stage_of(unit: Unit) -> int:
 
 def unfinished(units: Iterable[Unit], records: Iterable[Record]) -> list[Unit]:
     """Return the units of which not all cells have been scored without failure."""
-    finished = {(record.scores, record.anomaly) for record in records if record.ok}
+    finished = {(record.scores, record.condition) for record in records if record.ok}
     return [u for u in units if any((u.scores_key, a) not in finished for a in u.anomalies)]
 
 

@@ -221,7 +221,7 @@ class Results(Sequence[Record]):
             own = [r for r in self.records if r.setting == setting and r.ok]
             curves[str(setting)] = [
                 e for r in own
-                for e in self._scored(r.environment, r.anomaly, row=str(setting), seed=r.seed)
+                for e in self._scored(r.environment, r.condition, row=str(setting), seed=r.seed)
             ]  # fmt: skip
         return plots.power(curves)
 
@@ -237,8 +237,10 @@ class Results(Sequence[Record]):
         own = [r for r in self.records if r.setting == self._row(row)]
         check_known("environment of these results", {r.environment for r in own}, environment)
         own = [r for r in own if r.environment == environment]
-        check_known(f"anomaly of these results in {environment}", {r.anomaly for r in own}, anomaly)
-        own = sorted((r for r in own if r.anomaly == anomaly), key=lambda r: r.seed)
+        check_known(
+            f"anomaly of these results in {environment}", {r.condition for r in own}, anomaly
+        )
+        own = sorted((r for r in own if r.condition == anomaly), key=lambda r: r.seed)
         record = next((r for r in own if seed in (None, r.seed)), None)
         if record is None:
             raise UsageError(f"no detector seed {seed}: expected one of {[r.seed for r in own]}")

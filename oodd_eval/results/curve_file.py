@@ -45,8 +45,8 @@ def make_curves(
                 at = thresholds(scores[TWINS], rule)
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
-            anomalous = scores[f"test/{record.anomaly}"]
-            known = data.anomalous(record.anomaly)
+            anomalous = scores[f"test/{record.condition}"]
+            known = data.anomalous(record.condition)
             onsets, effects = (part[: len(anomalous)].tolist()
                                for part in (known.onsets, known.effects))  # fmt: skip
             curves = cell_curves(sweep, rule, anomalous, onsets, effects)

@@ -85,9 +85,9 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
 
 
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
-    anomalous, known = scores.parts[f"test/{record.anomaly}"], data.anomalous(record.anomaly)
+    anomalous, known = scores.parts[f"test/{record.condition}"], data.anomalous(record.condition)
     starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
-    explained = scores.explained.get(f"test/{record.anomaly}", [])
+    explained = scores.explained.get(f"test/{record.condition}", [])
     metrics, contributions = cell_metrics(
         anomalous, scores.parts[TWINS], starts, effects, rules, environment=record.environment,
         explained=explained,
@@ -129,7 +129,7 @@ def stored_scores(
 ) -> ScoreFile:
     """Return the stored scores that the records of one unit were computed from."""
     first = records[0]
-    lengths = lengths_of(parts_of(data, [r.anomaly for r in records]), first.limit)
+    lengths = lengths_of(parts_of(data, [r.condition for r in records]), first.limit)
     scores = results.scores(first.scores, lengths) if first.scores else None
     if scores is None:
         raise ResultsError(

@@ -127,7 +127,7 @@ def compare(
     for setting in settings:
         seeds = grouped((r for r in records if r.setting == setting), lambda r: r.seed)
         rows[str(setting)] = {
-            seed: {(r.environment, r.anomaly): _signed(contribution(r, metric), sign)
+            seed: {r.place: _signed(contribution(r, metric), sign)
                    for r in own if r.ok and metric in r.per_trajectory}
             for seed, own in seeds.items()
         }  # fmt: skip

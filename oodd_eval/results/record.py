@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
 from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
+from oodd_eval.data.facts import join_condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.identity import Cell, Setting
@@ -136,6 +137,16 @@ class Record:
         return Cell(
             self.split, self.environment, self.anomaly, self.setting, self.seed, self.strength
         )
+
+    @property
+    def condition(self) -> str:
+        """The anomaly, with its strength where it has several."""
+        return join_condition(self.anomaly, self.strength)
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Environment and condition: the column of a board that the record belongs to."""
+        return self.environment, self.condition
 
     @property
     def identity(self) -> tuple[str, ...]:

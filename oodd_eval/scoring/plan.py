@@ -3,11 +3,12 @@
 From names to a plan: settings are resolved and keys are made here, once.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
-from oodd_eval.data.facts import ANOMALIES, PROTOCOL, Group
+from oodd_eval.data.facts import PROTOCOL, Group, split_condition
+from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
 from oodd_eval.plugins.discovery import Offer, Plugins
@@ -17,17 +18,17 @@ from oodd_eval.results.record import Record
 from oodd_eval.scoring.keys import fit_key, scores_key, source_digest
 
 DEVICES: Final = ("auto", "cpu", "cuda")
-_GROUPS: Final[Mapping[str, Group]] = {a.id: a.group for a in ANOMALIES.values()}
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
     """One fit: setting x seed x environment, and the anomalies that it scores.
 
-    `parameters` are all that the factory gets, sorted by name; `shown` are those that are part of
-    the result, which the device is not. `plugin` is empty for a factory of this process, which has
-    no `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored
-    under a key, but never taken from there by a later run.
+    `anomalies` are conditions, such as ``"iid"`` or ``"iid@kept99"``. `parameters` are all that the
+    factory gets, sorted by name; `shown` are those that are part of the result, which the device is
+    not. `plugin` is empty for a factory of this process, which has no `source` (the digest of a
+    plug-in's code) and no key of a stored fit; its scores are stored under a key, but never taken
+    from there by a later run.
     """
 
     environment: str
@@ -64,7 +65,7 @@ class Plan:
     split_digest: str
     units: tuple[Unit, ...]
     limit: int | None = None
-    groups: Mapping[str, Group] = field(default_factory=lambda: _GROUPS)
+    groups: Mapping[str, Group] = field(default_factory=dict)
 
     @property
     def cells(self) -> list[Cell]:
@@ -73,7 +74,8 @@ class Plan:
 
     def cell(self, unit: Unit, anomaly: str) -> Cell:
         """Return one cell of a unit."""
-        return Cell(self.split, unit.environment, anomaly, unit.setting, unit.seed)
+        kind, strength = split_condition(anomaly)
+        return Cell(self.split, unit.environment, kind, unit.setting, unit.seed, strength)
 
     def matching(self, wanted: Predicate) -> "Plan":
         """Return the plan with those cells only whose text passes, without empty units."""
@@ -85,31 +87,30 @@ class Plan:
 
     def blank(self, unit: Unit, anomaly: str, **outcome: Any) -> Record:
         """Return the record of a cell with its identity filled in, and no metrics."""
+        kind, strength = split_condition(anomaly)
         return Record(
             detector=unit.setting.detector, horizon=unit.setting.horizon, seed=unit.seed,
             detector_version=unit.version, plugin=f"{unit.distribution}:{unit.plugin}",
             plugin_source=unit.source, parameters=dict(unit.shown),
             overrides=unit.setting.overrides, inputs=unit.inputs, alarm=unit.alarm,
-            deterministic=unit.deterministic, environment=unit.environment, anomaly=anomaly,
-            group=self.groups[anomaly],
+            deterministic=unit.deterministic, environment=unit.environment, anomaly=kind,
+            strength=strength, group=self.groups[kind],
             split=self.split, split_digest=self.split_digest, limit=self.limit,
             scores=unit.scores_key, protocol=PROTOCOL, **outcome,
         )  # fmt: skip
 
 
 def make_plan(
-    plugins: Plugins, *, split: str, split_digest: str, detectors: Sequence[str],
-    environments: Sequence[str], anomalies: Sequence[str] = tuple(ANOMALIES),
+    plugins: Plugins, *, split: Split, detectors: Sequence[str],
+    environments: Sequence[str], anomalies: Sequence[str] | None = None,
     horizons: Sequence[int] = (1,), seeds: Sequence[int] = (0,),
     parameters: Mapping[str, Any] | None = None, limit: int | None = None,
-    device: str | None = None, held: Callable[..., Mapping[str, Group]] = lambda *_: _GROUPS,
+    device: str | None = None,
 ) -> Plan:  # fmt: skip
     """Lay out every unit, environments outermost; the cells are the product of all names.
 
-    `held` is `Split.anomalies` of the split: what an environment lacks is left out. By default
-    each has the benchmark's.
-
-    `device` is the value of the parameter ``device`` for those detectors that have it. What is
+    `anomalies` are kinds or conditions, as `Split.anomalies` has them; by default all. `device` is
+    the value of the parameter ``device`` for those detectors that have it. What is
     unknown or refused, and a device that no detector has, raises `UsageError`.
     """
     offers = [plugins.offer(name) for name in detectors]
@@ -123,19 +124,27 @@ def make_plan(
         names = ", ".join(offer.spec.name for offer in offers)
         raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
     units = tuple(
-        make_unit(offer, own, environment, wanted, horizon, seed, split_digest, limit)
+        make_unit(offer, own, split, environment, conditions, horizon, seed, limit)
         for environment in environments
-        if (wanted := [a for a in anomalies if a in held(environment)])
+        if (conditions := _chosen(split.conditions(environment), anomalies))
         for offer, own in zip(offers, given, strict=True)
         for horizon in horizons
         for seed in seeds
     )
-    return Plan(split, split_digest, units, limit, held(*environments))
+    return Plan(split.name, split.digest, units, limit, split.groups)
+
+
+def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the conditions that some names choose, in the order of the names."""
+    if names is None:
+        return tuple(conditions)
+    found = (c for name in names for c in conditions if name in (c, split_condition(c)[0]))
+    return tuple(dict.fromkeys(found))
 
 
 def make_unit(
-    offer: Offer, given: Mapping[str, Any], environment: str, anomalies: Sequence[str],
-    horizon: int, seed: int, split_digest: str, limit: int | None,
+    offer: Offer, given: Mapping[str, Any], split: Split, environment: str,
+    anomalies: Sequence[str], horizon: int, seed: int, limit: int | None,
 ) -> Unit:  # fmt: skip
     """Resolve one unit: its parameters, its setting and its keys."""
     spec = offer.spec
@@ -152,13 +161,15 @@ def make_unit(
     identity: dict[str, Any] = {
         "distribution": offer.distribution, "version": offer.version, "source": source,
         "detector": spec.name, "parameters": shown, "seed": seed, "horizon": horizon,
-        "environment": environment, "split_digest": split_digest, "limit": limit,
+        "environment": environment, "split_digest": split.digest, "limit": limit,
     }  # fmt: skip
     scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
     fit = ""
     if offer.plugin:
         deciding = {name: value for name, value in shown.items() if kinds[name] == "fit"}
-        same: dict[str, Any] = {"detector": spec.fit_name or spec.name, "parameters": deciding}
+        # A fit serves all splits that have its training part.
+        same: dict[str, Any] = {"detector": spec.fit_name or spec.name, "parameters": deciding,
+                                "split_digest": split.train_digest(environment)}  # fmt: skip
         if not spec.horizon_decides_fit:
             same["horizon"] = None
         fit = fit_key(identity | same)

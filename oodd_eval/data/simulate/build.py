@@ -25,10 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, PART_OFFSETS, SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition
 from oodd_eval.data.files import remove_abandoned, replacing
+from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
-from oodd_eval.data.parts import NOMINAL, TWINS
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import (
     GENERATOR_VERSION,
@@ -36,11 +37,15 @@ from oodd_eval.data.simulate.record import (
     TwinTooShortError,
     record_seed,
 )
-from oodd_eval.data.split import Split
+from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
 
-CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}  # seeds; a test seed is nine episodes
+CHUNK: Final = {
+    "train": 25,
+    "calibration": 25,
+    "test": 5,
+}  # seeds; a test seed is nine episodes, or hundreds
 WORK: Final = ".building"  # the work folder, gone when the split is whole
 MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
 
@@ -58,13 +63,15 @@ class Chunk:
     first_seed: int
     count: int
     episode_cap: int | None
-    policy: str
+    noise: float
+    conditions: tuple[tuple[str, float | None], ...]
     policy_digest: str
+    policy: str
 
     @property
     def file_name(self) -> str:
-        """Everything the content depends on, as a name."""
-        text = repr((GENERATOR_VERSION, dataclasses.astuple(self)[:5], self.policy_digest))
+        """Everything the content depends on, as a name: the policy by its digest."""
+        text = repr((GENERATOR_VERSION, dataclasses.astuple(self)[:-1]))
         key = hashlib.sha256(text.encode()).hexdigest()[:16]
         return f"{self.environment}-{self.part}-{self.first_seed}-{key}.npz"
 
@@ -104,8 +111,15 @@ def build_split(
         todo = {e: planned + further[e] for e, planned in todo.items()}
     for environment, chunks in todo.items():
         files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
-        parts = *NOMINAL, *(f"test/{anomaly}" for anomaly in ANOMALIES)
-        groups = ((part, _joined(part, files[part.split("/")[0]])) for part in parts)
+        taken: dict[str, layout.Arrays] = {}
+        if definition.base:
+            with _base(definition.base, environment, digests[environment]) as base:
+                taken = {part: base.arrays(part) for part in (TRAIN, CALIBRATION)}
+        tests = [TWINS, *(f"test/{condition}" for condition, _ in chunks[-1].conditions)]
+        groups = (
+            (part, taken.get(part) or _joined(part, files[part.split("/")[0]]))
+            for part in (TRAIN, CALIBRATION, *tests)
+        )
         target = directory / f"{environment}.h5"
         info = ENVIRONMENTS[environment]
         entries[environment] = layout.write_environment(
@@ -134,7 +148,7 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     if not (directory / layout.MANIFEST).exists():
         return {}
     split = Split(directory)
-    manifest, recipe, kept = split.manifest, dataclasses.asdict(definition), {}
+    manifest, recipe, kept = split.manifest, definition.recipe, {}
     if manifest["definition"] != recipe:
         raise UsageError(
             f"{directory} holds the split {manifest['definition']}, expected {recipe}: "
@@ -150,13 +164,36 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     return kept
 
 
+def _base(
+    name: str, environment: str, policy: str
+) -> contextlib.AbstractContextManager[EnvironmentData]:
+    """Open the environment of the split whose training part is taken."""
+    split = load_split(name)
+    acted = split.manifest["environments"].get(environment, {}).get("policy", policy)
+    if acted != policy:
+        raise UsageError(
+            f"split {name!r} has episodes of another policy of {environment}: expected the digest "
+            f"{policy[:12]}, got {acted[:12]}; build on a split of the same policy"
+        )
+    return contextlib.closing(split.environment(environment))
+
+
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
+    conditions = tuple(conditions_of(definition.suite, environment).items())
+
+    def chunk(part: str, first: int, count: int) -> Chunk:
+        own = conditions if part == "test" else ()
+        recipe = (definition.episode_cap, definition.noise, own)
+        return Chunk(environment, part, first, count, *recipe, digest, path)
+
+    if definition.base:  # its test seeds have twins that are long enough
+        with _base(definition.base, environment, digest) as base:
+            return [chunk("test", int(seed), 1) for seed in base.twins.seeds]
     found = []
     for part, offset in PART_OFFSETS.items():
         first, size = definition.seed_base * 10**6 + offset, getattr(definition, part)
-        for start in range(0, size, CHUNK[part]):
-            seeds = (first + start, min(CHUNK[part], size - start))
-            found.append(Chunk(environment, part, *seeds, definition.episode_cap, path, digest))
+        starts = range(0, size, CHUNK[part])
+        found += [chunk(part, first + i, min(CHUNK[part], size - i)) for i in starts]
     return found
 
 
@@ -210,16 +247,18 @@ def _watch_parent() -> None:
 def record_chunk(chunk: Chunk, work: Path) -> None:
     """Record the episodes of a chunk and store them under the chunk's name, all or nothing."""
     policy = load_policy(chunk.environment, chunk.policy or None)
-    anomalies = list(ANOMALIES) if chunk.part == "test" else []
+    conditions = dict(chunk.conditions)
     environment, cap = chunk.environment, chunk.episode_cap
     recorded: list[dict[str | None, Episode]] = []
     for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
-            found = record_seed(environment, seed, anomalies, policy=policy, episode_cap=cap)
+            found = record_seed(
+                environment, seed, conditions, policy=policy, episode_cap=cap, noise=chunk.noise
+            )
             recorded.append(found)
     arrays: dict[str, NDArray[Any]] = {}
-    for kind in [None, *anomalies] if recorded else []:
+    for kind in [None, *conditions] if recorded else []:
         group = chunk.part if chunk.part != "test" else f"test/{kind or 'nominal'}"
         for name, array in _stack([r[kind] for r in recorded]).items():
             arrays[f"{group}:{name}"] = array

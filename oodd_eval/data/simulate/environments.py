@@ -54,13 +54,19 @@ Row = NDArray[np.float32]
 
 
 class Simulator:
-    """One episode of one environment, in a `wind` of -1, 0 or +1: the direction of its pushes."""
+    """One episode of one environment.
+
+    `wind` is the direction of its pushes, -1, 0 or +1, where actions are discrete; elsewhere it is
+    added to every command.
+    """
 
     names: ClassVar[Mapping[str, str]] = {}
     """The environment's names of attributes that it calls otherwise."""
 
     def __init__(self, env: Any) -> None:
-        self.env, self.wind = env, 0
+        self.env, self.wind = env, 0.0
+        self.gain, self.bias = 1.0, 0.0  # of the actuators, where actions are discrete
+        self._nominal: dict[str, float] = {}
 
     def reset(self, seed: int) -> Row:
         """Start the episode; return the observation of shape (D,)."""
@@ -83,6 +89,22 @@ class Simulator:
         """Read an attribute back from where the simulator itself reads it."""
         return float(getattr(self.env, self.names.get(attribute, attribute)))
 
+    def nominal(self, attribute: str) -> float:
+        """Return the value that an attribute had when it was first asked for."""
+        return self._nominal.setdefault(attribute, self.get(attribute))
+
+    def scale(self, attribute: str, factor: float) -> None:
+        """Make an attribute a multiple of its nominal value, if it is not so already."""
+        value = self.nominal(attribute) * factor
+        if self.get(attribute) != value:
+            self.set(attribute, value)
+
+    def restore(self) -> None:
+        """Put the wind, and all attributes that were scaled, back."""
+        self.wind = 0.0
+        for attribute in self._nominal:
+            self.scale(attribute, 1.0)
+
     def close(self) -> None:
         """Release what the simulator holds."""
         self.env.close()
@@ -91,13 +113,14 @@ class Simulator:
 class _Acrobot(AcrobotEnv):
     """Acrobot whose gravity can be changed: the stock equations hold it as a local constant.
 
-    They stay in force until then; after, the same pendulum is solved from its mass matrix.
+    They stay in force until then; after, the same pendulum is solved from its mass matrix, with
+    `friction` in both joints, in 1/s.
     """
 
-    gravity = 9.8
+    gravity, friction = 9.8, 0.0
 
     def _dsdt(self, s_augmented: Any) -> Any:
-        if self.gravity == _Acrobot.gravity:
+        if (self.gravity, self.friction) == (_Acrobot.gravity, _Acrobot.friction):
             return super()._dsdt(s_augmented)  # type: ignore[no-untyped-call]
         return self.derivative(s_augmented)
 
@@ -119,7 +142,8 @@ class _Acrobot(AcrobotEnv):
         determinant = m11 * m22 - m12**2
         acceleration1 = (-c1 * m22 - m12 * (torque - c2)) / determinant
         acceleration2 = (m11 * (torque - c2) + m12 * c1) / determinant
-        return omega1, omega2, acceleration1, acceleration2, 0.0
+        drag1, drag2 = self.friction * omega1, self.friction * omega2
+        return omega1, omega2, acceleration1 - drag1, acceleration2 - drag2, 0.0
 
 
 class Acrobot(Simulator):
@@ -135,15 +159,24 @@ class Acrobot(Simulator):
     def command(self, action: int) -> int:
         # Per instance: action 0 is torque -1, action 2 is torque +1.
         torques = {0: [-1.0, 0.0, 1.0], 1: [0.0, 0.0, 2.0], -1: [-2.0, 0.0, 0.0]}
-        self.env.AVAIL_TORQUE = torques[self.wind]
+        self.env.AVAIL_TORQUE = [self.gain * t + self.bias for t in torques[int(self.wind)]]
         return int(action)
 
     def set(self, attribute: str, value: float) -> None:
-        super().set(attribute, value)
+        if attribute in {"gain", "bias"}:
+            setattr(self, attribute, value)
+        elif attribute == "body_mass":  # both links weigh the same
+            self.env.LINK_MASS_1 = self.env.LINK_MASS_2 = value / 2
+        else:
+            super().set(attribute, value)
         if attribute.startswith("link_length_"):  # the centre of mass follows
             setattr(self.env, f"LINK_COM_POS_{attribute[-1]}", value / 2)
 
     def get(self, attribute: str) -> float:
+        if attribute in {"gain", "bias"}:
+            return float(getattr(self, attribute))
+        if attribute == "body_mass":
+            return float(self.env.LINK_MASS_1 + self.env.LINK_MASS_2)
         if attribute.startswith("link_length_"):
             return 2 * float(getattr(self.env, f"LINK_COM_POS_{attribute[-1]}"))
         return super().get(attribute)
@@ -152,24 +185,37 @@ class Acrobot(Simulator):
 class CartPole(Simulator):
     """CartPole-v1: a push of 10 N to the left or right; wind takes pushes away or doubles them."""
 
-    names: ClassVar = {"pole_length": "length", "pole_mass": "masspole"}
+    names: ClassVar = {"pole_length": "length", "pole_mass": "masspole", "body_mass": "masscart"}
 
     def __init__(self) -> None:
         super().__init__(CartPoleEnv())
-        self._force = self.env.force_mag
+        self._force, self._friction = self.env.force_mag, 0.0
 
     def command(self, action: int) -> int:
         direction = 1 if action == 1 else -1
-        self.env.force_mag = self._force * (1 + self.wind * direction)
+        force = self._force * (1 + self.wind * direction) * self.gain
+        # The environment gives the force the direction of the action.
+        push = self._force * self.bias - self._friction * float(self.env.state[1])
+        self.env.force_mag = force + direction * push
         return int(action)
 
     def set(self, attribute: str, value: float) -> None:
+        if attribute in {"gain", "bias"}:
+            setattr(self, attribute, value)
+            return
+        if attribute == "friction":  # of the track, in N s/m
+            self._friction = value
+            return
         super().set(attribute, value)
         env = self.env  # computes two quantities once
         env.total_mass = env.masspole + env.masscart
         env.polemass_length = env.masspole * env.length
 
     def get(self, attribute: str) -> float:
+        if attribute in {"gain", "bias"}:
+            return float(getattr(self, attribute))
+        if attribute == "friction":
+            return self._friction
         if attribute == "pole_length":
             return float(self.env.polemass_length / self.env.masspole)
         if attribute == "pole_mass":
@@ -187,11 +233,15 @@ class LunarLander(Simulator):
         step = lunar_lander.LunarLander.step
         own_step = types.FunctionType(step.__code__, self._globals, closure=step.__closure__)
         setattr(self.env, "step", types.MethodType(own_step, self.env))  # noqa: B010  # for mypy
-        self._side_power = float(self._globals["SIDE_ENGINE_POWER"])
+        self._side_power = self._nominal_side = float(self._globals["SIDE_ENGINE_POWER"])
 
     def command(self, action: int) -> int:
         push = {1: -1, 3: 1}.get(int(action), 0)
         self._globals["SIDE_ENGINE_POWER"] = self._side_power * (2 if push * self.wind > 0 else 1)
+        if self.bias:
+            lander = self.env.lander
+            side = self._nominal_side * self.bias
+            lander.ApplyLinearImpulse((side, 0.0), lander.worldCenter, True)
         return 0 if push * self.wind < 0 else int(action)
 
     def set(self, attribute: str, value: float) -> None:
@@ -199,12 +249,30 @@ class LunarLander(Simulator):
             # The environment reads its gravity at reset only; the world's acts at once.
             self.env.world.gravity = (0.0, -value)
             return
+        if attribute == "bias":  # in pushes of a side engine
+            self.bias = value
+            return
+        if attribute == "body_mass":
+            data, lander = self.env.lander.massData, self.env.lander
+            data.I, data.mass = data.I * value / data.mass, value
+            lander.massData = data
+            return
+        if attribute == "friction":
+            for fixture in self.env.moon.fixtures[1:]:  # the first one lies below the ground
+                fixture.friction = value
+            return
         self._globals[attribute.upper()] = value
         self._side_power = value if attribute == "side_engine_power" else self._side_power
 
     def get(self, attribute: str) -> float:
         if attribute == "gravity":
             return -float(self.env.world.gravity[1])
+        if attribute == "bias":
+            return self.bias
+        if attribute == "body_mass":
+            return float(self.env.lander.mass)
+        if attribute == "friction":
+            return float(self.env.moon.fixtures[1].friction)
         return float(self._globals[attribute.upper()])
 
 
@@ -232,18 +300,34 @@ class Bullet(Simulator):
         return row
 
     def command(self, action: Row) -> Row:
-        return np.clip(action + np.float32(self.wind * 0.33), -1, 1) if self.wind else action
+        return np.clip(action + np.float32(self.wind), -1, 1) if self.wind else action
 
     def set(self, attribute: str, value: float) -> None:
+        client = self.env._p  # noqa: SLF001  # the simulator's only handle
         if attribute == "gravity":
-            self.env._p.setGravity(0, 0, -value)  # noqa: SLF001  # the simulator's only handle
+            client.setGravity(0, 0, -value)
+        elif attribute == "body_mass":
+            client.changeDynamics(*self._torso(), mass=value)
+        elif attribute == "friction":
+            for body in self.env.stadium_scene.ground_plane_mjcf:
+                client.changeDynamics(body, -1, lateralFriction=value)
         else:
             self.env.robot.power = value
 
     def get(self, attribute: str) -> float:
-        if attribute != "gravity":
-            return float(self.env.robot.power)
-        return -float(self.env._p.getPhysicsEngineParameters()["gravityAccelerationZ"])  # noqa: SLF001
+        client = self.env._p  # noqa: SLF001  # the simulator's only handle
+        if attribute == "gravity":
+            return -float(client.getPhysicsEngineParameters()["gravityAccelerationZ"])
+        if attribute == "body_mass":
+            return float(client.getDynamicsInfo(*self._torso())[0])
+        if attribute == "friction":
+            ground = self.env.stadium_scene.ground_plane_mjcf[0]
+            return float(client.getDynamicsInfo(ground, -1)[1])
+        return float(self.env.robot.power)
+
+    def _torso(self) -> tuple[int, int]:
+        part = self.env.robot.parts["torso"]
+        return part.bodies[part.bodyIndex], part.bodyPartIndex
 
     def close(self) -> None:
         with quiet_streams():

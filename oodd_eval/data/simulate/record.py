@@ -5,23 +5,27 @@ would choose anyway, since the observations are the same. An episode that equals
 soon after its onset, is drawn again: onset and parameters.
 """
 
+import functools
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, split_condition
 from oodd_eval.data.simulate.anomalies import draw
-from oodd_eval.data.simulate.environments import make
+from oodd_eval.data.simulate.environments import Simulator, make
+from oodd_eval.data.simulate.faults import Fault, make_fault
 from oodd_eval.data.simulate.policies import Policy
+from oodd_eval.data.simulate.values import spread_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
 
 _Rows = NDArray[np.float32]
+_Maker = Callable[[Simulator, np.random.Generator], Fault]
 
 GENERATOR_VERSION: Final = 2  # raised by every change that gives other bytes for the same seed
 
@@ -33,6 +37,27 @@ SHORTEST_TAIL: Final = 20
 
 MAX_REDRAWS: Final = 100
 EVALUATION_SEED: Final = 900_000_000  # outside every split and training
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What all episodes of an environment have in common.
+
+    `episode_cap` is the longest episode in transitions, None for the simulator's own limit; `noise`
+    is that of every sensor in every row, in shares of the sensor's spread.
+    """
+
+    environment: str
+    policy: Policy
+    episode_cap: int | None = None
+    noise: float = 0.0
+
+    def record(self, seed: int) -> "Episode":
+        """Record the nominal episode of a seed; `SimulationError` for a negative one."""
+        if seed < 0:
+            raise SimulationError(f"seed is {seed}, expected a whole number from 0")
+        rows, actions, rewards, over, _ = _run(self, seed)
+        return Episode(Trajectory(rows, actions), rewards, over, seed)
 
 
 class TwinTooShortError(SimulationError):
@@ -59,43 +84,66 @@ class Episode:
 
 
 def record_seed(
-    environment: str, seed: int, anomalies: Iterable[str], *, policy: Policy,
-    episode_cap: int | None = None,
+    environment: str, seed: int, conditions: Iterable[str] | Mapping[str, float | None] = (), *,
+    policy: Policy, episode_cap: int | None = None, noise: float = 0.0,
 ) -> dict[str | None, Episode]:  # fmt: skip
-    """Record the nominal twin of a seed (key None) and one episode per anomaly.
+    """Record the nominal twin of a seed (key None) and one episode per condition.
 
-    Raises `TwinTooShortError` when an onset would not fit, `SimulationError` when an anomaly
-    changes nothing in 100 redraws.
+    Parameters
+    ----------
+    environment, seed
+        Name, and the seed of its reset.
+    conditions
+        Anomalies such as ``"iid"`` with the values of Table 1; or strengths by condition, such as
+        ``{"iid@kept99": 0.1}``, where None stands for Table 1's values.
+    policy
+        It acts on the observations as stored.
+    episode_cap
+        Longest episode in transitions, None for the simulator's own limit.
+    noise
+        Noise of every sensor in every row, in shares of the sensor's spread.
+
+    Raises
+    ------
+    TwinTooShortError
+        When an onset would not fit.
+    SimulationError
+        When an anomaly changes nothing in 100 redraws.
     """
-    names = list(anomalies)
-    check_known("anomaly", ANOMALIES, *names)
-    twin = record_nominal(environment, seed, policy=policy, episode_cap=episode_cap)
-    if names and twin.trajectory.transitions < SHORTEST_TWIN:
+    given = conditions if isinstance(conditions, Mapping) else dict.fromkeys(conditions)
+    check_known("anomaly", ANOMALIES, *(split_condition(name)[0] for name in given))
+    setup = Setup(environment, policy, episode_cap, noise)
+    twin = setup.record(seed)
+    if given and twin.trajectory.transitions < SHORTEST_TWIN:
         raise TwinTooShortError(
             f"the nominal episode of {environment} with seed {seed} has "
             f"{twin.trajectory.transitions} transitions, expected at least {SHORTEST_TWIN}"
         )
     episodes: dict[str | None, Episode] = {None: twin}
-    episodes |= {n: _record_anomalous(environment, n, twin, policy, episode_cap) for n in names}
+    episodes |= {c: record_anomalous(setup, c, given[c], twin) for c in given}
     return episodes
 
 
 def record_nominal(
-    environment: str, seed: int, *, policy: Policy, episode_cap: int | None = None
-) -> Episode:
-    """Record the nominal episode of a seed, a whole number from 0."""
-    if seed < 0:
-        raise SimulationError(f"seed is {seed}, expected a whole number from 0")
-    rows, actions, rewards, over, _ = _run(environment, seed, policy, episode_cap)
-    return Episode(Trajectory(rows, actions), rewards, over, seed)
+    environment: str, seed: int, *, policy: Policy, episode_cap: int | None = None,
+    noise: float = 0.0,
+) -> Episode:  # fmt: skip
+    """Record the nominal episode of a seed, a whole number from 0; see `record_seed`."""
+    return Setup(environment, policy, episode_cap, noise).record(seed)
 
 
 def evaluate_policy(
-    environment: str, policy: Policy, *, episodes: int = 100, seed: int = EVALUATION_SEED
-) -> NDArray[np.float64]:
+    environment: str, policy: Policy, *, episodes: int = 100, seed: int = EVALUATION_SEED,
+    noise: float = 0.0,
+) -> NDArray[np.float64]:  # fmt: skip
     """Return the returns of nominal episodes, a fresh simulator each, seeds ``seed + i``."""
-    recorded = (record_nominal(environment, seed + i, policy=policy) for i in range(episodes))
-    return np.array([float(episode.rewards.sum(dtype=np.float64)) for episode in recorded])
+    setup = Setup(environment, policy, noise=noise)
+    return np.array([return_of(setup.record(seed + i)) for i in range(episodes)])
+
+
+def return_of(episode: Episode) -> float:
+    """Return the sum of an episode's rewards."""
+    return float(episode.rewards.sum(dtype=np.float64))
 
 
 def generator(environment: str, anomaly: str, seed: int, attempt: int) -> np.random.Generator:
@@ -104,21 +152,29 @@ def generator(environment: str, anomaly: str, seed: int, attempt: int) -> np.ran
     return np.random.default_rng([GENERATOR_VERSION, *names, seed, attempt])
 
 
-def _record_anomalous(
-    environment: str, anomaly: str, twin: Episode, policy: Policy, episode_cap: int | None
-) -> Episode:
+def record_anomalous(
+    setup: Setup, condition: str, strength: float | None, twin: Episode, *,
+    redraws: int = MAX_REDRAWS,
+) -> Episode:  # fmt: skip
+    """Record the episode of a twin's seed under one condition; see `record_seed`.
+
+    After so many `redraws` the longest episode is taken.
+    """
+    environment, kind = setup.environment, split_condition(condition)[0]
+    maker: _Maker = functools.partial(draw, environment, kind)
+    if strength is not None:
+        maker = functools.partial(make_fault, environment, kind, strength)
     commands = list(twin.trajectory.actions)
     if ENVIRONMENTS[environment].discrete:
         commands = [int(row.argmax()) for row in commands]
     last = int(LAST_ONSET_SHARE * len(commands))
     longest: Episode | None = None
     tail = -1
-    for attempt in range(MAX_REDRAWS + 1):
-        rng = generator(environment, anomaly, twin.seed, attempt)
+    for attempt in range(redraws + 1):
+        rng = generator(environment, kind, twin.seed, attempt)
         onset = int(rng.integers(FIRST_ONSET, last + 1))
-        given = (commands[: onset - 1], (anomaly, rng))
         rows, actions, rewards, over, parameters = _run(
-            environment, twin.seed, policy, episode_cap, *given
+            setup, twin.seed, commands[: onset - 1], (maker, rng)
         )
         effect = first_difference(rows, twin.trajectory.observations)
         if effect is None or len(rewards) - onset <= tail:
@@ -127,12 +183,16 @@ def _record_anomalous(
         longest = Episode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
         if tail > SHORTEST_TAIL:
             return longest
+    if longest is None and strength is not None:
+        # Too weak to be felt: the episode stays, and counts from its onset on.
+        drawn = (onset, onset, parameters, redraws)
+        return Episode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
     if longest is None:
         raise SimulationError(
-            f"no {anomaly} episode of {environment} with seed {twin.seed} differs from its twin in "
-            f"{MAX_REDRAWS} redraws, expected one: the policy or the simulator ignores the anomaly"
+            f"no {condition} episode of {environment} with seed {twin.seed} differs from its twin "
+            f"in {redraws} redraws, expected one: the policy or the simulator ignores the anomaly"
         )
-    return replace(longest, redraws=MAX_REDRAWS)
+    return replace(longest, redraws=redraws)
 
 
 def first_difference(rows: _Rows, twin: _Rows) -> int | None:
@@ -143,12 +203,13 @@ def first_difference(rows: _Rows, twin: _Rows) -> int | None:
 
 
 def _run(
-    environment: str, seed: int, policy: Policy, episode_cap: int | None,
-    replayed: Sequence[Any] = (), anomaly: tuple[str, np.random.Generator] | None = None,
+    setup: Setup, seed: int, replayed: Sequence[Any] = (),
+    anomaly: tuple[_Maker, np.random.Generator] | None = None,
 ) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:  # fmt: skip
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
-    simulator, drawn, info = make(environment), None, ENVIRONMENTS[environment]
-    cap = info.episode_cap if episode_cap is None else min(info.episode_cap, episode_cap)
+    environment, act, info = setup.environment, setup.policy.act, ENVIRONMENTS[setup.environment]
+    simulator, fault, cap = make(environment), None, setup.episode_cap or info.episode_cap
+    cap, noisy = min(info.episode_cap, cap), _noise(setup, seed)
     actions: list[Any] = []
     rewards: list[float] = []
     over = False
@@ -159,18 +220,28 @@ def _run(
                 f"{environment}'s simulator gave an observation of shape {rows[0].shape}, expected "
                 f"({info.observation_dim},): install the version that oodd-eval[sim] names"
             )
+        rows[0] = noisy(rows[0])
         while not over and (step := len(rewards)) < cap:
+            actions.append(replayed[step] if step < len(replayed) else act(rows[-1]))
             if anomaly is not None and step == len(replayed):
-                drawn, rng = draw(environment, anomaly[0], simulator, anomaly[1]), anomaly[1]
-            actions.append(replayed[step] if step < len(replayed) else policy.act(rows[-1]))
-            if drawn is not None:
-                drawn.apply(simulator, rng, first=step == len(replayed))
-            row, reward, over = simulator.step(actions[-1])
-            rows.append(row if drawn is None else drawn.corrupt(row, len(rows), rng))
+                fault = anomaly[0](simulator, anomaly[1])
+                fault.begin(simulator, rows)
+            given = actions[-1] if fault is None else fault.command(actions[-1], simulator)
+            row, reward, over = simulator.step(given)
+            row = noisy(row)
+            rows.append(row if fault is None else fault.observe(row, len(rows)))
             rewards.append(reward)
     finally:
         simulator.close()
     one_hot = np.eye(info.action_dim, dtype=np.float32)
     commands = one_hot[actions] if info.discrete else np.array(actions, np.float32)
-    parameters = drawn.parameters if drawn is not None else {}
+    parameters = fault.parameters if fault is not None else {}
     return np.array(rows, np.float32), commands, np.array(rewards, np.float32), over, parameters
+
+
+def _noise(setup: Setup, seed: int) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """Return what adds the noise of nominal operation to a row; a seed's draws are the same."""
+    if not setup.noise:
+        return lambda row: row
+    std, rng = setup.noise * spread_of(setup.environment), generator(setup.environment, "", seed, 0)
+    return lambda row: (row + std * rng.normal(size=len(std))).astype(np.float32)

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData, TrajectorySet
 from oodd_eval.data.split import Split
 from oodd_eval.leaderboard.entry import EntryInfo, place_of
@@ -211,7 +211,7 @@ def _check_rows(records: Records, findings: Findings) -> None:
     for (setting, seed), environments in cells.items():
         label = setting.label(seed)
         for environment, present in environments.items():
-            if missing := [a for a in ANOMALIES if a not in present]:
+            if missing := [a for a in TABLE1 if a not in present]:
                 why = "an environment counts with all; run them, or leave out what is not complete"
                 message = f"{environment} lacks {', '.join(missing)}: {why}"
                 findings.refuse(f"records of {label}", "anomaly", message)

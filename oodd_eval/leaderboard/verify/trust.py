@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, TRUST, EntryInfo, Trust
@@ -107,7 +107,7 @@ def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings)
     lines = []
     for setting, own in rows.items():
         present = {(record.environment, record.anomaly) for _, record, _ in own}
-        if not any(all((e, a) in present for a in ANOMALIES) for e, _ in present):
+        if not any(all((e, a) in present for a in TABLE1) for e, _ in present):
             why = "all anomalies of an environment: run it again in one at least"
             findings.refuse("re-run", str(setting), f"is not there with {why}")
             continue

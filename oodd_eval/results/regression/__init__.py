@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
+from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.files import write_text
+from oodd_eval.data.parts import CONDITIONS
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import NAMES, metric_info
@@ -358,10 +359,10 @@ def write_reference(records: Iterable[Record], path: Path | str) -> None:
     """
     records = list(records)
     environments = in_order((r.environment for r in records), ENVIRONMENTS)
-    anomalies = in_order((r.anomaly for r in records), ANOMALIES)
+    conditions = in_order((r.condition for r in records), CONDITIONS)
 
     def order(r: Record) -> tuple[str, str, int, int, str]:
-        place = environments.index(r.environment), anomalies.index(r.anomaly)
+        place = environments.index(r.environment), conditions.index(r.condition)
         return r.split, r.split_digest, *place, str(r.cell)
 
     known, lines = ("oodd_eval", "python", "numpy"), []

@@ -203,7 +203,7 @@ def primary_settings(records: Iterable[Record]) -> set[Setting]:
     by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
-        cells = {(r.environment, r.anomaly) for r in by_row[row]}
+        cells = {r.place for r in by_row[row]}
         return -len(cells), _few_seeds(by_row[row]), len(row.parameters), *_name(row)
 
     found: dict[str, Setting] = {}
@@ -219,7 +219,7 @@ def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None
     detector seeds, unless the seed changes nothing. `ResultsError`: ranked rows differ in their
     numbers of test trajectories, or two rows have one name.
     """
-    own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.environment, r.anomaly))
+    own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.place))
     by_row = grouped(own, lambda r: r.setting)
     labels = Counter(map(str, by_row))
     if twice := [label for label, n in labels.items() if n > 1]:
@@ -228,7 +228,7 @@ def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None
             "tell rows apart: give one of the detectors another name"
         )
     first = primary_settings(records) if primary is None else set(primary)
-    cells = {(r.environment, r.anomaly) for r in records}
+    cells = {r.place for r in records}
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
     ranking, rows = _ranking(by_row, states, first, RANKING)
     by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
@@ -271,7 +271,7 @@ def _ranking(
             own = contribution(r, metric)
             if metric_info(metric).better == "lower":
                 own = Contribution(-own.numerator, own.denominator)
-            row.setdefault(r.seed, {})[r.environment, r.anomaly] = own
+            row.setdefault(r.seed, {})[r.place] = own
     return rank(rows, {str(entry) for entry in primary}), rows
 
 

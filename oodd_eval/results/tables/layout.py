@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, title_of
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.results.identity import Setting
@@ -310,7 +310,7 @@ def notes(board: Board) -> list[str]:
         lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
     benchmark = {*board.environments} <= {*ENVIRONMENTS}
     for group in filter(board.in_group, GROUPS) if benchmark else ():
-        own = [a.id for a in ANOMALIES.values() if a.group == group]
+        own = [a for a in TABLE1 if ANOMALIES[a].group == group]
         if missing := [a for a in own if a not in board.anomalies]:
             lines.append(f"Means over {group} anomalies are without {', '.join(missing)}.")
     if board.brief:

@@ -89,7 +89,7 @@ def cells_csv(ranks: RankedBoard) -> str:
     names = _metrics(ranks)
     return csv_rows([
         {**_setting(one.entry), "seed": r.seed, "environment": r.environment, "group": r.group,
-         "anomaly": r.anomaly, "status": r.status, "brief": str(r.brief).lower(),
+         "anomaly": r.condition, "status": r.status, "brief": str(r.brief).lower(),
          **_ends({name: r.metrics.get(name) for name in names})}
         for one in ranks.standings
         for r in one.records

@@ -1,0 +1,109 @@
+"""Strengths of anomalies by what they cost the policy: the rungs of the suite ladder.
+
+``ladder.json`` is written by ``oodd-eval data calibrate``. A rung ``kept90`` is the strength at
+which the policy keeps .90 of its nominal return; ``4th``, ``16th`` and ``64th`` are these parts of
+the strength of ``kept99``: they cost nothing yet.
+"""
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from oodd_eval.data.facts import ANOMALIES, TABLE1, Suite, join_condition
+from oodd_eval.errors import SplitError
+from oodd_eval.names import check_known
+
+LADDER: Final = Path(__file__).with_name("ladder.json")
+
+LEVELS: Final = MappingProxyType(
+    {"kept99": 0.99, "kept95": 0.95, "kept90": 0.90, "kept75": 0.75, "kept50": 0.50}
+)
+"""Share of the nominal return that the policy keeps, by rung, weakest first."""
+
+FRACTIONS: Final = MappingProxyType({"64th": 1 / 64, "16th": 1 / 16, "4th": 1 / 4})
+"""Parts of the strength of ``kept99``, by rung, weakest first."""
+
+PAPER: Final = "paper"  # the rung at which the return's ratio is that of the paper's Table 2
+
+RUNGS: Final = (*FRACTIONS, *LEVELS, PAPER)
+"""Names of all strengths, weakest first, and the paper's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One strength of a kind of anomaly in one environment.
+
+    Attributes
+    ----------
+    strength, low, high
+        The strength, and the 95 % interval of the one at which the policy keeps that much.
+    kept, kept_low, kept_high
+        Share of its nominal return that the policy keeps at this strength, with 95 % interval:
+        1 - (nominal return - return) / |nominal return|. NaN for ``4th``, ``16th`` and ``64th``.
+    reached
+        False where the largest sensible strength costs less; `strength` is that strength then.
+    """
+
+    strength: float
+    low: float = float("nan")
+    high: float = float("nan")
+    kept: float = float("nan")
+    kept_low: float = float("nan")
+    kept_high: float = float("nan")
+    reached: bool = True
+
+
+@functools.cache
+def read_ladder(path: Path = LADDER) -> Mapping[str, Mapping[str, Any]]:
+    """Return what ``ladder.json`` has for each environment and kind."""
+    found: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def _entry(environment: str, kind: str) -> Mapping[str, Any]:
+    check_known("anomaly", ANOMALIES, kind)
+    found = read_ladder().get(environment, {}).get(kind)
+    if found is None:
+        raise SplitError(
+            f"no strengths of {kind} are calibrated in {environment}: name others, or measure them "
+            f"with `oodd-eval data calibrate --env {environment}`"
+        )
+    entry: Mapping[str, Any] = found
+    return entry
+
+
+def rungs_of(environment: str, kind: str) -> dict[str, Rung]:
+    """Return the rungs of a kind in an environment by name, weakest first.
+
+    Levels that the largest sensible strength does not reach share one rung, that of the highest of
+    them. `SplitError` where nothing is calibrated.
+    """
+    return {name: Rung(**rung) for name, rung in _entry(environment, kind)["rungs"].items()}
+
+
+def strength_of(environment: str, kind: str, rung: str) -> float:
+    """Return the strength of a rung, ``"paper"`` among them; `UnknownNameError` for another."""
+    entry = _entry(environment, kind)
+    known = entry["rungs"] | ({PAPER: entry[PAPER]} if PAPER in entry else {})
+    check_known(f"rung of {kind} in {environment}", known, rung)
+    return float(known[rung]["strength"])
+
+
+def conditions_of(suite: Suite, environment: str) -> dict[str, float | None]:
+    """Return the strength of each condition of a suite; None stands for the values of Table 1."""
+    if suite == "table1":
+        return dict.fromkeys(TABLE1)
+    if suite == "paper":
+        return {join_condition(a, PAPER): strength_of(environment, a, PAPER) for a in TABLE1}
+    kinds = [kind for kind in ANOMALIES if kind in read_ladder().get(environment, {})]
+    if not kinds:
+        _entry(environment, next(iter(ANOMALIES)))
+    return {
+        join_condition(kind, name): rung.strength
+        for kind in kinds
+        for name, rung in rungs_of(environment, kind).items()
+    }

@@ -1,0 +1,283 @@
+"""Find the strengths at which a policy keeps given shares of its return: what a ladder stands on.
+
+Returns are measured on seeds of their own, the same for all strengths, with the first draw of each
+episode. The curve of what is kept against strength is the isotonic regression of these means; a
+level's strength is where the curve crosses it, linear in the logarithm of the strength. Intervals
+are percentiles of a bootstrap over the seeds.
+
+A measured strength is one line of JSON in a work file: an interrupted calibration goes on.
+"""
+
+import functools
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
+from oodd_eval.data.files import write_text
+from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER
+from oodd_eval.data.simulate.policies import load_policy
+from oodd_eval.data.simulate.record import (
+    GENERATOR_VERSION,
+    Episode,
+    Setup,
+    record_anomalous,
+    return_of,
+)
+from oodd_eval.data.simulate.values import bound_of, unit_of
+
+FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
+ROBOTS_CAP: Final = 300  # as in mini; the others run to their end
+STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass
+SMALLEST: Final = 4.0**-7  # of the bound; weaker strengths are not tried
+HALVINGS: Final = 2  # of each level's bracket
+DRAWS: Final = 1000
+
+Floats = NDArray[np.float64]
+Curve = dict[float, list[float]]
+"""Returns of the seeds, in their order, by strength."""
+
+
+def setup_of(environment: str) -> Setup:
+    """Return policy and cap with which returns are measured."""
+    cap = None if ENVIRONMENTS[environment].discrete else ROBOTS_CAP
+    return Setup(environment, load_policy(environment), cap)
+
+
+def episodes_of(environment: str) -> int:
+    """Return the number of seeds: robots take a hundred times longer than the others."""
+    return 100 if ENVIRONMENTS[environment].discrete else 32
+
+
+@functools.cache
+def twins_of(environment: str, first: int = FIRST_SEED, count: int = 0) -> list[Episode]:
+    """Return the nominal episodes of some seeds, by default of all that are measured on."""
+    setup, count = setup_of(environment), count or episodes_of(environment)
+    return [setup.record(first + i) for i in range(count)]
+
+
+def measure(
+    environment: str, kind: str, strength: float, first: int = FIRST_SEED, count: int = 0
+) -> list[float]:
+    """Return the returns of the seeds under an anomaly of a strength."""
+    setup = setup_of(environment)
+    episodes = (
+        record_anomalous(setup, f"{kind}@{strength}", strength, twin, redraws=0)
+        for twin in twins_of(environment, first, count)
+    )
+    return [return_of(episode) for episode in episodes]
+
+
+def kept_shares(returns: Floats, nominal: Floats) -> Floats:
+    """Return the share of the nominal return that is kept: means over the last axis.
+
+    1 - (nominal - return) / |nominal|, so that negative returns count alike.
+    """
+    base = nominal.mean(axis=-1)
+    return np.asarray(1 - (base - returns.mean(axis=-1)) / np.abs(base))
+
+
+def isotonic(values: Floats) -> Floats:
+    """Return the non-increasing least-squares fit along the last axis, of shape (..., n).
+
+    By the min-max formula: the smallest, over starts up to i, of the largest mean of a run that
+    holds i.
+    """
+    n = values.shape[-1]
+    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), values.cumsum(axis=-1)], axis=-1)
+    fitted = np.empty_like(values)
+    for i in range(n):
+        runs = [
+            np.max([(sums[..., b + 1] - sums[..., a]) / (b + 1 - a) for b in range(i, n)], axis=0)
+            for a in range(i + 1)
+        ]
+        fitted[..., i] = np.min(runs, axis=0)
+    return fitted
+
+
+def crossing(strengths: Floats, curve: Floats, level: float) -> float:
+    """Return the weakest strength at which a non-increasing curve is at a level; inf if none is.
+
+    `strengths` rise. Between them the curve is linear in their logarithm, before the first one
+    linear from 1 at strength 0.
+    """
+    below = curve <= level
+    if not below.any():
+        return math.inf
+    i = int(below.argmax())
+    if i == 0:
+        return float(strengths[0] * min(1.0, (1 - level) / max(1 - curve[0], 1e-12)))
+    share = (curve[i - 1] - level) / (curve[i - 1] - curve[i])
+    return float(strengths[i - 1] * (strengths[i] / strengths[i - 1]) ** share)
+
+
+def value_at(strengths: Floats, curves: Floats, strength: float) -> Floats:
+    """Return curves of shape (..., n) at a strength."""
+    x = np.log(strength)
+    logs = np.log(strengths)
+    i = int(np.clip(np.searchsorted(logs, x, side="right"), 1, len(logs) - 1))
+    share = np.clip((x - logs[i - 1]) / (logs[i] - logs[i - 1]), 0, 1)
+    return np.asarray((1 - share) * curves[..., i - 1] + share * curves[..., i])
+
+
+def levels_of(environment: str, kind: str) -> dict[str, float]:
+    """Return the shares to find, by rung; for a kind of the paper that of its Table 2, too."""
+    found = dict(LEVELS)
+    if kind in TABLE1:
+        table = paper_tables()["table2_policy_return"][environment]
+        nominal, changed = float(table["nominal"]), float(table[kind])
+        found[PAPER] = 1 - (nominal - changed) / abs(nominal)
+    return found
+
+
+def next_strength(environment: str, kind: str, curve: Curve, nominal: Sequence[float]) -> float:
+    """Return the strength to measure next; 0 when all levels are found."""
+    bound = bound_of(environment, kind)
+    if not curve:
+        return bound
+    strengths, kept = _means(curve, nominal)
+    # Down from the bound, until the policy keeps all but nothing.
+    weakest = float(strengths[0])
+    if kept[0] < 0.995 and weakest > SMALLEST * bound * 1.01:
+        return weakest / STEP
+    fitted = isotonic(kept)
+    for level in levels_of(environment, kind).values():
+        i = int((fitted <= level).argmax()) if (fitted <= level).any() else 0
+        if i and strengths[i] / strengths[i - 1] > STEP ** (0.5**HALVINGS) * 1.01:
+            return float(math.sqrt(strengths[i] * strengths[i - 1]))
+    return 0.0
+
+
+def _means(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats]:
+    strengths = np.array(sorted(curve))
+    returns = np.array([curve[s] for s in strengths])
+    return strengths, kept_shares(returns, np.array(nominal))
+
+
+def find_rungs(
+    environment: str, kind: str, curve: Curve, nominal: Sequence[float]
+) -> dict[str, Any]:
+    """Return the entry of a kind in ``ladder.json`` from measured returns."""
+    bound = bound_of(environment, kind)
+    strengths, kept = _means(curve, nominal)
+    base, returns = np.array(nominal), np.array([curve[s] for s in strengths])
+    drawn = np.random.default_rng(0).integers(len(base), size=(DRAWS, len(base)))
+    draws = isotonic(kept_shares(returns[:, drawn], base[drawn]).T)
+    fitted = isotonic(kept)
+
+    def rung(level: float) -> dict[str, Any]:
+        crossings = [min(crossing(strengths, own, level), bound) for own in draws]
+        found = crossing(strengths, fitted, level)
+        strength = _rounded(min(found, bound))
+        low, high = np.percentile(crossings, [2.5, 97.5])
+        at = value_at(strengths, draws, strength)
+        kept_low, kept_high = np.percentile(at, [2.5, 97.5])
+        return {
+            "strength": strength, "low": _rounded(low), "high": _rounded(high),
+            "kept": _rounded(float(value_at(strengths, fitted, strength))),
+            "kept_low": _rounded(kept_low), "kept_high": _rounded(kept_high),
+            "reached": bool(found <= bound),
+        }  # fmt: skip
+
+    levels = levels_of(environment, kind)
+    rungs: dict[str, dict[str, Any]] = {}
+    for name in LEVELS:
+        found = rung(levels[name])
+        if not rungs or found["strength"] > max(r["strength"] for r in rungs.values()):
+            rungs[name] = found
+    weak = {
+        n: {"strength": _rounded(f * rungs["kept99"]["strength"])} for n, f in FRACTIONS.items()
+    }
+    entry = {"unit": unit_of(environment, kind), "bound": bound, "rungs": weak | rungs}
+    return entry | ({PAPER: rung(levels[PAPER])} if PAPER in levels else {})
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def calibrate(
+    output: Path, work: Path, *, environments: Iterable[str], kinds: Sequence[str],
+    jobs: int | None = None, progress: Callable[[str], None] = lambda _text: None,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """Measure and find the rungs of some environments and kinds; return all that `output` has.
+
+    Returns that `work` holds are not measured again. Entries of other environments and kinds in
+    `output` are kept.
+    """
+    places = [(e, kind) for e in environments for kind in kinds]
+    measured = _read_work(work)
+    key = {e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e)] for e, _ in places}
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    spawn = multiprocessing.get_context("spawn")
+    work.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        patch.dict(os.environ, single),
+        ProcessPoolExecutor(jobs or os.cpu_count() or 1, spawn) as pool,
+        work.open("a", encoding="utf-8") as lines,
+    ):
+
+        def keep(e: str, kind: str, strength: float, returns: list[float]) -> None:
+            line = {"key": key[e], "environment": e, "kind": kind, "strength": strength}
+            lines.write(json.dumps(line | {"returns": returns}) + "\n")
+            lines.flush()
+            measured[_identity(line)] = returns
+
+        def results(tasks: Mapping[Any, tuple[str, str, float]]) -> Iterator[tuple[str, str]]:
+            pending = dict(tasks)
+            while pending:
+                done = next(as_completed(pending))
+                e, kind, strength = pending.pop(done)
+                keep(e, kind, strength, done.result())
+                yield e, kind
+                if found := following(e, kind):
+                    pending[pool.submit(measure, *found)] = found
+
+        def curve(e: str, kind: str) -> Curve:
+            return {i[3]: r for i, r in measured.items() if i[:3] == (str(key[e]), e, kind)}
+
+        def following(e: str, kind: str) -> tuple[str, str, float] | None:
+            own = curve(e, kind)
+            if not own or (nominal := curve(e, "")) == {}:
+                return e, kind, bound_of(e, kind)
+            strength = next_strength(e, kind, own, nominal[0.0])
+            return (e, kind, strength) if strength else None
+
+        for e in dict.fromkeys(e for e, _ in places):
+            if not curve(e, ""):
+                keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e)])
+        first = {p: following(*p) for p in places}
+        tasks = {pool.submit(measure, *task): task for task in first.values() if task}
+        for count, (e, kind) in enumerate(results(tasks), 1):
+            progress(f"{count}  {e} {kind}")
+        found = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+        for e, kind in places:
+            own = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0])
+            found.setdefault(e, {})[kind] = own
+    ordered = {e: found[e] for e in ENVIRONMENTS if e in found}
+    write_text(output, json.dumps(ordered, indent=1) + "\n")
+    return ordered
+
+
+def _identity(line: Mapping[str, Any]) -> tuple[str, str, str, float]:
+    return str(line["key"]), line["environment"], line["kind"], line["strength"]
+
+
+def _read_work(work: Path) -> dict[tuple[str, str, str, float], list[float]]:
+    found = {}
+    for text in work.read_text(encoding="utf-8").splitlines() if work.exists() else ():
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:  # the end of an interrupted write
+            continue
+        found[_identity(line)] = line["returns"]
+    return found

@@ -1,0 +1,361 @@
+"""Anomalies with one scalar strength: the kinds of the suite ladder.
+
+A kind's strength is 0 for nothing at all. Its unit and its largest sensible strength depend on the
+environment, see `oodd_eval.data.simulate.values`. What a fault draws (sensors, actuator, noise)
+depends on the generator and not on its strength: two strengths differ in nothing else.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.simulate.environments import Row, Simulator
+from oodd_eval.data.simulate.values import VALUES, choose_sensors, spread_of
+
+ON, PERIOD = 10, 50  # an intermittent fault acts on 10 rows, then rests for 40
+AR: Final = 0.9  # coefficient of the correlated noise
+
+Command = Any
+"""The number of a discrete action, or a float32 row of shape (A,)."""
+
+
+class Fault:
+    """One anomaly as drawn for one episode; it acts from the onset on.
+
+    Parameters
+    ----------
+    parameters
+        What was drawn, as plain JSON; stored with the episode. Corrupted sensors are listed under
+        ``"sensors"``.
+    """
+
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        self.parameters = parameters
+
+    def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
+        """Prepare, once, before the transition onto the onset; `rows` are those seen until then."""
+
+    def command(self, action: Command, simulator: Simulator) -> Command:
+        """Return what the simulator is given for an action; called before every transition."""
+        return action
+
+    def observe(self, row: Row, step: int) -> Row:
+        """Return the observation row number `step` as the broken sensors report it."""
+        return row
+
+
+class SensorFault(Fault):
+    """A fault of some sensors: `change` gets and returns their values, float64 of shape (k,)."""
+
+    def __init__(self, sensors: NDArray[np.intp], change: Callable[..., Any], **drawn: Any) -> None:
+        super().__init__({"sensors": [int(s) for s in sensors], **drawn})
+        self.sensors, self._change = sensors, change
+        self._before: Sequence[Row] = ()
+
+    def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
+        """Keep the rows until now: some faults repeat them."""
+        self._before = list(rows)
+
+    def observe(self, row: Row, step: int) -> Row:
+        """Return the row with the values of the chosen sensors changed."""
+        values = row[self.sensors].astype(np.float64)
+        changed = row.copy()
+        changed[self.sensors] = np.asarray(self._change(values, step), dtype=np.float32)
+        return changed
+
+    def history(self) -> NDArray[np.float64]:
+        """Return what the chosen sensors measured before the onset, of shape (rows, k)."""
+        return np.array([row[self.sensors] for row in self._before], dtype=np.float64)
+
+
+class Intermittent(Fault):
+    """Another fault, on for 10 rows and off for 40, beginning at the onset."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.parameters)
+        self._fault, self._rows = fault, 0
+
+    def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
+        """Prepare the fault."""
+        self._fault.begin(simulator, rows)
+
+    def command(self, action: Command, simulator: Simulator) -> Command:
+        """Let the fault act on the command, or put the simulator back."""
+        changed = self._fault.command(action, simulator)
+        if self._rows % PERIOD < ON:
+            return changed
+        simulator.restore()
+        return action
+
+    def observe(self, row: Row, step: int) -> Row:
+        """Let the fault act on the row while it is on; draws go on while it is off."""
+        changed = self._fault.observe(row, step)
+        self._rows += 1
+        return changed if (self._rows - 1) % PERIOD < ON else row
+
+
+class Dynamics(Fault):
+    """A fault of the dynamics: `act` gets action and simulator and returns the command."""
+
+    def __init__(self, act: Callable[[Command, Simulator], Command], **drawn: Any) -> None:
+        super().__init__(drawn)
+        self._act = act
+
+    def command(self, action: Command, simulator: Simulator) -> Command:
+        """Return what the fault makes of the action."""
+        return self._act(action, simulator)
+
+
+def make_fault(
+    environment: str, kind: str, strength: float, simulator: Simulator, rng: np.random.Generator
+) -> Fault:
+    """Draw a fault of one kind for one episode.
+
+    Parameters
+    ----------
+    environment, kind
+        Names of the benchmark.
+    strength
+        From 0, which changes nothing, to the kind's bound.
+    simulator
+        The episode's simulator, from which nominal values are read.
+    rng
+        Generator of this episode's draws.
+    """
+    base, intermittent = kind.removesuffix("-intermittent"), kind.endswith("-intermittent")
+    if base == "wind" and intermittent:
+        base = "wind-l2r"
+    fault = _MAKERS[base](environment, float(strength), simulator, rng)
+    fault.parameters["strength"] = float(strength)
+    return Intermittent(fault) if intermittent else fault
+
+
+_Maker = Callable[[str, float, Simulator, np.random.Generator], Fault]
+
+
+def _noise(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    sensors = choose_sensors(environment, rng)
+    std = strength * spread_of(environment)[sensors]
+    return SensorFault(sensors, lambda x, _: x + std * rng.normal(size=len(x)))
+
+
+def _calibration(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    return SensorFault(choose_sensors(environment, rng), lambda x, _: x * (1 + strength))
+
+
+def _drift(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    sensors = choose_sensors(environment, rng)
+    slope = strength * spread_of(environment)[sensors]
+    return SensorFault(sensors, lambda x, step: x + slope * step)
+
+
+def _shutdown(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    return SensorFault(choose_sensors(environment, rng), lambda x, _: x * (1 - strength))
+
+
+def _ar1(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    """x_t = 0.9 x_{t-1} + e_t in each sensor, from its stationary distribution on."""
+    sensors = choose_sensors(environment, rng)
+    std, state = strength * spread_of(environment)[sensors], rng.normal(size=len(sensors))
+
+    def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
+        nonlocal state
+        found = x + std * state
+        state = AR * state + np.sqrt(1 - AR**2) * rng.normal(size=len(state))
+        return found
+
+    return SensorFault(sensors, change)
+
+
+def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    """x_t = A x_{t-1} + e_t + 0.4 e_{t-1}, e_t correlated by .5, scaled to the variance of iid.
+
+    A has 0.7 on its diagonal, and -0.2 from each sensor to the next.
+    """
+    sensors = choose_sensors(environment, rng)
+    k = len(sensors)
+    a = 0.7 * np.eye(k) - (0.2 * np.eye(k, k=1) if k > 1 else 0)
+    root = np.linalg.cholesky(0.5 * np.eye(k) + 0.5)
+    # State (x, e): its stationary covariance solves S = F S F' + G G'.
+    forward = np.block([[a, 0.4 * np.eye(k)], [np.zeros((k, 2 * k))]])
+    driven = np.vstack([root, root])
+    covariance = driven @ driven.T
+    for __ in range(200):
+        covariance = forward @ covariance @ forward.T + driven @ driven.T
+    scale = strength * spread_of(environment)[sensors] / np.sqrt(np.diag(covariance)[:k])
+    state = np.linalg.cholesky(covariance + 1e-12 * np.eye(2 * k)) @ rng.normal(size=2 * k)
+
+    def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
+        nonlocal state
+        found = x + scale * state[:k]
+        state = forward @ state + driven @ rng.normal(size=k)
+        return found
+
+    return SensorFault(sensors, change)
+
+
+def _delay(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    """Between two whole numbers of steps: the mean of both rows, weighted."""
+    whole, part = int(strength), strength - int(strength)
+    recent: deque[NDArray[np.float64]] = deque(maxlen=whole + 2)
+
+    def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
+        if not recent:
+            recent.extend(fault.history())
+        recent.append(x)
+        newer, older = recent[max(-1 - whole, -len(recent))], recent[max(-2 - whole, -len(recent))]
+        return (1 - part) * newer + part * older if part else newer
+
+    fault = SensorFault(choose_sensors(environment, rng), change)
+    return fault
+
+
+def _stuck(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
+        return (1 - strength) * x + strength * fault.history()[-1] if strength else x
+
+    fault = SensorFault(choose_sensors(environment, rng), change)
+    return fault
+
+
+def _wind(direction: int) -> _Maker:
+    def maker(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+        discrete = ENVIRONMENTS[environment].discrete
+
+        def act(action: Command, simulator: Simulator) -> Command:
+            gust = rng.random() < strength if discrete else True
+            simulator.wind = direction * (1 if discrete else strength) if gust else 0
+            return action
+
+        return Dynamics(act, direction=direction)
+
+    return maker
+
+
+def _setting(names: Sequence[str], factor: float, **drawn: Any) -> Fault:
+    """Return a fault that multiplies attributes of the simulator."""
+
+    def act(action: Command, simulator: Simulator) -> Command:
+        for name in names:
+            simulator.scale(name, factor)
+        return action
+
+    return Dynamics(act, **drawn)
+
+
+def _gravity(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> Fault:
+    return _setting(["gravity"], 1 + strength)
+
+
+def _mass(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> Fault:
+    return _setting(["body_mass"], 1 + strength)
+
+
+def _components(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    """Scale a random non-empty subset: lengths and masses grow, powers shrink."""
+    known = sorted(VALUES["components"][environment])
+    names: list[str] = []
+    while not names:
+        chosen = rng.random(len(known)) < 0.5
+        names = [name for name, use in zip(known, chosen, strict=True) if use]
+    weaker = any("power" in name for name in known)
+    return _setting(names, 1 - strength if weaker else 1 + strength, attributes=names)
+
+
+def _friction(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> Fault:
+    def act(action: Command, simulator: Simulator) -> Command:
+        if simulator.nominal("friction"):
+            simulator.scale("friction", 1 - strength)
+        elif strength:
+            simulator.set("friction", strength)
+        return action
+
+    return Dynamics(act)
+
+
+def _gain(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    if environment == "lunarlander":
+        engine = ("main_engine_power", "side_engine_power")[rng.integers(2)]
+        return _setting([engine], 1 - strength, actuator=engine)
+    if ENVIRONMENTS[environment].discrete:
+        return _setting(["gain"], 1 - strength)
+    j = int(rng.integers(ENVIRONMENTS[environment].action_dim))
+    return Dynamics(lambda a, _: _replaced(a, j, a[j] * (1 - strength)), actuator=j)
+
+
+def _bias(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    sign = int(rng.choice([-1, 1]))
+    if ENVIRONMENTS[environment].discrete:
+
+        def push(action: Command, simulator: Simulator) -> Command:
+            simulator.set("bias", sign * strength)
+            return action
+
+        return Dynamics(push, direction=sign)
+    j = int(rng.integers(ENVIRONMENTS[environment].action_dim))
+    act = lambda a, _: _replaced(a, j, np.clip(a[j] + sign * strength, -1, 1))  # noqa: E731
+    return Dynamics(act, actuator=j, direction=sign)
+
+
+def _stuck_joint(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    """Discrete: with a probability the first command is carried out again."""
+    info = ENVIRONMENTS[environment]
+    first: list[Command] = []
+    j = int(rng.integers(info.action_dim))
+
+    def act(action: Command, _: Simulator) -> Command:
+        if not first:
+            first.append(action if info.discrete else float(action[j]))
+        if info.discrete:
+            return first[0] if rng.random() < strength else action
+        return _replaced(action, j, (1 - strength) * action[j] + strength * first[0])
+
+    return Dynamics(act, **({} if info.discrete else {"actuator": j}))
+
+
+def _latency(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
+    """Between two whole numbers of steps: the mean of both commands, discrete: one by chance."""
+    discrete, whole, part = ENVIRONMENTS[environment].discrete, int(strength), strength % 1
+    recent: deque[Command] = deque(maxlen=whole + 2)
+
+    def act(action: Command, _: Simulator) -> Command:
+        recent.append(action)
+        newer, older = recent[max(-1 - whole, -len(recent))], recent[max(-2 - whole, -len(recent))]
+        if discrete:
+            return older if rng.random() < part else newer
+        return ((1 - part) * newer + part * older).astype(np.float32) if part else newer
+
+    return Dynamics(act)
+
+
+def _action_noise(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    """Discrete: with a probability the command is drawn at random."""
+    info = ENVIRONMENTS[environment]
+
+    def act(action: Command, _: Simulator) -> Command:
+        if info.discrete:
+            other, chance = int(rng.integers(info.action_dim)), rng.random()
+            return other if chance < strength else action
+        noise = strength * rng.normal(size=info.action_dim)
+        return np.clip(action + noise, -1, 1).astype(np.float32) if strength else action
+
+    return Dynamics(act)
+
+
+def _replaced(action: Row, j: int, value: float) -> Row:
+    changed = action.copy()
+    changed[j] = value
+    return changed
+
+
+_MAKERS: Final[dict[str, _Maker]] = {
+    "iid": _noise, "calibration": _calibration, "drift": _drift, "shutdown": _shutdown,
+    "wind-l2r": _wind(1), "wind-r2l": _wind(-1), "gravity": _gravity, "components": _components,
+    "ar1": _ar1, "varma": _varma, "delay": _delay, "stuck": _stuck, "gain": _gain, "bias": _bias,
+    "stuck-joint": _stuck_joint, "latency": _latency, "action-noise": _action_noise,
+    "mass": _mass, "friction": _friction,
+}  # fmt: skip
