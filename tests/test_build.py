@@ -73,7 +73,7 @@ def test_a_built_split_holds_what_recording_gives(built):
 
 def test_the_manifest_names_recipe_policy_and_versions(built):
     manifest = load_split(built).manifest
-    assert manifest["definition"] == dataclasses.asdict(SMALL)
+    assert manifest["definition"] == SMALL.recipe
     assert manifest["environments"]["cartpole"]["policy"] == load_policy("cartpole").digest
     assert {"oodd-eval", "numpy", "gymnasium", "python"} <= set(manifest["versions"])
 
@@ -163,13 +163,14 @@ def test_a_killed_build_resumes_and_leaves_no_worker(built, tmp_path, monkeypatc
 
 
 def test_a_chunk_is_named_by_everything_its_content_depends_on(monkeypatch):
-    chunk = Chunk("cartpole", "train", 7, 5, 60, "", "a" * 64)
+    chunk = Chunk("cartpole", "train", 7, 5, 60, 0.0, (), "a" * 64, "")
     changes = [
         {"environment": "ant"}, {"part": "test"}, {"first_seed": 8}, {"count": 6},
-        {"episode_cap": None}, {"policy_digest": "b" * 64},
+        {"episode_cap": None}, {"policy_digest": "b" * 64}, {"noise": 0.01},
+        {"conditions": (("iid@kept99", 0.1),)}, {"conditions": (("iid@kept99", 0.2),)},
     ]  # fmt: skip
     names = {dataclasses.replace(chunk, **change).file_name for change in [{}, *changes]}
-    assert len(names) == 7
+    assert len(names) == 10
     assert dataclasses.replace(chunk, policy="elsewhere.npz").file_name == chunk.file_name
     monkeypatch.setattr(build, "GENERATOR_VERSION", 999)
     assert chunk.file_name not in names

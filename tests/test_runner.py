@@ -544,7 +544,7 @@ def test_cells_name_what_is_not_a_default(tuned):
 @pytest.mark.parametrize(
     ("change", "scores", "fit"),
     [
-        ({"split": "tiny"}, True, True),
+        ({"split": "another"}, True, True),
         ({"seeds": [4]}, True, True),
         ({"environments": ["hopper"]}, True, True),
         ({"limit": 3}, True, True),
@@ -556,7 +556,11 @@ def test_cells_name_what_is_not_a_default(tuned):
         ({"device": "cuda"}, False, False),
     ],
 )
-def test_everything_that_decides_scores_or_the_fit_is_in_their_key(tuned, change, scores, fit):
+def test_everything_that_decides_scores_or_the_fit_is_in_their_key(
+    tuned, tiny_split, change, scores, fit
+):
+    if "split" in change:
+        change = {"split": tiny_split, "environments": ["cartpole"]}
     before, after = tuned_unit(tuned), tuned_unit(tuned, **change)
     assert (before.scores_key != after.scores_key, before.fit_key != after.fit_key) == (scores, fit)
 

@@ -118,8 +118,9 @@ def test_an_unknown_anomaly_is_refused():
 
 
 def corrupt(anomaly, row, step=0, seed=0, **parameters):
-    drawn = Draw(anomaly, parameters, sensors=np.array([1, 3]))
-    return drawn.corrupt(np.array(row, np.float32), step, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    drawn = Draw(anomaly, parameters, rng, sensors=np.array([1, 3]))
+    return drawn.observe(np.array(row, np.float32), step)
 
 
 def test_corrupted_values_worked_by_hand():
@@ -134,7 +135,7 @@ def test_corrupted_values_worked_by_hand():
 def test_corruption_rounds_once_to_float32_and_leaves_its_input():
     row = np.array([0.0, 0.1, 0.0, 1e8], np.float32)
     kept = row.copy()
-    found = Draw("drift", {"slope": 1e-4}, sensors=np.array([1, 3])).corrupt(row, 7, None)
+    found = Draw("drift", {"slope": 1e-4}, None, sensors=np.array([1, 3])).observe(row, 7)
     assert found.dtype == np.float32
     assert found[1] == np.float32(float(np.float32(0.1)) + 7e-4)
     assert (row == kept).all()
@@ -142,8 +143,8 @@ def test_corruption_rounds_once_to_float32_and_leaves_its_input():
 
 def test_noise_is_fresh_every_step_and_sensor_with_the_stated_moments():
     rng = np.random.default_rng(0)
-    drawn = Draw("iid", {"mean": 2.0, "std": 3.0}, sensors=np.array([0, 2]))
-    rows = np.array([drawn.corrupt(np.zeros(3, np.float32), t, rng) for t in range(4000)])
+    drawn = Draw("iid", {"mean": 2.0, "std": 3.0}, rng, sensors=np.array([0, 2]))
+    rows = np.array([drawn.observe(np.zeros(3, np.float32), t) for t in range(4000)])
     assert (rows[:, 1] == 0).all()
     noise = rows[:, [0, 2]]
     np.testing.assert_allclose(noise.mean(axis=0), 2.0, atol=5 * 3 / 4000**0.5)
@@ -154,7 +155,7 @@ def test_noise_is_fresh_every_step_and_sensor_with_the_stated_moments():
 
 def test_dynamics_anomalies_leave_observations_alone():
     row = np.ones(3, np.float32)
-    assert Draw("gravity", {"gravity": 9.0}).corrupt(row, 3, None) is row
+    assert Draw("gravity", {"gravity": 9.0}, None).observe(row, 3) is row
 
 
 # Action on the simulator
@@ -162,10 +163,10 @@ def test_dynamics_anomalies_leave_observations_alone():
 
 def test_gusts_come_with_the_stated_probability_and_are_drawn_every_step():
     simulator, rng = SimpleNamespace(wind=0), np.random.default_rng(0)
-    drawn = Draw("wind-r2l", {"direction": -1, "probability": 0.66})
+    drawn = Draw("wind-r2l", {"direction": -1, "probability": 0.66}, rng)
     winds = []
-    for t in range(4000):
-        drawn.apply(simulator, rng, first=t == 0)
+    for _ in range(4000):
+        assert drawn.command(2, simulator) == 2
         winds.append(simulator.wind)
     assert set(winds) == {0, -1}
     assert -np.mean(winds) == pytest.approx(0.66, abs=5 * (0.66 * 0.34 / 4000) ** 0.5)
@@ -174,18 +175,19 @@ def test_gusts_come_with_the_stated_probability_and_are_drawn_every_step():
 
 def test_bullet_wind_blows_in_every_step():
     simulator, rng = SimpleNamespace(wind=0), np.random.default_rng(0)
-    drawn = Draw("wind-l2r", {"direction": 1, "strength": 0.33})
+    drawn = Draw("wind-l2r", {"direction": 1, "strength": 0.33}, rng)
     for _ in range(20):
         simulator.wind = 0
-        drawn.apply(simulator, rng, first=False)
-        assert simulator.wind == 1
+        drawn.command(2, simulator)
+        assert simulator.wind == 0.33
 
 
 def test_attributes_are_set_once_at_the_onset():
     calls = []
     simulator = SimpleNamespace(wind=0, set=lambda *a: calls.append(a))
-    drawn = Draw("components", {}, attributes={"power": 0.6})
-    for first in (True, False, False):
-        drawn.apply(simulator, None, first=first)
+    drawn = Draw("components", {}, None, attributes={"power": 0.6})
+    drawn.begin(simulator, [])
+    for _ in range(3):
+        drawn.command(2, simulator)
     assert calls == [("power", 0.6)]
     assert simulator.wind == 0

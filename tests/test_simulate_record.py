@@ -187,7 +187,7 @@ def test_draws_that_change_nothing_are_redrawn_and_counted(monkeypatch):
     def idle_twice(environment, anomaly, simulator, rng):
         calls.append(anomaly)
         drawn = true_draw(environment, anomaly, simulator, rng)
-        return drawn if len(calls) > 2 else Draw("drift", drawn.parameters)
+        return drawn if len(calls) > 2 else Draw("drift", drawn.parameters, rng)
 
     monkeypatch.setattr(recording, "draw", idle_twice)
     episode = record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
@@ -199,7 +199,7 @@ def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeyp
 
     def idle(environment, anomaly, simulator, rng):
         calls.append(anomaly)
-        return Draw("drift", {})
+        return Draw("drift", {}, rng)
 
     monkeypatch.setattr(recording, "draw", idle)
     with pytest.raises(SimulationError, match="no drift episode of cartpole with seed 1 differs"):
@@ -214,7 +214,7 @@ def scripted(monkeypatch, script):
     )
     attempts = []
 
-    def run(environment, seed, policy, cap, replayed, anomaly):
+    def run(setup, seed, replayed, anomaly):
         _, length, effect = script(len(attempts) - 1)
         rows = np.zeros((length + 1, 4), np.float32)
         if effect is not None:
@@ -229,7 +229,7 @@ def scripted(monkeypatch, script):
 
     monkeypatch.setattr(recording, "_run", run)
     monkeypatch.setattr(recording, "generator", generator)
-    found = recording._record_anomalous("cartpole", "iid", twin, None, None)
+    found = recording.record_anomalous(recording.Setup("cartpole", None), "iid", None, twin)
     assert attempts == list(range(len(attempts)))
     return found, len(attempts)
 

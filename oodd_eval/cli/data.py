@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from oodd_eval.cli import Parser, at_least, value
@@ -34,6 +35,7 @@ def define(parser: Parser) -> None:
         build,
         "data build standard --jobs 2",
         "data build dev --train 120 --calibration 40 --test 20 --cap 500 --seed-base 41",
+        "data build dev-ladder --base dev --suite ladder",
     )
     add("name", help="a published split, or a new name with sizes and a seed base of its own")
     add("--train", type=int, metavar="N", help="training trajectories per environment")
@@ -41,6 +43,10 @@ def define(parser: Parser) -> None:
     add("--test", type=int, metavar="N", help="test seeds per environment")
     add("--cap", type=int, metavar="T", help="longest episode (default: the simulator's)")
     add("--seed-base", type=int, metavar="K", help="base of the seeds, apart from published ones")
+    add("--noise", type=float, metavar="SHARE",
+        help="noise of all sensors in nominal operation, in shares of their spread")
+    add("--base", metavar="SPLIT", help="take training and calibration part, and test seeds")
+    add("--suite", choices=["ladder", "paper"], help="strengths of anomalies; needs --base")
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
     add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
     add("--output", type=Path, metavar="DIR", help=place)
@@ -121,11 +127,26 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
     name, cap = options.name, options.cap
     sizes = {"train": options.train, "calibration": options.calibration, "test": options.test,
              "seed-base": options.seed_base}  # fmt: skip
+    others = {"cap": cap, "noise": options.noise}
+    given = [n for n, size in {**sizes, **others}.items() if size is not None]
     if name in SPLITS:
-        if given := [n for n, size in {**sizes, "cap": cap}.items() if size is not None]:
+        given += [n for n in ("base", "suite") if getattr(options, n) is not None]
+        if given:
             other = f"--{given[0]} would make another; give that a name of its own"
             raise UsageError(f"split {name!r} is published: {other}")
         return SPLITS[name]
+    if not name.isprintable() or set(name) & set("/@: "):
+        raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
+    if options.base:
+        if given or not options.suite:
+            raise UsageError(
+                f"--base {options.base} gives split {name!r} its sizes and seeds: expected --suite "
+                f"ladder or --suite paper, and none of --{', --'.join([*sizes, *others])}"
+            )
+        base = SplitDefinition(**load_split(options.base).manifest["definition"])
+        return replace(base, name=name, suite=options.suite, base=options.base)
+    if options.suite:
+        raise UsageError(f"--suite {options.suite} needs --base, a split to take training from")
     if missing := [f"--{n}" for n, size in sizes.items() if size is None]:
         known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
         raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
@@ -135,9 +156,9 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
             f"--seed-base is {seed_base}, expected {OWN_SEED_BASES.start} to "
             f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
-    if not name.isprintable() or set(name) & set("/@: "):
-        raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
-    return SplitDefinition(name, train, calibration, test, cap, seed_base)
+    return SplitDefinition(
+        name, train, calibration, test, cap, seed_base, noise=options.noise or 0.0
+    )
 
 
 def import_logs(options: argparse.Namespace) -> int:

@@ -30,6 +30,8 @@ def define(parser: Parser) -> None:
     add("--policy", metavar="FILE", help="policy file (default: the frozen one)")
     add("--episodes", type=at_least(1), default=100, metavar="N",
         help="fresh episodes (default: 100)")
+    add("--noise", type=float, default=0.0, metavar="SHARE",
+        help="noise of all sensors, in shares of their spread (default: 0)")
     # fmt: on
 
 
@@ -45,7 +47,8 @@ def train(options: argparse.Namespace) -> int:
 def evaluate(options: argparse.Namespace) -> int:
     """Carry out ``policies evaluate``: mean return over fresh nominal episodes."""
     name = options.environment
-    found = evaluate_policy(name, load_policy(name, options.policy), episodes=options.episodes)
+    found = evaluate_policy(name, load_policy(name, options.policy), episodes=options.episodes,
+                            noise=options.noise)  # fmt: skip
     mean, paper = f"{found.mean():.1f} ± {found.std():.1f}", ENVIRONMENTS[name].paper_return
     make_console().print(f"{name}: return {mean} over {options.episodes} episodes (paper: {paper})")
     return 0

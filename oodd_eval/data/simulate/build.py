@@ -124,7 +124,7 @@ def build_split(
         info = ENVIRONMENTS[environment]
         entries[environment] = layout.write_environment(
             target, groups, digests[environment], sensors=info.sensors, actions=info.actions
-        )
+        ) | _strengths(definition, environment)
     ordered = {e: entries[e] for e in ENVIRONMENTS if e in entries}
     versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
     layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
@@ -139,6 +139,8 @@ def _check_sizes(definition: SplitDefinition) -> None:
             raise UsageError(f"{part} must have 1 to 200000 trajectories, got {size}")
     if definition.episode_cap is not None and definition.episode_cap < 60:
         raise UsageError(f"the episode cap must be at least 60, got {definition.episode_cap}")
+    if not 0 <= definition.noise <= 1:
+        raise UsageError(f"the noise must be 0 to 1 of the spread, got {definition.noise}")
     if definition.seed_base < 0:
         raise UsageError(f"the seed base must not be negative, got {definition.seed_base}")
 
@@ -157,11 +159,19 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     for environment in split.environments:
         entry = manifest["environments"][environment]
         same_policy = digests.get(environment, entry["policy"]) == entry["policy"]
-        if manifest["generator"] == GENERATOR_VERSION and same_policy:
+        same = _strengths(definition, environment).items() <= entry.items()
+        if manifest["generator"] == GENERATOR_VERSION and same_policy and same:
             with contextlib.suppress(SplitError):  # a damaged file is built again
                 split.environment(environment).close()
                 kept[environment] = entry
     return kept
+
+
+def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
+    """Return the strength of each condition of a suite, as an entry of the manifest."""
+    if definition.suite == "table1":
+        return {}
+    return {"strengths": conditions_of(definition.suite, environment)}
 
 
 def _base(

@@ -122,8 +122,9 @@ def crossing(strengths: Floats, curve: Floats, level: float) -> float:
 
 def value_at(strengths: Floats, curves: Floats, strength: float) -> Floats:
     """Return curves of shape (..., n) at a strength."""
-    x = np.log(strength)
-    logs = np.log(strengths)
+    if len(strengths) == 1:
+        return np.asarray(curves[..., 0])
+    x, logs = np.log(strength), np.log(strengths)
     i = int(np.clip(np.searchsorted(logs, x, side="right"), 1, len(logs) - 1))
     share = np.clip((x - logs[i - 1]) / (logs[i] - logs[i - 1]), 0, 1)
     return np.asarray((1 - share) * curves[..., i - 1] + share * curves[..., i])

@@ -207,9 +207,9 @@ def _run(
     anomaly: tuple[_Maker, np.random.Generator] | None = None,
 ) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:  # fmt: skip
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
-    environment, act, info = setup.environment, setup.policy.act, ENVIRONMENTS[setup.environment]
-    simulator, fault, cap = make(environment), None, setup.episode_cap or info.episode_cap
-    cap, noisy = min(info.episode_cap, cap), _noise(setup, seed)
+    environment, policy, fault = setup.environment, setup.policy, None
+    simulator, info, noisy = make(environment), ENVIRONMENTS[environment], _noise(setup, seed)
+    cap = min(info.episode_cap, setup.episode_cap or info.episode_cap)
     actions: list[Any] = []
     rewards: list[float] = []
     over = False
@@ -222,7 +222,7 @@ def _run(
             )
         rows[0] = noisy(rows[0])
         while not over and (step := len(rewards)) < cap:
-            actions.append(replayed[step] if step < len(replayed) else act(rows[-1]))
+            actions.append(replayed[step] if step < len(replayed) else policy.act(rows[-1]))
             if anomaly is not None and step == len(replayed):
                 fault = anomaly[0](simulator, anomaly[1])
                 fault.begin(simulator, rows)

@@ -1,0 +1,339 @@
+"""The suite ladder: strengths found by what they cost, and splits built with them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.isotonic import IsotonicRegression
+
+pytest.importorskip("gymnasium")
+
+from oodd_eval.cli.main import main
+from oodd_eval.data import ladder
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
+from oodd_eval.data.ladder import FRACTIONS, LEVELS, RUNGS, conditions_of, rungs_of, strength_of
+from oodd_eval.data.simulate import build, calibrate
+from oodd_eval.data.simulate.build import build_split
+from oodd_eval.data.simulate.values import bound_of, unit_of
+from oodd_eval.data.split import load_split
+from oodd_eval.errors import SplitError, UnknownNameError
+
+FEW = {"environments": ["cartpole"]}
+STRENGTHS = {
+    "cartpole": {
+        "iid": {"rungs": {"4th": {"strength": 0.5}, "kept99": {"strength": 2.0}}},
+        "gravity": {"rungs": {"kept99": {"strength": 0.5}}},
+    }
+}
+
+
+@pytest.fixture
+def own_ladder(monkeypatch):
+    monkeypatch.setattr(ladder, "read_ladder", lambda: STRENGTHS)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    place = tmp_path_factory.mktemp("base") / "small"
+    return build_split(SplitDefinition("small", 3, 2, 2, 60, 951), place, jobs=1, **FEW)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    def run(chunks, work, _jobs):
+        for chunk in chunks:
+            build.record_chunk(chunk, work)
+            yield chunk
+
+    monkeypatch.setattr(build, "_run", run)
+
+
+def graded(base, **changes):
+    given = {"name": "up", "train": 3, "calibration": 2, "test": 2, "episode_cap": 60,
+             "seed_base": 951, "suite": "ladder", "base": str(base)}  # fmt: skip
+    return SplitDefinition(**(given | changes))
+
+
+# The committed strengths
+
+
+def test_strengths_rise_from_rung_to_rung_within_their_bound():
+    for environment, kinds in ladder.read_ladder().items():
+        for kind, entry in kinds.items():
+            where = f"{environment} {kind}"
+            assert entry["unit"] == unit_of(environment, kind), where
+            assert entry["bound"] == bound_of(environment, kind), where
+            rungs = rungs_of(environment, kind)
+            assert [*rungs] == [name for name in RUNGS if name in rungs], where
+            assert {*FRACTIONS, "kept99"} <= {*rungs}, where
+            strengths = [rung.strength for rung in rungs.values()]
+            assert strengths[0] > 0, where
+            assert strengths[-1] <= entry["bound"], where
+            assert (np.diff(strengths) > 0).all(), where
+            for name, rung in rungs.items():
+                if name in FRACTIONS:
+                    expected = rungs["kept99"].strength * FRACTIONS[name]
+                    assert rung.strength == pytest.approx(expected, rel=1e-3), where
+                    continue
+                assert rung.kept_low <= rung.kept <= rung.kept_high, where
+                assert rung.low <= rung.strength * 1.001, where
+                assert rung.strength <= rung.high * 1.001, where
+                if rung.reached:
+                    assert rung.kept == pytest.approx(LEVELS[name], abs=0.011), where
+                else:
+                    assert rung.strength == entry["bound"], where
+                    assert name == [*rungs][-1], where
+
+
+def test_every_kind_has_strengths_in_every_environment():
+    found = {e: set(kinds) for e, kinds in ladder.read_ladder().items()}
+    assert found == {e: set(ANOMALIES) for e in ENVIRONMENTS}
+    for environment in ENVIRONMENTS:
+        assert set(conditions_of("paper", environment)) == {f"{a}@paper" for a in TABLE1}
+        for anomaly in TABLE1:
+            assert strength_of(environment, anomaly, "paper") > 0
+
+
+def test_unknown_rungs_and_what_is_not_calibrated_are_refused(own_ladder):
+    assert strength_of("cartpole", "iid", "4th") == 0.5
+    with pytest.raises(UnknownNameError, match="rung of iid in cartpole"):
+        strength_of("cartpole", "iid", "kept50")
+    with pytest.raises(SplitError, match="data calibrate --env ant"):
+        rungs_of("ant", "iid")
+    with pytest.raises(SplitError, match="data calibrate --env ant"):
+        conditions_of("ladder", "ant")
+
+
+# Calibration
+
+
+def curve(strength, scale):
+    """A policy that keeps half of its return at a strength of `scale`."""
+    return 100 / (1 + strength / scale)
+
+
+@pytest.fixture
+def measured(monkeypatch, tmp_path):
+    """A simulator whose returns are known, with noise that all strengths share."""
+    calls = []
+    noise = np.random.default_rng(0).normal(size=32)
+
+    def measure(environment, kind, strength, *_):
+        calls.append((kind, strength))
+        returns = curve(strength, 0.2) if kind != "stuck" else 100.0
+        return list(returns + noise * strength)
+
+    class Pool:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return False
+
+        def submit(self, function, *given):
+            from concurrent.futures import Future
+
+            done = Future()
+            done.set_result(function(*given))
+            return done
+
+    monkeypatch.setattr(calibrate, "measure", measure)
+    monkeypatch.setattr(calibrate, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(calibrate, "return_of", lambda _: 100.0)
+    monkeypatch.setattr(calibrate, "twins_of", lambda *_: [None] * 32)
+
+    def go(kinds=("iid",), work=None):
+        work = work or tmp_path / "work.jsonl"
+        found = calibrate.calibrate(
+            tmp_path / "ladder.json", work, environments=["hopper"], kinds=kinds
+        )
+        return found["hopper"]
+
+    return go, calls, tmp_path
+
+
+def test_strengths_are_where_a_known_curve_has_the_levels(measured):
+    go, _, _ = measured
+    rungs = go()["iid"]["rungs"]
+    for name, level in LEVELS.items():
+        exact = 0.2 * (1 / level - 1)
+        assert rungs[name]["strength"] == pytest.approx(exact, rel=0.12), name
+        assert rungs[name]["low"] <= rungs[name]["strength"] <= rungs[name]["high"]
+        kept = curve(rungs[name]["strength"], 0.2) / 100
+        assert rungs[name]["kept_low"] - 0.01 <= kept <= rungs[name]["kept_high"] + 0.01
+        assert rungs[name]["reached"]
+    assert rungs["16th"]["strength"] == pytest.approx(rungs["kept99"]["strength"] / 16, rel=1e-3)
+
+
+def test_a_kind_that_costs_nothing_stops_at_its_bound_and_says_so(measured):
+    go, _, _ = measured
+    rungs = go(kinds=["stuck"])["stuck"]["rungs"]
+    assert [*rungs] == [*FRACTIONS, "kept99"]
+    assert rungs["kept99"] == {
+        "strength": 1.0, "low": 1.0, "high": 1.0, "kept": pytest.approx(1, abs=0.01),
+        "kept_low": pytest.approx(1, abs=0.01), "kept_high": pytest.approx(1, abs=0.01),
+        "reached": False,
+    }  # fmt: skip
+
+
+def test_a_calibration_goes_on_where_it_was_interrupted(measured):
+    go, calls, place = measured
+    whole = go()
+    made = len(calls)
+    work = place / "work.jsonl"
+    lines = work.read_text().splitlines()
+    assert len(lines) == made + 1  # and the nominal returns
+    work.write_text("\n".join(lines[:4]) + '\n{"key": [1')
+    (place / "ladder.json").unlink()
+    calls.clear()
+    assert go() == whole
+    assert len(calls) == made - 3
+    calls.clear()
+    assert go() == whole
+    assert calls == []
+
+
+def test_entries_of_other_kinds_are_kept(measured):
+    go, _, place = measured
+    go()
+    found = go(kinds=["drift"])
+    assert [*found] == ["iid", "drift"]
+    assert json.loads((place / "ladder.json").read_text())["hopper"].keys() == {"iid", "drift"}
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=12))
+@settings(deadline=None)
+def test_the_min_max_formula_is_isotonic_regression(values):
+    x = np.arange(len(values))
+    expected = IsotonicRegression(increasing=False).fit_transform(x, values)
+    np.testing.assert_allclose(calibrate.isotonic(np.array(values)), expected, atol=1e-9)
+
+
+def test_crossings_worked_by_hand():
+    strengths, kept = np.array([1.0, 4.0, 16.0]), np.array([0.98, 0.9, 0.5])
+    assert calibrate.crossing(strengths, kept, 0.9) == 4.0
+    assert calibrate.crossing(strengths, kept, 0.7) == pytest.approx(8.0)
+    assert calibrate.crossing(strengths, kept, 0.99) == pytest.approx(0.5)
+    assert calibrate.crossing(strengths, kept, 0.4) == math.inf
+    assert calibrate.value_at(strengths, kept, 8.0) == pytest.approx(0.7)
+
+
+def test_what_is_kept_counts_negative_returns_alike():
+    nominal = np.array([-80.0, -80.0])
+    assert calibrate.kept_shares(np.array([-88.0, -88.0]), nominal) == pytest.approx(0.9)
+    assert calibrate.kept_shares(np.array([90.0]), np.array([100.0])) == pytest.approx(0.9)
+
+
+# Splits
+
+
+def test_a_ladder_has_its_bases_episodes_and_one_part_a_rung(
+    base, own_ladder, in_process, tmp_path
+):
+    split = load_split(build_split(graded(base), tmp_path / "up", **FEW))
+    assert split.conditions("cartpole") == ("iid@4th", "iid@kept99", "gravity@kept99")
+    assert split.anomalies == ("iid", "gravity", "iid@4th", "iid@kept99", "gravity@kept99")
+    assert split.train_digest("cartpole") == load_split(base).train_digest("cartpole")
+    assert all(check.ok for check in split.verify())
+    mine, own = (load_split(p).environment("cartpole") for p in (tmp_path / "up", base))
+    for part in ("train", "calibration", "twins"):
+        pairs = zip(getattr(mine, part), getattr(own, part), strict=True)
+        assert all((a.observations == b.observations).all() for a, b in pairs)
+    strong, weak = mine.anomalous("iid@kept99"), mine.anomalous("iid@4th")
+    assert [p["strength"] for p in strong.parameters] == [2.0, 2.0]
+    assert (strong.onsets == weak.onsets).all()
+    assert [p["sensors"] for p in strong.parameters] == [p["sensors"] for p in weak.parameters]
+    before = (tmp_path / "up" / "cartpole.h5").stat().st_mtime_ns
+    build_split(graded(base), tmp_path / "up", **FEW)
+    assert (tmp_path / "up" / "cartpole.h5").stat().st_mtime_ns == before
+
+
+def test_other_strengths_are_built_again(base, own_ladder, in_process, tmp_path, monkeypatch):
+    first = load_split(build_split(graded(base), tmp_path / "up", **FEW)).digest
+    other = json.loads(json.dumps(STRENGTHS))
+    other["cartpole"]["gravity"]["rungs"]["kept99"]["strength"] = 0.6
+    monkeypatch.setattr(ladder, "read_ladder", lambda: other)
+    assert load_split(build_split(graded(base), tmp_path / "up", **FEW)).digest != first
+
+
+def test_an_interrupted_ladder_goes_on_to_the_same_digest(base, own_ladder, tmp_path, monkeypatch):
+    class StoppedError(Exception):
+        pass
+
+    def dies(chunks, work, _jobs):
+        build.record_chunk(chunks[0], work)
+        yield chunks[0]
+        raise StoppedError
+
+    def lives(chunks, work, _jobs):
+        for chunk in chunks:
+            build.record_chunk(chunk, work)
+            yield chunk
+
+    monkeypatch.setattr(build, "_run", dies)
+    with pytest.raises(StoppedError):
+        build_split(graded(base), tmp_path / "up", **FEW)
+    monkeypatch.setattr(build, "_run", lives)
+    steps = []
+    build_split(graded(base), tmp_path / "up", progress=lambda *a: steps.append(a), **FEW)
+    assert len(steps) == 1
+    whole = load_split(build_split(graded(base), tmp_path / "other" / "up", **FEW))
+    assert load_split(tmp_path / "up").digest == whole.digest
+
+
+def test_two_workers_build_the_same_ladder(base, tmp_path):
+    # In processes of their own, which read the committed strengths.
+    few = {"environments": ["cartpole"]}
+    one, two = (
+        load_split(build_split(graded(base), tmp_path / str(jobs) / "up", jobs=jobs, **few)).digest
+        for jobs in (1, 2)
+    )
+    assert one == two
+
+
+def test_noise_is_part_of_the_recipe_and_of_every_episode(base, in_process, tmp_path):
+    recipe = SplitDefinition("loud", 3, 2, 2, 60, 951, noise=0.05)
+    loud = load_split(build_split(recipe, tmp_path / "loud", **FEW))
+    assert loud.manifest["definition"]["noise"] == 0.05
+    assert "noise" not in load_split(base).manifest["definition"]
+    noisy, clean = (s.environment("cartpole").train for s in (loud, load_split(base)))
+    assert noisy[0].observations[0].tolist() != clean[0].observations[0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["mine", "--base", "mini"], "expected --suite ladder"),
+        (["mine", "--base", "mini", "--suite", "ladder", "--cap", "90"], "none of --train"),
+        (["mine", "--suite", "paper"], "--suite paper needs --base"),
+        (["ladder", "--base", "mini", "--suite", "ladder"], "is published"),
+        (["mine", "--train", "1", "--calibration", "1", "--test", "1", "--seed-base", "41",
+          "--noise", "3"], "the noise must be 0 to 1 of the spread, got 3.0"),
+    ],
+)  # fmt: skip
+def test_wrong_recipes_are_refused(options, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path))
+    assert main(["data", "build", *options]) == 4
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_split_of_ones_own_gets_a_ladder(base, own_ladder, in_process, tmp_path, capsys):
+    code = main(["data", "build", "mine", "--base", str(base), "--suite", "ladder", "--env",
+                 "cartpole", "--output", str(tmp_path / "mine")])  # fmt: skip
+    assert code == 0
+    assert load_split(tmp_path / "mine").conditions("cartpole")[0] == "iid@4th"
+    assert main(["run", "--detector", "clock", "--env", "cartpole", "--anomaly", "iid", "--split",
+                 str(tmp_path / "mine"), "--output", str(tmp_path / "out")]) == 0  # fmt: skip
+    lines = (tmp_path / "out" / "records.jsonl").read_text().splitlines()
+    assert [(json.loads(x)["anomaly"], json.loads(x)["strength"]) for x in lines] == [
+        ("iid", "4th"), ("iid", "kept99"),
+    ]  # fmt: skip
+    capsys.readouterr()
+    assert main(["show", str(tmp_path / "out"), "--split", str(tmp_path / "mine")]) == 0
