@@ -283,7 +283,7 @@ def _manifest_schema() -> Any:
     text, by_name = core_schema.str_schema(), core_schema.dict_schema
     name = core_schema.str_schema(pattern=f"^{NAME_PATTERN}$")
     parts = core_schema.str_schema(
-        pattern=f"^(train|calibration|test/{NAME_PATTERN}(@[a-z0-9.]{{1,32}})?)$"
+        pattern=f"^(train|calibration|test/{NAME_PATTERN}(@[a-z0-9.-]{{1,32}})?)$"
     )
     # Others trust these numbers with memory and disk.
     count = core_schema.int_schema(ge=0, le=10**10)
