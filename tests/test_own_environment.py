@@ -135,3 +135,56 @@ def test_spaces_that_are_not_as_the_spec_says_are_refused(tank, monkeypatch, cap
     install(monkeypatch, tank / "other", "tank", code, header="")
     assert build("mine", "--env", "tank", "--strength", "leak=1") == 4
     assert "a Box of shape (1,) from -1 to 1" in capsys.readouterr().err
+
+
+def checked(name, capsys, *options):
+    code = main(["check", name, *options])
+    return code, " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_in_order_passes_its_checks(tank, capsys):
+    for name in ("tank", "valve"):
+        assert checked(name, capsys)[0] == 0
+    code, told = checked("leak", capsys)
+    assert (code, "4 passed" in told) == (0, True)
+    assert checked("leak", capsys, "--env", "valve", "-k", "onset or draws")[0] == 0
+    assert checked("leak", capsys, "-k", "nothing")[0] == 5
+
+
+NOISE = "0.01 * self.np_random.normal(size=2)"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("tank", NOISE, "0.01 * np.random.default_rng().normal(size=2)",
+         "FAILED seed two episodes of seed 960000000 differ"),
+        ("tank", "self.np_random.uniform(0.8, 1.2, 2)", "np.ones(2)",
+         "FAILED seed different seeds give the same episode"),
+        ("tank", "False, False, {}", "self.level[0] > 1.6, False, {}", "FAILED columns 0 of 8"),
+        ("tank", "return lambda row: [np.clip(2.0 - row[1], -1, 1)]",
+         "t = iter(range(10**9))\n    return lambda row: [next(t) % 2 - 0.5]",
+         "FAILED policy the policy gives another action"),
+        ("tank", 'Quantity(n, u) for n, u in (("upper", "m"),', "Quantity(n, u) for n, u in (",
+         "FAILED columns environment 'tank' has observations"),
+        ("leak", "0.2 * (1 + strength)", "0.2 * (1.5 + strength)",
+         "FAILED zero-strength with seed 960000000 it differs from its twin"),
+        ("leak", "0.2 * (1 + strength)", "0.2", "FAILED onset at the largest strength 8 of 8"),
+        ("leak", "return Leak({})", "return Leak({'strong': strength > 1})",
+         "FAILED draws with seed 960000000 it draws {'strong': False} or {'strong': True}"),
+        ("leak", "0.2 * (1 + strength)", "0.2 * (1 + strength * (3 - strength))",
+         "FAILED strength the mean distance from the twins is"),
+        ("leak", "return Leak({})", "raise ValueError('no')",
+         "FAILED zero-strength it raised ValueError: no"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_an_environment_or_an_anomaly_is_found(
+    tank, monkeypatch, capsys, name, old, new, message
+):
+    noiseless = old.startswith("self.np_random.uniform")
+    code = TANK.replace(old, new).replace(NOISE, "0.01") if noiseless else TANK.replace(old, new)
+    assert code != TANK
+    install(monkeypatch, tank / "other", "tank", code, header="")
+    code, told = checked(name, capsys)
+    assert code == 1
+    assert message in told
