@@ -11,6 +11,8 @@ from oodd_eval._version import __version__
 
 if TYPE_CHECKING:
     from oodd_eval.api import evaluate, load_results
+    from oodd_eval.data.facts import Quantity
+    from oodd_eval.data.own import AnomalySpec, Attribute, EnvironmentSpec
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
@@ -18,10 +20,13 @@ if TYPE_CHECKING:
     from oodd_eval.plugins.explanations import Explanation
     from oodd_eval.testing import check_detector
 
-__all__ = ["Detector", "DetectorSpec", "Explanation", "Trajectory", "__version__",
-           "check_detector", "evaluate", "hookimpl", "load_results", "load_split"]  # fmt: skip
+__all__ = ["AnomalySpec", "Attribute", "Detector", "DetectorSpec", "EnvironmentSpec",
+           "Explanation", "Quantity", "Trajectory", "__version__", "check_detector", "evaluate",
+           "hookimpl", "load_results", "load_split"]  # fmt: skip
 
-_HOMES = {"Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
+_HOMES = {"AnomalySpec": "data.own", "Attribute": "data.own", "EnvironmentSpec": "data.own",
+          "Quantity": "data.facts",
+          "Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
           "Explanation": "plugins.explanations", "Trajectory": "data.trajectory",
           "check_detector": "testing", "evaluate": "api", "hookimpl": "plugins",
           "load_results": "api", "load_split": "data.split"}  # fmt: skip

@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import select
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import Offer, Plugins, discover
@@ -94,10 +93,10 @@ def evaluate(
     names = [_added(plugins, d, given) for d in tried]
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
+    where, kinds = opened.select(_listed(environments), _listed(anomalies))
     plan = make_plan(
-        plugins, split=opened, detectors=names,
-        environments=select("environment", _listed(environments), opened.environments),
-        anomalies=select("anomaly", _listed(anomalies), opened.anomalies), horizons=[horizon],
+        plugins, split=opened, detectors=names, environments=where, anomalies=kinds,
+        horizons=[horizon],
         seeds=[seed] if isinstance(seed, int) else list(seed), parameters=given, limit=limit,
     )  # fmt: skip
     place = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)

@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from helpers_own import TANK
 from helpers_plugins import install
 
 from oodd_eval import load_split
@@ -67,7 +68,7 @@ def watched(tiny_split):
 
 
 def test_every_hook_has_a_test_of_its_name():
-    assert len(SPECS) == 6
+    assert len(SPECS) == 8
     assert {f"test_{name}" for name in SPECS} <= set(globals())
     assert {name for name in SPECS if hasattr(observer_hooks, name)} == set(OBSERVER_HOOKS)
 
@@ -75,6 +76,20 @@ def test_every_hook_has_a_test_of_its_name():
 @pytest.mark.parametrize("name", SPECS)
 def test_every_hook_says_when_it_is_called(name):
     assert "Called" in inspect.getdoc(SPECS[name])
+
+
+def test_oodd_environments(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "tank", TANK, header="")
+    found = discover(only=["tank"]).own_specs
+    spec, origin = found["valve"]
+    assert origin == "plug-in 'tank' of oodd-tank"
+    assert [quantity.name for quantity in spec.actions] == ["close", "open"]
+
+
+def test_oodd_anomalies(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "tank", TANK, header="")
+    spec, _ = discover(only=["tank"]).own_specs["leak"]
+    assert (spec.group, spec.bound) == ("dynamics", 3.0)
 
 
 def test_oodd_detectors(monkeypatch, tmp_path):

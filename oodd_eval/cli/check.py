@@ -1,12 +1,15 @@
-"""``oodd-eval check``: the conformance checks of one detector, each reported when it is done."""
+"""``oodd-eval check``: checks of a detector, an environment or an anomaly, told one by one."""
 
 import argparse
+import time
 from typing import Final
 
 from oodd_eval.cli import Parser, add_detector, add_limits, at_least, say, value
-from oodd_eval.cli.terminal import discovered, make_console
-from oodd_eval.names import assignment, check_known, expression
-from oodd_eval.plugins.conformance import CHECKS, Report, expected
+from oodd_eval.cli.terminal import discovered, know_own, make_console
+from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
+from oodd_eval.errors import UnknownNameError
+from oodd_eval.names import Predicate, assignment, check_known, expression
+from oodd_eval.plugins.conformance import CHECKS, Report, Result, expected
 from oodd_eval.plugins.conformance.supervise import supervise
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
@@ -21,7 +24,8 @@ def define(parser: Parser) -> None:
     add = parser.options(
         run, "check rf", "check mine -k 'prefix or causality' -v", plugins=True
     )
-    add("detector", metavar="DETECTOR", help="name of a detector")
+    add("detector", metavar="NAME", help="a detector, or an environment or anomaly of a plug-in")
+    add("--env", metavar="NAME", help="where to try an anomaly (default: one that it is for)")
     add_detector(add)
     add("--seed", type=at_least(0), default=0, metavar="N", help="seed of a detector (default: 0)")
     add("-k", dest="expression", metavar="EXPR",
@@ -36,12 +40,20 @@ def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval check``: 1 when a check failed, 5 when none ran, else 0."""
     limits = Limits(options.timeout, options.memory)
     expecting, parameters = dict(options.expect), dict(options.param)
-    check_known("check", CHECKS, *expecting)
-    offer = discovered(options).offer(options.detector)
+    wanted = expression(options.expression) if options.expression else lambda _: True
+    plugins = discovered(options)
+    try:
+        offer = plugins.offer(options.detector)
+    except UnknownNameError:
+        if options.detector in plugins.own_specs:
+            return _own(options, wanted)
+        known = [*plugins.own_specs, *plugins.offers]
+        kind = "detector, environment or anomaly of a plug-in"
+        raise UnknownNameError(kind, options.detector, known) from None
     offer.require()
     spec = offer.spec
+    check_known("check", CHECKS, *expecting)
     resolve_parameters(spec.name, spec.parameters, parameters, others=spec.other_parameters)
-    wanted = expression(options.expression) if options.expression else lambda _: True
     names = [name for name in CHECKS if wanted(name)]
     if not names:
         return say(f"no check matches -k {options.expression!r}", 5)
@@ -64,3 +76,29 @@ def run(options: argparse.Namespace) -> int:
         console.print(report.summary(), style="green" if report.ok else "bold red")
         good = good and report.ok
     return 0 if good else 1
+
+
+def _own(options: argparse.Namespace, wanted: Predicate) -> int:
+    """Check an environment or an anomaly of a plug-in; 1 when a check failed."""
+    from oodd_eval.data.simulate.checks import check_own
+
+    specs = {spec.name: spec for spec in know_own(options)}
+    spec, environment = specs[options.detector], options.detector
+    if isinstance(spec, AnomalySpec):
+        others = (s.name for s in specs.values() if isinstance(s, EnvironmentSpec))
+        environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
+    console, results = make_console(), []
+    console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
+    for name, carry_out in check_own(spec, environment):
+        if wanted(name):
+            start = time.perf_counter()
+            wrong = carry_out()
+            took = time.perf_counter() - start
+            results.append(Result(name, "failed" if wrong else "passed", wrong, took))
+            if options.verbosity >= 0 or wrong:
+                console.print(results[-1].line(13), style=_STYLES[results[-1].status])
+    report = Report(results)
+    if not results:
+        return say(f"no check matches -k {options.expression!r}", 5)
+    console.print(report.summary(), style="green" if report.ok else "bold red")
+    return 0 if report.ok else 1

@@ -1,21 +1,30 @@
-"""``oodd-eval data``: build, verify, fetch and export splits, and describe them."""
+"""``oodd-eval data``: build, import, verify, fetch and export splits, and describe them."""
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
-from oodd_eval.cli import Parser, at_least
-from oodd_eval.cli.terminal import make_console
+from oodd_eval.cli import Parser, at_least, value
+from oodd_eval.cli.terminal import know_own, make_console
 from oodd_eval.data.export import export as export_split
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    OWN_SEED_BASES,
+    SPLITS,
+    Quantity,
+    SplitDefinition,
+    join_condition,
+)
 from oodd_eval.data.fetch import fetch as fetch_split
+from oodd_eval.data.importing import import_data
 from oodd_eval.data.info import describe
-from oodd_eval.data.simulate.build import build_split
-from oodd_eval.data.simulate.calibrate import calibrate as find_strengths
+from oodd_eval.data.logs import FORMATS, quantity
+from oodd_eval.data.own import EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import select
+from oodd_eval.names import assignment, select
 
 
 def define(parser: Parser) -> None:
@@ -29,6 +38,9 @@ def define(parser: Parser) -> None:
         "data build standard --jobs 2",
         "data build dev --train 120 --calibration 40 --test 20 --cap 500 --seed-base 41",
         "data build dev-ladder --base dev --suite ladder",
+        "data build mine --env cartpole --train 40 --calibration 40 --test 10 --seed-base 42 "
+        "--strength iid=0.1,0.3",
+        plugins=True,
     )
     add("name", help="a published split, or a new name with sizes and a seed base of its own")
     add("--train", type=int, metavar="N", help="training trajectories per environment")
@@ -40,8 +52,32 @@ def define(parser: Parser) -> None:
         help="noise of all sensors in nominal operation, in shares of their spread")
     add("--base", metavar="SPLIT", help="take training and calibration part, and test seeds")
     add("--suite", choices=["ladder", "paper"], help="strengths of anomalies; needs --base")
-    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    add("--strength", action="append", default=[], metavar="ANOMALY=NUMBER,...",
+        type=value(_strengths), help="strengths of an anomaly, in place of the paper's values")
+    add("--env", default="all", metavar="NAMES",
+        help="environments, also of plug-ins (default: all of the benchmark)")
     add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
+    add("--output", type=Path, metavar="DIR", help=place)
+    add = action("import", "import logs of your own as an environment of a split").options(
+        import_logs,
+        "data import plant --env pump --format csv --train logs/a --calibration logs/b",
+    )
+    add("name", help="of a split of your own; one that was imported gets a further environment")
+    add("--env", required=True, metavar="NAME", help="name of the environment")
+    add("--format", required=True, choices=[*FORMATS], help="of the files")
+    add("--train", required=True, type=Path, metavar="PLACE", help="nominal episodes to fit on")
+    add("--calibration", required=True, type=Path, metavar="PLACE",
+        help="nominal episodes for the thresholds of alarms")
+    add("--test", type=Path, metavar="DIR",
+        help="the place 'nominal' of twins, and one for each anomaly, named as the anomaly")
+    add("--sensors", type=value(_quantities), default=(), metavar="NAME[UNIT],...",
+        help="names of the sensors, if the files do not name them")
+    add("--actions", type=value(_quantities), default=(), metavar="NAME[UNIT],...",
+        help="names of the actions")
+    add("--discrete", type=at_least(1), default=0, metavar="N",
+        help="actions are whole numbers from 0 to N - 1")
+    add("--group", action="append", default=[], metavar="ANOMALY=sensor|dynamics",
+        type=value(assignment), help="group of an anomaly of your own (default: dynamics)")
     add("--output", type=Path, metavar="DIR", help=place)
     action("verify", "compare a split with its digests").options(
         verify, "data verify mini"
@@ -73,7 +109,11 @@ def define(parser: Parser) -> None:
 
 def build(options: argparse.Namespace) -> int:
     """Carry out ``data build``; what an earlier call has recorded is kept."""
-    environments = select("environment", options.env, ENVIRONMENTS)
+    environments = list(ENVIRONMENTS)
+    if options.env != "all" or options.strength:
+        own = [s.name for s in know_own(options) if isinstance(s, EnvironmentSpec)]
+        if options.env != "all":
+            environments = select("environment", options.env, [*ENVIRONMENTS, *own])
     record_split(_definition(options), options, environments, options.output)
     return 0
 
@@ -83,6 +123,9 @@ def record_split(
     environments: Sequence[str] = tuple(ENVIRONMENTS), output: Path | None = None,
 ) -> None:  # fmt: skip
     """Record a split, by default of all environments and where splits are found."""
+    # Other actions need no simulators.
+    from oodd_eval.data.simulate.build import build_split
+
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
     build_split(definition, directory, environments=environments, jobs=options.jobs,
@@ -96,10 +139,10 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
     name, cap = options.name, options.cap
     sizes = {"train": options.train, "calibration": options.calibration, "test": options.test,
              "seed-base": options.seed_base}  # fmt: skip
-    others = {"cap": cap, "noise": options.noise}
+    others, strengths = {"cap": cap, "noise": options.noise}, dict(chain(*options.strength))
     given = [n for n, size in {**sizes, **others}.items() if size is not None]
     if name in SPLITS:
-        given += [n for n in ("base", "suite") if getattr(options, n) is not None]
+        given += [n for n in ("base", "suite", "strength") if getattr(options, n)]
         if given:
             other = f"--{given[0]} would make another; give that a name of its own"
             raise UsageError(f"split {name!r} is published: {other}")
@@ -107,13 +150,17 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
     if not name.isprintable() or set(name) & set("/@: "):
         raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
     if options.base:
-        if given or not options.suite:
+        if given or bool(options.suite) == bool(strengths):
             raise UsageError(
-                f"--base {options.base} gives split {name!r} its sizes and seeds: expected --suite "
-                f"ladder or --suite paper, and none of --{', --'.join([*sizes, *others])}"
+                f"--base {options.base} gives split {name!r} its sizes and seeds: expected "
+                "--suite ladder, --suite paper or --strength, and none of "
+                f"--{', --'.join([*sizes, *others])}"
             )
-        base = SplitDefinition(**load_split(options.base).manifest["definition"])
-        return replace(base, name=name, suite=options.suite, base=options.base)
+        taken = load_split(options.base).manifest["definition"]
+        if "seed_base" not in taken:
+            raise UsageError(f"--base {options.base} was imported: expected a recorded split")
+        own = {"suite": options.suite or "table1", "strengths": strengths}
+        return SplitDefinition(**{**taken, "name": name, "base": options.base, **own})
     if options.suite:
         raise UsageError(f"--suite {options.suite} needs --base, a split to take training from")
     if missing := [f"--{n}" for n, size in sizes.items() if size is None]:
@@ -126,8 +173,38 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
             f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
     return SplitDefinition(
-        name, train, calibration, test, cap, seed_base, noise=options.noise or 0.0
-    )
+        name, train, calibration, test, cap, seed_base, noise=options.noise or 0.0,
+        strengths=strengths,
+    )  # fmt: skip
+
+
+def _strengths(text: str) -> list[tuple[str, float]]:
+    """Return conditions with their strengths from ``ANOMALY=NUMBER,...``."""
+    kind, numbers = assignment(text)
+    try:
+        found = [float(number) for number in numbers.split(",")]
+    except ValueError:
+        raise UsageError(f"{text!r}, expected ANOMALY=NUMBER,...") from None
+    if len(found) == 1:
+        return [(kind, found[0])]
+    return [(join_condition(kind, f"{strength:g}"), strength) for strength in found]
+
+
+def import_logs(options: argparse.Namespace) -> int:
+    """Carry out ``data import``."""
+    notes = make_console(quiet=options.verbosity < 0)
+    split = import_data(
+        options.name, options.env, form=options.format, train=options.train,
+        calibration=options.calibration, test=options.test, sensors=options.sensors,
+        actions=options.actions, discrete=options.discrete, groups=dict(options.group),
+        output=options.output, progress=lambda part: notes.print(f"{options.env} {part}"),
+    )  # fmt: skip
+    make_console().print(f"split {split.name}, digest {split.digest}, in {split.path}")
+    return 0
+
+
+def _quantities(text: str) -> tuple[Quantity, ...]:
+    return tuple(map(quantity, text.split(",")))
 
 
 def verify(options: argparse.Namespace) -> int:
@@ -146,6 +223,8 @@ def verify(options: argparse.Namespace) -> int:
 
 def calibrate(options: argparse.Namespace) -> int:
     """Carry out ``data calibrate``; returns that an earlier call has measured are kept."""
+    from oodd_eval.data.simulate.calibrate import calibrate as find_strengths
+
     notes = make_console(quiet=options.verbosity < 0)
     work = options.work or options.output.with_name(options.output.name + ".work")
     found = find_strengths(

@@ -9,8 +9,9 @@ from tabulate import tabulate
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
+from oodd_eval.data.own import AnomalySpec
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins.discovery import Offer
+from oodd_eval.plugins.discovery import Offer, OwnSpec
 from oodd_eval.plugins.parameters import parameters_of
 
 Lines = Iterator[tuple[str, str]]
@@ -31,10 +32,14 @@ def run(options: argparse.Namespace) -> int:
         lines = _anomaly(ANOMALIES[name])
     else:
         plugins = discovered(options)
+        own = plugins.own_specs
+        if name in own:
+            print(tabulate(_own(*own[name]), tablefmt="plain", disable_numparse=True))
+            return 0
         try:
             offer = plugins.offer(name)
         except UnknownNameError:
-            known = [*ENVIRONMENTS, *ANOMALIES, *plugins.offers]
+            known = [*ENVIRONMENTS, *ANOMALIES, *own, *plugins.offers]
             raise UnknownNameError("detector, environment or anomaly", name, known) from None
         lines = _detector(offer)
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
@@ -51,6 +56,22 @@ def _environment(info: EnvironmentInfo) -> Lines:
     kind = "discrete actions" if info.discrete else "actions"
     for i, action in enumerate(info.actions):
         yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
+
+
+def _own(spec: OwnSpec, origin: str) -> Lines:
+    if isinstance(spec, AnomalySpec):
+        yield "anomaly", f"{spec.name}, {origin}"
+        yield "group", spec.group
+        yield "what it changes", spec.summary
+        yield "strength", f"0 to {spec.bound:g}; 1 is: {spec.unit}"
+        yield "environments", ", ".join(spec.environments) or "any"
+        return
+    yield "environment", f"{spec.name} ({spec.title or spec.name}), {origin}"
+    yield "longest episode", f"{spec.episode_cap} steps"
+    for kind, columns in (("sensors", spec.sensors), ("actions", spec.actions)):
+        for i, column in enumerate(columns):
+            yield "" if i else f"{len(columns)} {kind}", f"{column.name} ({column.unit})"
+    yield "attributes", ", ".join(spec.attributes) or "none"
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:

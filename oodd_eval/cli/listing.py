@@ -3,15 +3,18 @@
 import argparse
 from collections.abc import Iterable
 from dataclasses import asdict
+from typing import TypeVar
 
 from tabulate import tabulate
 
 from oodd_eval.cli import Parser
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
+from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
 from oodd_eval.plugins.discovery import Plugins, discover
 
+T = TypeVar("T")
 Rows = Iterable[tuple[str, ...]]
 
 
@@ -33,8 +36,12 @@ def run(options: argparse.Namespace) -> int:
         case "envs":
             rows = [(e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy")
                     for e in ENVIRONMENTS.values()]  # fmt: skip
+            rows += [(s.name, origin, f"{len(s.sensors)} sensors, its own policy")
+                     for s, origin in _own(options, EnvironmentSpec)]  # fmt: skip
         case "anomalies":
             rows = [(a.id, a.group, a.summary) for a in ANOMALIES.values()]
+            rows += [(s.name, s.group, f"{s.summary} ({origin})")
+                     for s, origin in _own(options, AnomalySpec)]  # fmt: skip
         case "splits":
             rows = _splits()
         case "metrics":
@@ -44,6 +51,13 @@ def run(options: argparse.Namespace) -> int:
             raise UnknownNameError("thing to list", options.what, kinds)
     print(tabulate(rows, tablefmt="plain", disable_numparse=True))
     return code
+
+
+def _own(options: argparse.Namespace, kind: type[T]) -> Iterable[tuple[T, str]]:
+    """Yield the environments, or the anomalies, of plug-ins with their origin."""
+    for spec, origin in discover(options.disabled).own_specs.values():
+        if isinstance(spec, kind):
+            yield spec, origin
 
 
 def _detectors(plugins: Plugins) -> Rows:
@@ -57,14 +71,14 @@ def _detectors(plugins: Plugins) -> Rows:
 
 def _splits() -> Rows:
     # Listing is quick: these need numpy.
-    from oodd_eval.data.layout import read_manifest
+    from oodd_eval.data.layout import part_sizes, read_manifest
     from oodd_eval.data.split import split_directories
 
     here = split_directories()
     for name in dict.fromkeys([*SPLITS, *here]):
         if name in here:
             manifest = read_manifest(here[name])
-            sizes, digest = manifest["definition"], manifest["digest"][:12]
+            sizes, digest = part_sizes(manifest), manifest["digest"][:12]
             where = f"{len(manifest['environments'])} environments, digest {digest}"
         else:
             sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"

@@ -31,7 +31,7 @@ COMMANDS: Final = (
     ("info", "info", "describe a detector, an environment or an anomaly"),
     ("forget", "forget", "remove cells from a results directory"),
     ("leaderboard", "leaderboard", "submit, verify and show entries of the board"),
-    ("data", "data", "build, verify, fetch and export splits"),
+    ("data", "data", "build, import, verify, fetch and export splits"),
     ("policies", "policies", "train and evaluate nominal policies"),
     ("reproduce", "reproduce",
      "regenerate the paper's tables, figures and claims; resumes where it was"),

@@ -13,7 +13,7 @@ from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import expression, select, whole_numbers
+from oodd_eval.names import expression, whole_numbers
 from oodd_eval.plugins.isolation.supervisor import Limits
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.tables import rendering
@@ -63,11 +63,10 @@ def run(options: argparse.Namespace) -> int:
             raise UsageError(f"--{name} is missing, on the command line and in --config")
     plugins = discovered(options)
     split = load_split(options.split)
+    environments, anomalies = split.select(options.env, options.anomaly)
     plan = make_plan(
-        plugins, split=split,
-        detectors=plugins.select(options.detector),
-        environments=select("environment", options.env, split.environments),
-        anomalies=select("anomaly", options.anomaly, split.anomalies),
+        plugins, split=split, detectors=plugins.select(options.detector),
+        environments=environments, anomalies=anomalies,
         horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
         device=options.device, limit=options.limit,
     )  # fmt: skip

@@ -5,7 +5,7 @@ import json
 
 from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import load_split
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
@@ -50,7 +50,8 @@ def run(options: argparse.Namespace) -> int:
     check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()
-    chosen = select("environment", options.env, ENVIRONMENTS)
+    known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
+    chosen = select("environment", options.env, known)
     wanted = expression(options.expression)
     records = [r for r in records if r.environment in chosen and wanted(str(r.cell))]
     if not options.stored:

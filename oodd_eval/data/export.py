@@ -17,8 +17,8 @@ import h5py
 import numpy as np
 
 from oodd_eval._version import __version__
-from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.parts import PARTS, AnomalousSet, EnvironmentData, TrajectorySet, parts_of
+from oodd_eval.data.facts import ENVIRONMENTS, title_of
+from oodd_eval.data.parts import AnomalousSet, EnvironmentData, TrajectorySet, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OutputError
@@ -36,14 +36,17 @@ def export(
     `OutputError` when one exists, before any work, or cannot be written.
     """
     name = re.sub(r"[^-\w]", "-", str(split.manifest["name"]))
-    found = [directory / NAMESPACE / name / e / _dataset(p) for e in environments for p in PARTS]
+    entries = split.manifest["environments"]
+    found = [directory / NAMESPACE / name / e / _dataset(part)
+             for e in environments for part in entries[e]["groups"]]  # fmt: skip
     if there := next((str(place) for place in found if place.exists()), None):
         raise OutputError(f"{there!r} exists: remove it, or export to another directory")
     written = []
     try:
         for environment in environments:
             with contextlib.closing(split.environment(environment)) as data:
-                for trajectories in (data.train, *parts_of(data, data.anomalies).values()):
+                parts = data.train, *parts_of(data, data.anomalies).values()
+                for trajectories in (part for part in parts if len(part)):
                     identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(trajectories.group)}"
                     _write(directory, identity, data, trajectories, split)
                     written.append(identity)
@@ -54,7 +57,7 @@ def export(
 
 
 def _dataset(part: str) -> str:
-    return f"{part.replace('/', '-')}-v0"
+    return f"{part.replace('/', '-').replace('@', '-')}-v0"
 
 
 def _write(
@@ -62,7 +65,7 @@ def _write(
 ) -> None:
     """Write one dataset, all or nothing."""
     place = directory / identity
-    info = ENVIRONMENTS[data.id]
+    policy = ENVIRONMENTS[data.id].policy if data.id in ENVIRONMENTS else "own"
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=place.parent) as temporary:
         made = Path(temporary)
@@ -72,23 +75,26 @@ def _write(
             ended = trajectories.terminated.tolist()
             for i, trajectory in enumerate(trajectories):
                 group = stored.create_group(f"episode_{i}")
-                _episode(group, i, trajectories, trajectory, info.discrete, ended[i])
+                _episode(group, i, trajectories, trajectory, data.discrete, ended[i])
         what, further = f"nominal, {trajectories.group}", ""
         if isinstance(trajectories, AnomalousSet):
             what = f"{trajectories.group.removeprefix('test/')} anomalies from an onset on"
             further = ", anomaly, onset, effect, redraws, parameters as JSON"
-        infinity, action = float("inf"), _box(info.action_dim, -1.0, 1.0)
-        if info.discrete:
-            action = {"type": "Discrete", "dtype": "int64", "start": 0, "n": info.action_dim}
+        infinity = float("inf")
+        # Commands of the benchmark's robots are shares of a motor's power; others may be anything.
+        bound = 1.0 if data.id in ENVIRONMENTS else infinity
+        action = _box(len(data.actions), -bound, bound)
+        if data.discrete:
+            action = {"type": "Discrete", "dtype": "int64", "start": 0, "n": len(data.actions)}
         metadata = {
             "dataset_id": identity, "minari_version": "0.5.0", "data_format": "hdf5",
             "total_episodes": len(trajectories), "total_steps": int(trajectories.lengths.sum()),
             "dataset_size": round(file.stat().st_size / 1e6, 1),
-            "observation_space": json.dumps(_box(info.observation_dim, -infinity, infinity)),
-            "action_space": json.dumps(action), "algorithm_name": info.policy,
+            "observation_space": json.dumps(_box(len(data.sensors), -infinity, infinity)),
+            "action_space": json.dumps(action), "algorithm_name": policy,
             "author": ["The oodd-eval developers"],
-            "description": f"{info.title}, {what}: trajectories of a frozen {info.policy} policy, "
-            f"from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
+            "description": f"{title_of(data.id)}, {what}: trajectories of a fixed policy "
+            f"({policy}), from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
             "oodd_eval_version": __version__, "split_digest": split.digest,
             "sensors": [dataclasses.asdict(quantity) for quantity in data.sensors],
             "actions": [dataclasses.asdict(quantity) for quantity in data.actions],

@@ -6,8 +6,8 @@ The module needs neither simulators nor data. Values of the paper are from Danes
 import functools
 import json
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -32,7 +32,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentInfo:
-    """One environment of the benchmark; actions are discrete in the family ``"classic"``.
+    """One environment; actions are discrete in the family ``"classic"``, or with `numbers`.
 
     `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A discrete action is a
     one-hot row, so `action_dim` is then their number. `policy` is the algorithm of the nominal
@@ -44,7 +44,7 @@ class EnvironmentInfo:
     id: str
     title: str
     simulator: str
-    family: Literal["classic", "bullet"]
+    family: Literal["classic", "bullet", "own"]
     observation_dim: int
     action_dim: int
     policy: Literal["IQN", "TD3"]
@@ -52,11 +52,12 @@ class EnvironmentInfo:
     episode_cap: int
     sensors: tuple[Quantity, ...]
     actions: tuple[Quantity, ...]
+    numbers: bool = False
 
     @property
     def discrete(self) -> bool:
         """True when actions are discrete."""
-        return self.family == "classic"
+        return self.family == "classic" or self.numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,8 @@ class SplitDefinition:
     those of the paper's Table 1; all kinds at several strengths; or the kinds of the paper at the
     strength at which its policies lost what its Table 2 says. `base` is the split whose training
     and calibration parts, and test seeds, are taken, if any. `noise` is that of every sensor in
-    nominal operation, in shares of its spread.
+    nominal operation, in shares of its spread. `strengths` are those of all conditions, in place of
+    a suite.
     """
 
     name: str
@@ -108,15 +110,18 @@ class SplitDefinition:
     suite: Suite = "table1"
     base: str = ""
     noise: float = 0.0
+    strengths: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def recipe(self) -> dict[str, Any]:
         """All fields that were given: a manifest's ``definition``."""
-        every = {field.name: getattr(self, field.name) for field in fields(self)}
+        every = {own.name: getattr(self, own.name) for own in fields(self)}
         return {n: v for n, v in every.items() if n not in _LATER or v != _LATER[n]}
 
 
-_LATER: Final = {"suite": "table1", "base": "", "noise": 0.0}  # older manifests lack these
+_LATER: Final[dict[str, Any]] = {
+    "suite": "table1", "base": "", "noise": 0.0, "strengths": {},
+}  # fmt: skip  # older manifests lack these
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -163,11 +168,34 @@ SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 OWN_SEED_BASES: Final = range(10, 900)
 """Seed bases for splits of one's own: published splits have those below, policies those above."""
 
+NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
+"""Names of environments and anomalies: they become names of files and groups."""
+
 BRIEF_TAIL: Final = 20
 """A part whose episodes last fewer transitions beyond their onsets, in the median, is *brief*."""
 
 PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "test": 600_000})
 """Seed offset of each part within the million seeds of a split's base."""
+
+
+def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
+    """Return names, each once: known ones in their order, then the others as they come.
+
+    A condition that is not known, such as ``"iid@0.5"``, has the place of its anomaly.
+
+    >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
+    ['cartpole', 'hopper', 'mine']
+    """
+    place = {name: i for i, name in enumerate(known)}
+    last = len(place)
+    return sorted(
+        dict.fromkeys(names), key=lambda n: place.get(n, place.get(n.partition("@")[0], last))
+    )
+
+
+def title_of(environment: str) -> str:
+    """Return the paper's title of an environment; of one's own, its name."""
+    return ENVIRONMENTS[environment].title if environment in ENVIRONMENTS else environment
 
 
 @functools.cache

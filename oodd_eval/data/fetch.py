@@ -25,7 +25,6 @@ from urllib.request import url2pathname
 import h5py
 
 from oodd_eval._version import __version__
-from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import lock
 from oodd_eval.data.layout import MANIFEST, read_manifest
 from oodd_eval.data.split import SHIPPED, Split, data_home
@@ -97,8 +96,6 @@ def _bring(
     if not name or not name.isprintable() or set(name) & set("/\\@: ") or name.startswith("."):
         raise SplitError(f"the manifest names the split {name!r}, which is no name")
     for environment, entry in environments.items():
-        if environment not in ENVIRONMENTS:
-            raise SplitError(f"the manifest has an unknown environment {environment!r}")
         file, expected = entry["file"], f"{environment}.h5"
         if file != expected:
             raise SplitError(f"it names the file {file!r} for {environment}, expected {expected!r}")
@@ -153,9 +150,9 @@ def _bring_file(
             return
         file.unlink()
     # The most bytes that it may have, if nothing in it were compressed, with some to spare.
-    info = ENVIRONMENTS[environment]
-    row = 4 * (info.observation_dim + info.action_dim + 1)
-    trajectory = 4 * info.observation_dim + 6 * 8 + 4096
+    sensors, actions = len(entry["sensors"]), len(entry["actions"])
+    row = 4 * (sensors + actions + 1)
+    trajectory = 4 * sensors + 6 * 8 + 4096
     sizes = [(g["transitions"], g["trajectories"]) for g in entry["groups"].values()]
     most = 2 * _MIB + sum(_MIB + row * steps + trajectory * n for steps, n in sizes)
     source(file.name, part, most)
@@ -171,7 +168,7 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
     """Raise unless a file is whole in itself, and all in it is what the manifest says."""
     split.environment(environment).close()
     with h5py.File(file, "r") as stored:
-        if elsewhere := stored.visititems_links(_elsewhere) or stored.visititems(_elsewhere):
+        if elsewhere := pointing_elsewhere(stored):
             raise SplitError(f"{file.name} {elsewhere}: refused")
         for name, group in entry["groups"].items():
             found = (len(stored[name]["seeds"]), int(stored[name]["offsets"][-1]))
@@ -181,6 +178,12 @@ def _verify(split: Split, environment: str, file: Path, entry: dict[str, Any]) -
                     f"{file.name}, {name} has {found[0]} trajectories with {found[1]} transitions, "
                     f"expected {named[0]} with {named[1]}"
                 )
+
+
+def pointing_elsewhere(file: h5py.File) -> str | None:
+    """Say what in a file leads out of it; None where nothing does."""
+    found: str | None = file.visititems_links(_elsewhere) or file.visititems(_elsewhere)
+    return found
 
 
 def _elsewhere(name: str, item: object) -> str | None:

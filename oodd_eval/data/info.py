@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
+from oodd_eval.data.facts import paper_tables, title_of
+from oodd_eval.data.layout import part_sizes
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData
 from oodd_eval.data.split import Split
 
-_KINDS = ("nominal", *TABLE1)
 HEADER: Final = ("group", "trajectories", "transitions", "length", "onset", "effect", "tail",
                  "redraws", "return")  # fmt: skip
 Rows = list[list[str]]
@@ -24,25 +24,27 @@ def describe(split: Split) -> str:
     """Return all there is to know of a split as plain text; opens and verifies every file."""
     manifest = split.manifest
     definition = manifest["definition"]
-    cap = definition["episode_cap"] or "the simulator's"
-    recipe = (
-        f"split {split.name}, digest {split.digest}\n{definition['train']} training, "
-        f"{definition['calibration']} calibration trajectories, {definition['test']} test seeds; "
-        f"episode cap {cap}; seed base {definition['seed_base']}; "
-        f"generator {manifest['generator']}\nin {split.path}"
-    )
-    lines = [recipe]
+    text = "{train} training, {calibration} calibration trajectories, {test} test seeds; "
+    how = "imported"
+    if "seed_base" in definition:
+        cap = definition["episode_cap"] or "the simulator's"
+        seeds = f"seed base {definition['seed_base']}"
+        how = f"episode cap {cap}; {seeds}; generator {manifest['generator']}"
+    sizes = text.format_map(part_sizes(manifest))
+    lines = [f"split {split.name}, digest {split.digest}\n{sizes}{how}\nin {split.path}"]
     returns: dict[str, Returns] = {}
     for name in split.environments:
         entry = manifest["environments"][name]
         size = (split.path / entry["file"]).stat().st_size / 1e6
-        title = f"{ENVIRONMENTS[name].title}: {size:.2f} MB, policy {entry['policy'][:12]}"
+        title = f"{title_of(name)}: {size:.2f} MB, policy {entry['policy'][:12]}"
         with closing(split.environment(name)) as data:
             lines += ["", _table(title, HEADER, group_rows(data)), "", *column_lines(data)]
             returns[name] = collect_returns(data)
     title = "Table 2: mean return of the policies, nominal and under each anomaly"
+    found = {kind for own in returns.values() for kind in own}
+    kinds = ["nominal", *(name for name in split.anomalies if name in found and "@" not in name)]
     return "\n".join(
-        [*lines, "", _table(title, ["Environment", "", *_KINDS], return_rows(returns))]
+        [*lines, "", _table(title, ["Environment", "", *kinds], return_rows(returns, kinds))]
     )
 
 
@@ -60,7 +62,7 @@ def group_rows(data: EnvironmentData) -> Rows:
             after = f"+{_span(part.effects - part.onsets)}"
             drawn = [_span(part.onsets), after, tail, str(part.redraws.sum())]
         sizes = [str(len(part)), str(part.lengths.sum()), _span(part.lengths)]
-        mean = f"{part.returns.mean():.1f} ± {part.returns.std():.1f}"
+        mean = f"{part.returns.mean():.1f} ± {part.returns.std():.1f}" if len(part) else ""
         rows.append([part.group, *sizes, *drawn, mean])
     return rows
 
@@ -83,20 +85,21 @@ def collect_returns(data: EnvironmentData) -> Returns:
     return {"nominal": data.twins.returns} | {a: data.anomalous(a).returns for a in data.anomalies}
 
 
-def return_rows(returns: Mapping[str, Returns]) -> Rows:
+def return_rows(returns: Mapping[str, Returns], kinds: Sequence[str]) -> Rows:
     """Return mean returns by environment and kind, ours above the paper's, which has no cap."""
     rows = []
     for environment, found in returns.items():
-        paper = paper_tables()["table2_policy_return"][environment]
-        ours = [f"{found[k].mean():.1f}" if k in found else "" for k in _KINDS]
-        title = ENVIRONMENTS[environment].title
-        rows += [[title, "ours", *ours], ["", "paper", *(f"{paper[k]:.1f}" for k in _KINDS)]]
+        ours = [f"{found[k].mean():.1f}" if k in found and len(found[k]) else "" for k in kinds]
+        rows.append([title_of(environment), "ours", *ours])
+        if paper := paper_tables()["table2_policy_return"].get(environment):
+            known = [f"{paper[k]:.1f}" if k in paper else "" for k in kinds]
+            rows.append(["", "paper", *known])
     return rows
 
 
 def _span(values: NDArray[np.int64]) -> str:
     """Return the range of some integers, as one number when they are equal."""
-    return "..".join(map(str, sorted({values.min(), values.max()})))
+    return "..".join(map(str, sorted({values.min(), values.max()}))) if len(values) else ""
 
 
 def _table(title: str, header: Sequence[str], rows: Rows) -> str:

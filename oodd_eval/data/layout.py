@@ -20,9 +20,26 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import Quantity, SplitDefinition
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    GROUPS,
+    NAME_PATTERN,
+    Group,
+    Quantity,
+    SplitDefinition,
+    split_condition,
+)
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.parts import CALIBRATION, NAMES, PARTS, TRAIN, TWINS
+from oodd_eval.data.parts import (
+    CALIBRATION,
+    NAMES,
+    NOMINAL,
+    TRAIN,
+    TWINS,
+    anomalies_in,
+    groups_in,
+)
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
@@ -82,7 +99,7 @@ class GroupCheck:
 
 def dtypes_of(group: str) -> dict[str, str]:
     """Return names and dtypes of the datasets a group must have."""
-    return dict(NOMINAL_DTYPES if group in {TRAIN, CALIBRATION, TWINS} else ANOMALOUS_DTYPES)
+    return dict(NOMINAL_DTYPES if group in NOMINAL else ANOMALOUS_DTYPES)
 
 
 def check_layout(file: str, name: str, group: h5py.Group) -> None:
@@ -127,14 +144,13 @@ def check_names(file: str, stored: h5py.File) -> None:
         names = stored[f"{NAMES}/{kind}"]
         if names.dtype.kind != "S":
             raise SplitError(f"{file}, {NAMES}/{kind} has dtype {names.dtype.str}, expected |S")
-        for part in PARTS:
-            if f"{part}/{columns}" in stored:
-                shape = stored[f"{part}/{columns}"].shape
-                if (*shape[1:], len(shape)) != (len(names), 2):
-                    raise SplitError(
-                        f"{file}, group {part}: {columns} have shape {shape}, expected "
-                        f"{len(names)} columns, since {NAMES} has as many {kind}"
-                    )
+        for part in groups_in(stored):
+            shape = stored[f"{part}/{columns}"].shape
+            if (*shape[1:], len(shape)) != (len(names), 2):
+                raise SplitError(
+                    f"{file}, group {part}: {columns} have shape {shape}, expected "
+                    f"{len(names)} columns, since {NAMES} has as many {kind}"
+                )
 
 
 def content_digest(group: Mapping[str, Any]) -> str:
@@ -155,9 +171,37 @@ def content_digest(group: Mapping[str, Any]) -> str:
 
 
 def environment_digest(entry: Mapping[str, Any]) -> str:
-    """Return the digest of an environment from its manifest entry: that of all its groups."""
+    """Return the digest of an environment from its manifest entry: that of all its groups.
+
+    What is said of an environment or of anomalies of one's own counts, too.
+    """
     digests = {name: group["sha256"] for name, group in entry["groups"].items()}
-    return _canonical_digest(digests | {NAMES: names_digest(entry)})
+    own = {"own": entry["own"]} if "own" in entry else {}
+    return _canonical_digest(digests | {NAMES: names_digest(entry)} | own)
+
+
+def own_facts(environment: str, *, discrete: bool, groups: Mapping[str, Group]) -> dict[str, Any]:
+    """Return what a manifest entry says of what is not among the benchmark's facts, if anything.
+
+    `groups` are those of all anomalies in the environment's file.
+    """
+    kinds = {split_condition(name)[0]: group for name, group in groups.items()}
+    kinds = {kind: group for kind, group in kinds.items() if kind not in ANOMALIES}
+    if environment in ENVIRONMENTS and not kinds:
+        return {}
+    return {"own": {"discrete": discrete, "anomalies": kinds}}
+
+
+def discrete_actions(environment: str, entry: Mapping[str, Any]) -> bool:
+    """Tell from a manifest entry whether an environment's actions are one-hot rows."""
+    return bool(entry["own"]["discrete"] if "own" in entry else ENVIRONMENTS[environment].discrete)
+
+
+def groups_of(entry: Mapping[str, Any]) -> dict[str, Group]:
+    """Return the groups of the anomalies of a manifest entry, by kind."""
+    own = entry["own"]["anomalies"] if "own" in entry else {}
+    kinds = (split_condition(condition)[0] for condition in anomalies_in(entry["groups"]))
+    return {kind: ANOMALIES[kind].group if kind in ANOMALIES else own[kind] for kind in kinds}
 
 
 def names_digest(entry: Mapping[str, Any]) -> str:
@@ -185,8 +229,12 @@ def pack_parameters(parameters: Sequence[Mapping[str, Any]]) -> NDArray[np.bytes
 def write_environment(
     path: Path, groups: Iterable[tuple[str, Arrays]], policy: str, *,
     sensors: Sequence[Quantity], actions: Sequence[Quantity],
+    own: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write an environment's groups, one at a time, in one step; return its manifest entry."""
+    """Write an environment's groups, one at a time, in one step; return its manifest entry.
+
+    `own` is what `own_facts` returns.
+    """
     names = {"sensors": [dataclasses.asdict(q) for q in sensors],
              "actions": [dataclasses.asdict(q) for q in actions]}  # fmt: skip
     entries: dict[str, dict[str, Any]] = {}
@@ -203,7 +251,7 @@ def write_environment(
             digest = content_digest(group)
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
         check_names(path.name, file)
-    entry = {"groups": entries, **names}
+    entry = {"groups": entries, **names, **(own or {})}
     return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
 
 
@@ -218,7 +266,7 @@ def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: 
     dataset = group.create_dataset(name, content.shape, dtype, track_times=False, **packing)
     # Whole chunks, so that each is compressed once.
     step, start = dataset.chunks[0] if dataset.chunks else 1, 0
-    for block in content.of_length(step * max(1, _BLOCK // (row * step))):
+    for block in content.of_length(step * max(1, _BLOCK // max(1, row * step))):
         dataset[start : start + len(block)] = block.astype(dtype, copy=False)
         start += len(block)
 
@@ -228,31 +276,51 @@ def _manifest_schema() -> Any:
     # The core of pydantic: its models would take longer to import than a split to open.
     from pydantic_core import SchemaValidator, core_schema  # noqa: PLC0415  slow to import
 
-    def record(**fields: core_schema.CoreSchema) -> core_schema.CoreSchema:
+    def record(**fields: core_schema.CoreSchema) -> core_schema.TypedDictSchema:
         typed = {name: core_schema.typed_dict_field(field) for name, field in fields.items()}
         return core_schema.typed_dict_schema(typed, extra_behavior="allow")
 
     text, by_name = core_schema.str_schema(), core_schema.dict_schema
+    name = core_schema.str_schema(pattern=f"^{NAME_PATTERN}$")
+    parts = core_schema.str_schema(
+        pattern=f"^(train|calibration|test/{NAME_PATTERN}(@[a-z0-9.-]{{1,32}})?)$"
+    )
     # Others trust these numbers with memory and disk.
-    count = core_schema.int_schema(gt=0, le=10**10)
+    count = core_schema.int_schema(ge=0, le=10**10)
     group = record(sha256=text, trajectories=count, transitions=count)
-    names = core_schema.list_schema(record(name=text, unit=text), min_length=1)
-    environment = record(file=text, policy=text, digest=text, groups=by_name(text, group),
+    names = core_schema.list_schema(record(name=text, unit=text))
+    kinds = by_name(name, core_schema.literal_schema([*GROUPS]))
+    own = record(discrete=core_schema.bool_schema(), anomalies=kinds)
+    environment = record(file=text, policy=text, digest=text, groups=by_name(parts, group),
                          sensors=names, actions=names)  # fmt: skip
-    environments, schema = by_name(text, environment), core_schema.literal_schema([SCHEMA])
+    environment["fields"]["own"] = core_schema.typed_dict_field(own, required=False)
+    environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
     named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
     return SchemaValidator(manifest, core_schema.CoreConfig(strict=True))
 
 
+def part_sizes(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Return numbers of trajectories, such as ``"40"`` or ``"12..40"`` of several environments."""
+    found = {}
+    for name, group in (("train", TRAIN), ("calibration", CALIBRATION), ("test", TWINS)):
+        parts = (entry["groups"].get(group) for entry in manifest["environments"].values())
+        sizes = {part["trajectories"] if part else 0 for part in parts} or {0}
+        found[name] = "..".join(map(str, sorted({min(sizes), max(sizes)})))
+    return found
+
+
 def write_manifest(
-    directory: Path, definition: SplitDefinition, environments: Mapping[str, Any],
-    generator: int, versions: Mapping[str, str],
+    directory: Path, definition: SplitDefinition | Mapping[str, Any],
+    environments: Mapping[str, Any], generator: int, versions: Mapping[str, str],
 ) -> None:  # fmt: skip
-    """Write ``manifest.json`` in one step from the entries of environments, in their order."""
-    recipe = definition.recipe
+    """Write ``manifest.json`` in one step from the entries of environments, in their order.
+
+    A split that was not recorded has no definition, but a mapping with its name.
+    """
+    recipe = definition.recipe if isinstance(definition, SplitDefinition) else dict(definition)
     manifest = {
-        "schema": SCHEMA, "name": definition.name, "definition": recipe, "generator": generator,
+        "schema": SCHEMA, "name": recipe["name"], "definition": recipe, "generator": generator,
         "environments": environments, "digest": split_digest(environments, recipe),
         "versions": versions,
     }  # fmt: skip
@@ -282,6 +350,15 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise SplitError(f"{file} is not a split's manifest: {found}") from None
     except OSError as error:
         raise SplitError(f"{file} cannot be read as a split's manifest: {error}") from error
+    for environment, entry in manifest["environments"].items():
+        said = entry["own"]["anomalies"] if "own" in entry else {}
+        kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
+        if environment not in ENVIRONMENTS and "own" not in entry:
+            raise SplitError(f"{file} has an unknown environment {environment!r}, of which it says "
+                             "nothing: build or import it again")  # fmt: skip
+        if unknown := sorted(kinds - {*ANOMALIES, *said}):
+            raise SplitError(f"{file} has an unknown anomaly {unknown[0]!r} in {environment}, of "
+                             "which it says nothing: build or import it again")  # fmt: skip
     expected = split_digest(manifest["environments"], manifest["definition"])
     if manifest["digest"] != expected:
         raise SplitError(

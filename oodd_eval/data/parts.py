@@ -13,27 +13,39 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, join_condition
+from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, in_order, join_condition
 from oodd_eval.data.ladder import RUNGS
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
-from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
 TRAIN: Final = "train"
 CALIBRATION: Final = "calibration"
 TWINS: Final = "test/nominal"
 
+NOMINAL: Final = (TRAIN, CALIBRATION, TWINS)
+"""The nominal parts, which every environment has. Each part is a group of its file."""
+
 CONDITIONS: Final = tuple(
     join_condition(anomaly, strength) for anomaly in ANOMALIES for strength in ("", *RUNGS)
 )
-"""Every anomaly, at every strength that a suite may have, in the benchmark's order."""
-
-PARTS: Final = (TRAIN, CALIBRATION, TWINS, *(f"test/{condition}" for condition in CONDITIONS))
-"""All parts in the benchmark's order. Each is a group of the environment's file."""
+"""Every anomaly of the benchmark, at every strength that a suite may have, in its order."""
 
 NAMES: Final = "names"  # the group that names the columns of observations and actions
 _ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
+
+
+def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
+    """Return the anomalies among groups such as ``"test/iid"``, in the benchmark's order."""
+    tests = (group.removeprefix("test/") for group in groups if group not in NOMINAL)
+    return tuple(in_order(sorted(tests), CONDITIONS))
+
+
+def groups_in(file: h5py.File) -> list[str]:
+    """Return the parts that an environment's file has."""
+    tests = file.get("test")
+    inner = [f"test/{name}" for name in tests] if isinstance(tests, h5py.Group) else []
+    return [*(part for part in (TRAIN, CALIBRATION) if part in file), *inner]
 
 
 class TrajectorySet(TrajectorySequence):
@@ -136,14 +148,17 @@ class EnvironmentData:
     `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
     calibrate alarms, `twins` those of the test seeds. `anomalies` are the conditions of this split:
     names of anomalies, with ``@`` and the strength where there are several, as in ``iid@kept99``.
-    `sensors` and `actions` are names and units of the columns of observations and actions.
+    `sensors` and `actions` are names and units of the columns of observations and actions; an
+    action that is `discrete` is a one-hot row.
     """
 
-    def __init__(self, environment: str, file: h5py.File, digest: str) -> None:
-        self.id, self.digest, self._file = environment, digest, file
-        nominal = (TrajectorySet(file, part) for part in (TRAIN, CALIBRATION, TWINS))
+    def __init__(
+        self, environment: str, file: h5py.File, digest: str, *, discrete: bool = False
+    ) -> None:
+        self.id, self.digest, self.discrete, self._file = environment, digest, discrete, file
+        nominal = (TrajectorySet(file, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
-        self.anomalies = tuple(c for c in CONDITIONS if f"test/{c}" in file)
+        self.anomalies = anomalies_in(groups_in(file))
         self.sensors, self.actions = (
             tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, file[kind][:]))
             for kind in (f"{NAMES}/sensors", f"{NAMES}/actions")
@@ -159,12 +174,10 @@ class EnvironmentData:
 
         Raises
         ------
-        UnknownNameError, SplitError
-            When the benchmark has no such anomaly, or this split has no such part.
+        UnknownNameError
+            When this split has no such anomaly.
         """
-        check_known("anomaly", CONDITIONS, anomaly)
-        if f"test/{anomaly}" not in self._file:
-            raise SplitError(f"{Path(self._file.filename).name} has no group test/{anomaly}")
+        check_known(f"anomaly of {Path(self._file.filename).name}", self.anomalies, anomaly)
         return AnomalousSet(self._file, f"test/{anomaly}")
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:

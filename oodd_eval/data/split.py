@@ -12,11 +12,17 @@ from typing import Any
 import h5py
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, split_condition
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order, split_condition
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import CONDITIONS, NAMES, PARTS, TRAIN, EnvironmentData
-from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
-from oodd_eval.names import check_known
+from oodd_eval.data.parts import CONDITIONS, NAMES, TRAIN, EnvironmentData, anomalies_in, groups_in
+from oodd_eval.errors import (
+    DigestError,
+    SplitError,
+    SplitNotFoundError,
+    UnknownNameError,
+    UsageError,
+)
+from oodd_eval.names import check_known, select
 
 SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
 
@@ -96,18 +102,44 @@ class Split:
 
     @property
     def environments(self) -> tuple[str, ...]:
-        """Names of the environments, in the benchmark's order."""
-        return tuple(e for e in ENVIRONMENTS if e in self.manifest["environments"])
+        """Names of the environments: the benchmark's in its order, then others in theirs."""
+        return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
     def conditions(self, environment: str) -> tuple[str, ...]:
         """Return the anomalies of an environment, each with its strength if it has several."""
-        groups = self.manifest["environments"][environment]["groups"]
-        return tuple(c for c in CONDITIONS if f"test/{c}" in groups)
+        return anomalies_in(self.manifest["environments"][environment]["groups"])
 
     @property
     def anomalies(self) -> tuple[str, ...]:
         """Names by which anomalies of any environment can be chosen: kinds, and conditions."""
-        every = [c for e in self.environments for c in self.conditions(e)]
+        return self._names(*self.environments)
+
+    @property
+    def groups(self) -> dict[str, Group]:
+        """Groups of all anomalies, by kind."""
+        found: dict[str, Group] = {}
+        for entry in self.manifest["environments"].values():
+            found |= layout.groups_of(entry)
+        return found
+
+    def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
+        """Return the environments and anomalies that comma lists, globs or ``"all"`` select.
+
+        Raises
+        ------
+        UsageError
+            When something is unknown, or the environments have nominal episodes only.
+        """
+        chosen = select("environment", environments, self.environments)
+        if not (known := self._names(*chosen)):
+            raise UsageError(
+                f"split {self.name} has no anomalous episodes of {', '.join(chosen)}, expected "
+                "some to evaluate detectors on: import them, or fit a watchdog on what there is"
+            )
+        return chosen, select("anomaly", anomalies, known)
+
+    def _names(self, *environments: str) -> tuple[str, ...]:
+        every = in_order((c for e in environments for c in self.conditions(e)), CONDITIONS)
         kinds = (split_condition(condition)[0] for condition in every)
         return tuple(dict.fromkeys((*kinds, *every)))
 
@@ -146,8 +178,10 @@ class Split:
                     "fetch it again"
                 )
             stack.pop_all()
-        digest = layout.environment_digest(self.manifest["environments"][name])
-        return EnvironmentData(name, file, digest)
+        entry = self.manifest["environments"][name]
+        digest = layout.environment_digest(entry)
+        discrete = layout.discrete_actions(name, entry)
+        return EnvironmentData(name, file, digest, discrete=discrete)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
@@ -181,8 +215,8 @@ class Split:
         short = Path(file.filename).name
         entry = self.manifest["environments"][name]
         expected = {group: str(found["sha256"]) for group, found in entry["groups"].items()}
-        held = [part for part in PARTS if part in file]
-        if {*held, *expected} != {*expected} & {*PARTS}:
+        held = groups_in(file)
+        if {*held} - {*expected}:
             raise SplitError(f"{short} holds the groups {held}, expected {[*expected]}")
         for group, digest in (expected | {NAMES: layout.names_digest(entry)}).items():
             if group not in file:

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.data.files import compress_large, digests
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
@@ -116,8 +116,10 @@ def selected(
     left_out: list[str] = []
     if complete:
         chosen, left_out = _complete(chosen)
-    order = {name: i for i, name in enumerate((*ENVIRONMENTS, *ANOMALIES))}
-    chosen.sort(key=lambda r: (order[r.environment], order[r.anomaly], r.strength))
+    environments = in_order((r.environment for r in chosen), ENVIRONMENTS)
+    anomalies = in_order((r.anomaly for r in chosen), ANOMALIES)
+    places = environments.index, anomalies.index
+    chosen.sort(key=lambda r: (places[0](r.environment), places[1](r.anomaly), r.strength))
     chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
     return [_publishable(r) for r in chosen], left_out
 

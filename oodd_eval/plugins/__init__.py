@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import pluggy
 
 if TYPE_CHECKING:
+    from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
     from oodd_eval.plugins.contract import DetectorSpec
 
 PROJECT: Final = "oodd_eval"
@@ -36,6 +37,33 @@ def oodd_detectors() -> list[DetectorSpec] | None:
     Returns
     -------
     list of DetectorSpec
+        None stands for an empty list.
+    """
+
+
+@hookspec
+def oodd_environments() -> list[EnvironmentSpec] | None:
+    """Offer environments with their policies, which ``oodd-eval data build`` records.
+
+    Called once, when environments or anomalies are listed, or one that the benchmark lacks is
+    named. It has to be quick: import simulators inside the functions that specs name.
+
+    Returns
+    -------
+    list of EnvironmentSpec
+        None stands for an empty list.
+    """
+
+
+@hookspec
+def oodd_anomalies() -> list[AnomalySpec] | None:
+    """Offer kinds of anomalies, for environments of the benchmark or of one's own.
+
+    Called as `oodd_environments` is.
+
+    Returns
+    -------
+    list of AnomalySpec
         None stands for an empty list.
     """
 

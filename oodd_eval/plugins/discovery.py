@@ -19,9 +19,12 @@ from typing import Final, NamedTuple
 import pluggy
 
 from oodd_eval import plugins as hooks
+from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, check_spec
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
 from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
+
+OwnSpec = EnvironmentSpec | AnomalySpec
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -88,6 +91,21 @@ class Plugin:
             specs += found
         return specs
 
+    def own_specs(self) -> list[OwnSpec]:
+        """Return its environments and anomalies, checked."""
+        found: list[OwnSpec] = []
+        for hook, kind in (("oodd_environments", EnvironmentSpec), ("oodd_anomalies", AnomalySpec)):
+            for specs in getattr(self.hook, hook)():
+                if not isinstance(specs, list) or not all(isinstance(s, kind) for s in specs):
+                    expected = f"a list of oodd_eval.{kind.__name__}"
+                    raise PluginError(
+                        f"{hook} of {self} returned {specs!r:.80}, expected {expected}"
+                    )
+                found += specs
+        for spec in found:
+            check_spec(spec)
+        return found
+
     def offer(self, spec: DetectorSpec) -> Offer:
         """Return a spec as an offer; its version names the library that does the work, too."""
         version = "+".join(filter(None, (_version(self.point), spec.version)))
@@ -113,6 +131,23 @@ class Plugins:
     def names(self) -> set[str]:
         """Names of all plug-ins, loaded or not."""
         return {point.name for point in (*self._points, *self.observer_points)}
+
+    @property
+    def own_specs(self) -> dict[str, tuple[OwnSpec, str]]:
+        """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
+        for point in list(self._waiting):
+            self._load(point)
+        found: dict[str, tuple[OwnSpec, str]] = {}
+        for plugin in list(self.loaded.values()):
+            with self.blaming(plugin.point):
+                own: dict[str, tuple[OwnSpec, str]] = {}
+                for spec in plugin.own_specs():
+                    if previous := found.get(spec.name) or own.get(spec.name):
+                        by = f"{previous[1]} and by {plugin}"
+                        raise PluginError(f"{spec.name!r} is offered twice, by {by}")
+                    own[spec.name] = (spec, str(plugin))
+                found |= own
+        return found
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -258,7 +293,8 @@ def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
     for specification in (hooks, *specifications):
         manager.add_hookspecs(specification)
     manager.register(plugin)
-    known = {"oodd_detectors", "oodd_detector_from_spec", *hooks.OBSERVER_HOOKS}
+    known = {"oodd_detectors", "oodd_detector_from_spec", "oodd_environments", "oodd_anomalies"}
+    known |= {*hooks.OBSERVER_HOOKS}
     check_known("hook", known, *(caller.name for caller in manager.get_hookcallers(plugin) or ()))
     return manager.hook
 

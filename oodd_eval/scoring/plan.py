@@ -4,10 +4,10 @@ From names to a plan: settings are resolved and keys are made here, once.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
-from oodd_eval.data.facts import ANOMALIES, PROTOCOL, split_condition
+from oodd_eval.data.facts import PROTOCOL, Group, split_condition
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
@@ -57,13 +57,15 @@ class Unit:
 class Plan:
     """All units of a run, in the order in which they are begun and recorded.
 
-    Of each part the first `limit` trajectories are used; None means all.
+    Of each part the first `limit` trajectories are used; None means all. `groups` are those of
+    anomalies by name.
     """
 
     split: str
     split_digest: str
     units: tuple[Unit, ...]
     limit: int | None = None
+    groups: Mapping[str, Group] = field(default_factory=dict)
 
     @property
     def cells(self) -> list[Cell]:
@@ -92,7 +94,7 @@ class Plan:
             plugin_source=unit.source, parameters=dict(unit.shown),
             overrides=unit.setting.overrides, inputs=unit.inputs, alarm=unit.alarm,
             deterministic=unit.deterministic, environment=unit.environment, anomaly=kind,
-            strength=strength, group=ANOMALIES[kind].group,
+            strength=strength, group=self.groups[kind],
             split=self.split, split_digest=self.split_digest, limit=self.limit,
             scores=unit.scores_key, protocol=PROTOCOL, **outcome,
         )  # fmt: skip
@@ -129,7 +131,7 @@ def make_plan(
         for horizon in horizons
         for seed in seeds
     )
-    return Plan(split.name, split.digest, units, limit)
+    return Plan(split.name, split.digest, units, limit, split.groups)
 
 
 def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
+from oodd_eval.data.own import info_of
 from oodd_eval.data.simulate.policies import (
     FROZEN,
     LAYERS,
@@ -27,7 +28,7 @@ def freeze_policy(
     environment: str, arrays: Arrays, facts: Mapping[str, Any], directory: Path = FROZEN
 ) -> str:
     """Write a policy (float32 arrays) and its provenance; return the content digest."""
-    info = ENVIRONMENTS[environment]
+    info = info_of(environment)
     packed = {
         name: np.asarray(arrays[name]).astype(np.int64 if name == "quantiles" else np.float32)
         for name in LAYERS[info.policy]

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.own import info_of
 from oodd_eval.data.simulate.environments import make
 from oodd_training.replay import Replay
 
@@ -95,8 +95,8 @@ class _Actor:
         self, environment: str, first_seed: int, replay: Replay, p: dict[str, Any]
     ) -> None:
         self.environment, self.seed, self.replay, self.p = environment, first_seed, replay, p
-        self.cap = ENVIRONMENTS[environment].episode_cap
-        self.actions = ENVIRONMENTS[environment].action_dim
+        self.cap = info_of(environment).episode_cap
+        self.actions = info_of(environment).action_dim
         self.held, self.random = 0, 0
         self.restart()
 
@@ -143,7 +143,7 @@ class IQN:
 
     def __init__(self, environment: str) -> None:
         p = self.hyper_parameters = HYPER_PARAMETERS | OVERRIDES.get(environment, {})
-        self.environment, info = environment, ENVIRONMENTS[environment]
+        self.environment, info = environment, info_of(environment)
         shape = (info.observation_dim, info.action_dim, p["width"], p["cosines"])
         self.online, self.target = Network(*shape), Network(*shape)
         self.target.load_state_dict(self.online.state_dict())
@@ -169,7 +169,7 @@ class IQN:
         """Train from one step to another; yield the step whenever an evaluation is due."""
         p, step = self.hyper_parameters, start
         rng = np.random.default_rng(seed)
-        replay = Replay(p["replay"], 2 * ENVIRONMENTS[self.environment].observation_dim + 3)
+        replay = Replay(p["replay"], 2 * info_of(self.environment).observation_dim + 3)
         seeds = [seed * 10**7 + i * 10**6 + step for i in range(p["environments"])]
         actors = [_Actor(self.environment, s, replay, p) for s in seeds]
         first, last, share = p["exploration"]

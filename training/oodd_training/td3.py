@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.own import info_of
 from oodd_eval.data.simulate.environments import make
 from oodd_eval.data.simulate.policies import LAYERS
 from oodd_training.replay import Replay
@@ -85,7 +85,7 @@ class TD3:
 
     def __init__(self, environment: str) -> None:
         self.environment, self.hyper_parameters = environment, HYPER_PARAMETERS
-        p, info = HYPER_PARAMETERS, ENVIRONMENTS[environment]
+        p, info = HYPER_PARAMETERS, info_of(environment)
         observations, actions = info.observation_dim, info.action_dim
         self.observations, self.actions = observations, actions
         self.networks: dict[str, Layers] = {
@@ -178,7 +178,7 @@ class TD3:
             following, reward, over = simulator.step(action)
             replay.add(row, following, action, [reward, over])
             row, length = following, length + 1
-            if over or length >= ENVIRONMENTS[self.environment].episode_cap:
+            if over or length >= info_of(self.environment).episode_cap:
                 # The client is kept while training: a fresh one costs as much as a hundred steps.
                 row, length = simulator.reset(int(rng.integers(2**31))), 0
             if step >= max(start, p["warm_up"]):

@@ -11,12 +11,11 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
+from oodd_eval.data.own import info_of
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import evaluate_policy
 from oodd_eval.errors import MissingExtraError, PolicyError
-from oodd_eval.names import check_known
 from oodd_training.freeze import freeze_policy
 
 SELECTION_SEED: Final = 910_000_000
@@ -28,6 +27,8 @@ DEFAULT_STEPS: Final = {
     "acrobot": 60_000, "cartpole": 60_000, "lunarlander": 400_000, "ant": 1_000_000,
     "halfcheetah": 1_500_000, "hopper": 1_000_000, "walker2d": 1_000_000,
 }  # fmt: skip
+
+OTHER_STEPS: Final = 200_000  # of an environment of one's own
 
 Progress = Callable[[str], None]
 
@@ -69,9 +70,8 @@ def train_policy(
     steps in all, those of earlier runs included; `progress` is called with one line per
     evaluation.
     """
-    check_known("environment", ENVIRONMENTS, environment)
-    algorithm = ENVIRONMENTS[environment].policy
-    total = DEFAULT_STEPS[environment] if steps is None else steps
+    algorithm = info_of(environment).policy
+    total = DEFAULT_STEPS.get(environment, OTHER_STEPS) if steps is None else steps
     learner = _make_learner(environment, algorithm, seed)
     facts = {"algorithm": algorithm, "hyper_parameters": learner.hyper_parameters, "seed": seed}
     journal = _Journal(environment, out, facts, progress)

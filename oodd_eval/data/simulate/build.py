@@ -25,18 +25,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition
+from oodd_eval.data.facts import (
+    ENVIRONMENTS,
+    PART_OFFSETS,
+    SplitDefinition,
+    in_order,
+    split_condition,
+)
 from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
+from oodd_eval.data.own import (
+    MEASURED,
+    AnomalySpec,
+    EnvironmentSpec,
+    Measured,
+    anomaly_info,
+    code_digest,
+    info_of,
+    kinds_of,
+    register,
+    registered,
+)
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import (
     GENERATOR_VERSION,
     Episode,
     TwinTooShortError,
+    measure,
     record_seed,
 )
+from oodd_eval.data.simulate.values import bound_of, unit_of
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
@@ -86,12 +106,12 @@ def build_split(
     Complete environments there are kept. By default there are all seven, the frozen policies act,
     one worker process per core. `UsageError` for a wrong size, or another split in the directory.
     """
-    asked = list(ENVIRONMENTS if environments is None else environments)
-    check_known("environment", ENVIRONMENTS, *asked)
-    names = [e for e in ENVIRONMENTS if e in asked]
+    names = in_order(ENVIRONMENTS if environments is None else environments, ENVIRONMENTS)
     _check_sizes(definition)
+    for name in names:
+        _check_strengths(definition, name)
     paths = {e: str((policies or {}).get(e, "")) for e in names}
-    digests = {e: load_policy(e, paths[e] or None).digest for e in names}
+    digests = {e: _acting(definition, e, paths[e]) for e in names}
     entries = _kept(definition, directory, digests)
     work = directory / WORK
     work.mkdir(parents=True, exist_ok=True)
@@ -121,11 +141,13 @@ def build_split(
             for part in (TRAIN, CALIBRATION, *tests)
         )
         target = directory / f"{environment}.h5"
-        info = ENVIRONMENTS[environment]
+        info = info_of(environment)
+        kinds = {c: anomaly_info(split_condition(c)[0]).group for c, _ in chunks[-1].conditions}
         entries[environment] = layout.write_environment(
-            target, groups, digests[environment], sensors=info.sensors, actions=info.actions
-        ) | _strengths(definition, environment)
-    ordered = {e: entries[e] for e in ENVIRONMENTS if e in entries}
+            target, groups, digests[environment], sensors=info.sensors, actions=info.actions,
+            own=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
+        ) | _strengths(definition, environment)  # fmt: skip
+    ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
     versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
     layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
     shutil.rmtree(work)
@@ -143,6 +165,33 @@ def _check_sizes(definition: SplitDefinition) -> None:
         raise UsageError(f"the noise must be 0 to 1 of the spread, got {definition.noise}")
     if definition.seed_base < 0:
         raise UsageError(f"the seed base must not be negative, got {definition.seed_base}")
+
+
+def _check_strengths(definition: SplitDefinition, environment: str) -> None:
+    """Raise `UsageError` for kinds that an environment cannot have, and beyond their bounds."""
+    if not definition.strengths and environment not in ENVIRONMENTS:
+        raise UsageError(
+            f"no strengths of anomalies are given for {environment!r}, an environment of one's own:"
+            f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}"
+        )
+    for condition, strength in definition.strengths.items():
+        kind = split_condition(condition)[0]
+        check_known(f"anomaly that {environment} can have", kinds_of(environment), kind)
+        if not 0 <= strength <= bound_of(environment, kind):
+            most, unit = bound_of(environment, kind), unit_of(environment, kind)
+            raise UsageError(
+                f"the strength of {kind} is {strength:g}, expected 0 to {most:g} in {environment} "
+                f"(1 is: {unit})"
+            )
+
+
+def _acting(definition: SplitDefinition, environment: str, path: str) -> str:
+    """Return the digest of what acts in an environment: policy, and code of one's own."""
+    policy = load_policy(environment, path or None)
+    measure(environment, policy)
+    kinds = [split_condition(condition)[0] for condition in definition.strengths]
+    code = code_digest(environment, kinds)
+    return hashlib.sha256(f"{policy.digest} {code}".encode()).hexdigest() if code else policy.digest
 
 
 def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str]) -> dict[str, Any]:
@@ -189,7 +238,8 @@ def _base(
 
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
-    conditions = tuple(conditions_of(definition.suite, environment).items())
+    strengths = definition.strengths or conditions_of(definition.suite, environment)
+    conditions = tuple(strengths.items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
         own = conditions if part == "test" else ()
@@ -233,7 +283,10 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
     # Sums depend on the number of threads of matrix libraries, which these read when they load,
     # before any code of ours runs in a child.
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    with patch.dict(os.environ, single), ProcessPoolExecutor(jobs, context, _watch_parent) as pool:
+    with (
+        patch.dict(os.environ, single),
+        ProcessPoolExecutor(jobs, context, _begin, (registered(), dict(MEASURED))) as pool,
+    ):
         running = {pool.submit(record_chunk, chunk, work): chunk for chunk in chunks}
         try:
             for future in as_completed(running):
@@ -243,8 +296,15 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _watch_parent() -> None:
-    """End this worker when the build is killed: it would wait for work forever."""
+def _begin(
+    specs: Sequence[EnvironmentSpec | AnomalySpec], measured: Mapping[str, Measured]
+) -> None:
+    """Make known what the build knows, and end this worker when the build is killed.
+
+    It would wait for work forever.
+    """
+    register(specs)
+    MEASURED.update(measured)
 
     def wait_for_parent() -> None:
         if parent := multiprocessing.parent_process():

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import redirected
+from oodd_eval.data.own import EnvironmentSpec, environment_spec
 from oodd_eval.errors import MissingExtraError
-from oodd_eval.names import check_known
 
 
 @contextmanager
@@ -334,9 +334,27 @@ class Bullet(Simulator):
             super().close()
 
 
+class Own(Simulator):
+    """An environment of one's own; wind adds to every command of continuous actions."""
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        super().__init__(spec.make())
+        self._attributes = spec.attributes
+
+    def command(self, action: Any) -> Any:
+        return np.clip(action + np.float32(self.wind), -1, 1) if self.wind else action
+
+    def set(self, attribute: str, value: float) -> None:
+        self._attributes[attribute].set(self.env, value)
+
+    def get(self, attribute: str) -> float:
+        return float(self._attributes[attribute].get(self.env))
+
+
 def make(environment: str) -> Simulator:
     """Return a fresh simulator of an environment, to be used for one episode and closed."""
-    check_known("environment", ENVIRONMENTS, environment)
+    if spec := environment_spec(environment):
+        return Own(spec)
     classic: dict[str, Any] = {"acrobot": Acrobot, "cartpole": CartPole, "lunarlander": LunarLander}
     found: Simulator = classic.get(environment, functools.partial(Bullet, environment))()
     return found

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.own import anomaly_spec, info_of
 from oodd_eval.data.simulate.environments import Row, Simulator
 from oodd_eval.data.simulate.values import VALUES, choose_sensors, spread_of
 
@@ -118,7 +118,7 @@ def make_fault(
     Parameters
     ----------
     environment, kind
-        Names of the benchmark.
+        Names of the benchmark, or of one's own.
     strength
         From 0, which changes nothing, to the kind's bound.
     simulator
@@ -129,7 +129,10 @@ def make_fault(
     base, intermittent = kind.removesuffix("-intermittent"), kind.endswith("-intermittent")
     if base == "wind" and intermittent:
         base = "wind-l2r"
-    fault = _MAKERS[base](environment, float(strength), simulator, rng)
+    if spec := anomaly_spec(kind):
+        fault: Fault = spec.make(float(strength), rng, simulator)
+    else:
+        fault = _MAKERS[base](environment, float(strength), simulator, rng)
     fault.parameters["strength"] = float(strength)
     return Intermittent(fault) if intermittent else fault
 
@@ -224,7 +227,7 @@ def _stuck(environment: str, strength: float, _: Simulator, rng: np.random.Gener
 
 def _wind(direction: int) -> _Maker:
     def maker(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
-        discrete = ENVIRONMENTS[environment].discrete
+        discrete = info_of(environment).discrete
 
         def act(action: Command, simulator: Simulator) -> Command:
             gust = rng.random() < strength if discrete else True
@@ -281,29 +284,29 @@ def _gain(environment: str, strength: float, _: Simulator, rng: np.random.Genera
     if environment == "lunarlander":
         engine = ("main_engine_power", "side_engine_power")[rng.integers(2)]
         return _setting([engine], 1 - strength, actuator=engine)
-    if ENVIRONMENTS[environment].discrete:
+    if info_of(environment).discrete:
         return _setting(["gain"], 1 - strength)
-    j = int(rng.integers(ENVIRONMENTS[environment].action_dim))
+    j = int(rng.integers(info_of(environment).action_dim))
     return Dynamics(lambda a, _: _replaced(a, j, a[j] * (1 - strength)), actuator=j)
 
 
 def _bias(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
     sign = int(rng.choice([-1, 1]))
-    if ENVIRONMENTS[environment].discrete:
+    if info_of(environment).discrete:
 
         def push(action: Command, simulator: Simulator) -> Command:
             simulator.set("bias", sign * strength)
             return action
 
         return Dynamics(push, direction=sign)
-    j = int(rng.integers(ENVIRONMENTS[environment].action_dim))
+    j = int(rng.integers(info_of(environment).action_dim))
     act = lambda a, _: _replaced(a, j, np.clip(a[j] + sign * strength, -1, 1))  # noqa: E731
     return Dynamics(act, actuator=j, direction=sign)
 
 
 def _stuck_joint(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
     """Discrete: with a probability the first command is carried out again."""
-    info = ENVIRONMENTS[environment]
+    info = info_of(environment)
     first: list[Command] = []
     j = int(rng.integers(info.action_dim))
 
@@ -319,7 +322,7 @@ def _stuck_joint(environment: str, strength: float, _: Simulator, rng: Any) -> F
 
 def _latency(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
     """Between two whole numbers of steps: the mean of both commands, discrete: one by chance."""
-    discrete, whole, part = ENVIRONMENTS[environment].discrete, int(strength), strength % 1
+    discrete, whole, part = info_of(environment).discrete, int(strength), strength % 1
     recent: deque[Command] = deque(maxlen=whole + 2)
 
     def act(action: Command, _: Simulator) -> Command:
@@ -334,7 +337,7 @@ def _latency(environment: str, strength: float, _: Simulator, rng: np.random.Gen
 
 def _action_noise(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
     """Discrete: with a probability the command is drawn at random."""
-    info = ENVIRONMENTS[environment]
+    info = info_of(environment)
 
     def act(action: Command, _: Simulator) -> Command:
         if info.discrete:

@@ -5,7 +5,7 @@ that the last bits of a matrix product cannot reach the simulator.
 """
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -13,10 +13,10 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ENVIRONMENTS, EnvironmentInfo
+from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
+from oodd_eval.data.own import code_digest, environment_spec, info_of
 from oodd_eval.errors import PolicyError
-from oodd_eval.names import check_known
 
 FROZEN: Final = Path(__file__).with_name("frozen")
 ACTION_GRID: Final = 2.0**16
@@ -76,7 +76,20 @@ class IQNPolicy:
         return int(np.argmax(np.round(self.values(row) * ACTION_GRID)))
 
 
-Policy = TD3Policy | IQNPolicy  # deterministic controllers
+class OwnPolicy:
+    """A function of the row, as the spec of an environment of one's own names it."""
+
+    def __init__(self, environment: str, act: Callable[[Any], Any]) -> None:
+        self.digest = code_digest(environment, ())
+        self._act, self._discrete = act, info_of(environment).discrete
+
+    def act(self, row: NDArray[np.float32]) -> Any:
+        """Return the action for an observation row of shape (D,): an int, or a float32 row."""
+        action = self._act(row)
+        return int(action) if self._discrete else np.asarray(action, np.float32).ravel()
+
+
+Policy = TD3Policy | IQNPolicy | OwnPolicy  # deterministic controllers
 
 
 def policy_digest(arrays: Arrays) -> str:
@@ -86,8 +99,11 @@ def policy_digest(arrays: Arrays) -> str:
 
 def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     """Load the frozen policy of an environment, or another file; `PolicyError` if it is none."""
-    check_known("environment", ENVIRONMENTS, environment)
-    info = ENVIRONMENTS[environment]
+    spec, info = environment_spec(environment), info_of(environment)
+    if spec and path is None:
+        if callable(spec.policy):
+            return OwnPolicy(environment, spec.policy())
+        path = spec.policy
     file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
     try:
         with file.open("rb") as source, np.load(source, allow_pickle=False) as stored:

@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, split_condition
+from oodd_eval.data.facts import split_condition
+from oodd_eval.data.own import MEASURED, Measured, environment_spec, info_of, kinds_of
 from oodd_eval.data.simulate.anomalies import draw
 from oodd_eval.data.simulate.environments import Simulator, make
 from oodd_eval.data.simulate.faults import Fault, make_fault
@@ -36,6 +37,7 @@ SHORTEST_TAIL: Final = 20
 """An anomalous episode has more than this many transitions beyond the onset, if any draw does."""
 
 MAX_REDRAWS: Final = 100
+MEASURED_EPISODES: Final = 10
 EVALUATION_SEED: Final = 900_000_000  # outside every split and training
 
 
@@ -111,7 +113,8 @@ def record_seed(
         When an anomaly changes nothing in 100 redraws.
     """
     given = conditions if isinstance(conditions, Mapping) else dict.fromkeys(conditions)
-    check_known("anomaly", ANOMALIES, *(split_condition(name)[0] for name in given))
+    kinds = [split_condition(name)[0] for name in given]
+    check_known(f"anomaly that {environment} can have", kinds_of(environment), *kinds)
     setup = Setup(environment, policy, episode_cap, noise)
     twin = setup.record(seed)
     if given and twin.trajectory.transitions < SHORTEST_TWIN:
@@ -141,6 +144,27 @@ def evaluate_policy(
     return np.array([return_of(setup.record(seed + i)) for i in range(episodes)])
 
 
+def measure(environment: str, policy: Policy) -> None:
+    """Measure the sensors of an environment of one's own, once, in ten nominal episodes.
+
+    Sensors that may break vary as the benchmark's do: they differ from their median in at least 1 %
+    of the rows, and have more than 8 distinct values.
+    """
+    if environment_spec(environment) is None or environment in MEASURED:
+        return
+    setup = Setup(environment, policy)
+    episodes = [setup.record(EVALUATION_SEED + i).trajectory for i in range(MEASURED_EPISODES)]
+    rows = np.concatenate([episode.observations for episode in episodes]).astype(np.float64)
+    moves = (rows != np.median(rows, axis=0)).mean(axis=0) >= 0.01
+    may_break = [i for i, x in enumerate(rows.T) if moves[i] and len(np.unique(x)) > 8]
+    if not may_break:
+        raise SimulationError(
+            f"no sensor of {environment} varies under its policy, expected one with more than 8 "
+            "values in ten nominal episodes"
+        )
+    MEASURED[environment] = Measured(tuple(rows.std(axis=0).tolist()), tuple(may_break))
+
+
 def return_of(episode: Episode) -> float:
     """Return the sum of an episode's rewards."""
     return float(episode.rewards.sum(dtype=np.float64))
@@ -165,7 +189,7 @@ def record_anomalous(
     if strength is not None:
         maker = functools.partial(make_fault, environment, kind, strength)
     commands = list(twin.trajectory.actions)
-    if ENVIRONMENTS[environment].discrete:
+    if info_of(environment).discrete:
         commands = [int(row.argmax()) for row in commands]
     last = int(LAST_ONSET_SHARE * len(commands))
     longest: Episode | None = None
@@ -208,7 +232,7 @@ def _run(
 ) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:  # fmt: skip
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
     environment, policy, fault = setup.environment, setup.policy, None
-    simulator, info, noisy = make(environment), ENVIRONMENTS[environment], _noise(setup, seed)
+    simulator, info, noisy = make(environment), info_of(environment), _noise(setup, seed)
     cap = min(info.episode_cap, setup.episode_cap or info.episode_cap)
     actions: list[Any] = []
     rewards: list[float] = []
@@ -218,7 +242,8 @@ def _run(
         if rows[0].shape != (info.observation_dim,):
             raise SimulationError(
                 f"{environment}'s simulator gave an observation of shape {rows[0].shape}, expected "
-                f"({info.observation_dim},): install the version that oodd-eval[sim] names"
+                f"({info.observation_dim},): install the version that oodd-eval[sim] names, or "
+                "mend the environment's spec"
             )
         rows[0] = noisy(rows[0])
         while not over and (step := len(rewards)) < cap:

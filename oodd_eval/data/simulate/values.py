@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.own import MEASURED, anomaly_spec, info_of
 
 SENSOR_SHARE: Final = 0.2  # of the sensors that an anomaly corrupts, rounded down, at least one
 
@@ -31,13 +31,16 @@ strength of kinds; discrete actions, or one environment, may have their own.
 
 def choose_sensors(environment: str, rng: np.random.Generator) -> NDArray[np.intp]:
     """Draw the sensors that an anomaly corrupts, sorted."""
-    count = max(1, int(SENSOR_SHARE * ENVIRONMENTS[environment].observation_dim))
-    return np.sort(rng.choice(VALUES["sensors"][environment], size=count, replace=False))
+    own = MEASURED.get(environment)
+    known = own.sensors if own else VALUES["sensors"][environment]
+    count = min(len(known), max(1, int(SENSOR_SHARE * info_of(environment).observation_dim)))
+    return np.sort(rng.choice(known, size=count, replace=False))
 
 
 def spread_of(environment: str) -> NDArray[np.float64]:
     """Return the nominal standard deviation of each sensor, of shape (D,)."""
-    return np.array(VALUES["spread"][environment], dtype=np.float64)
+    own = MEASURED.get(environment)
+    return np.array(own.spread if own else VALUES["spread"][environment], dtype=np.float64)
 
 
 def unit_of(environment: str, kind: str) -> str:
@@ -51,7 +54,9 @@ def bound_of(environment: str, kind: str) -> float:
 
 
 def _strength(environment: str, kind: str) -> tuple[str, float]:
+    if spec := anomaly_spec(kind):
+        return spec.unit, spec.bound
     own = VALUES["strength"]["wind-l2r" if kind.startswith("wind") else kind]
-    family = "discrete" if ENVIRONMENTS[environment].discrete else "continuous"
+    family = "discrete" if info_of(environment).discrete else "continuous"
     found: tuple[str, float] = own.get(environment) or own.get(family) or own["all"]
     return found

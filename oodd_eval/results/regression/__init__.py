@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.files import write_text
 from oodd_eval.data.parts import CONDITIONS
 from oodd_eval.errors import ResultsError, UsageError
@@ -357,7 +357,9 @@ def write_reference(records: Iterable[Record], path: Path | str) -> None:
 
     Records stand in the order of the benchmark, whatever the order in which cells ran.
     """
-    environments, conditions = list(ENVIRONMENTS), list(CONDITIONS)
+    records = list(records)
+    environments = in_order((r.environment for r in records), ENVIRONMENTS)
+    conditions = in_order((r.condition for r in records), CONDITIONS)
 
     def order(r: Record) -> tuple[str, str, int, int, str]:
         place = environments.index(r.environment), conditions.index(r.condition)

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
@@ -53,8 +53,9 @@ class Board:
         for (setting, _, _), own in self._cells.items():
             self._plugins.setdefault(setting, own[0].plugin)
         self.entries = list(self._plugins)
-        self.environments = [e for e in ENVIRONMENTS if any(e == own for _, own, _ in self._cells)]
-        self.anomalies = [a for a in ANOMALIES if any(a == own for _, _, own in self._cells)]
+        self.environments = in_order((e for _, e, _ in self._cells), ENVIRONMENTS)
+        self.anomalies = in_order((a for _, _, a in self._cells), ANOMALIES)
+        self._groups = {r.anomaly: r.group for r in self.records}
         self.horizons = sorted({entry.horizon for entry in self.entries})
         brief = {(r.environment, r.anomaly) for r in self.records if r.brief}
         everywhere = itertools.product(self.environments, self.anomalies)
@@ -62,7 +63,7 @@ class Board:
 
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
-        return [a for a in self.anomalies if ANOMALIES[a].group == group]
+        return [a for a in self.anomalies if self._groups[a] == group]
 
     def test_seeds(self) -> list[int]:
         """Return the numbers of test trajectories per cell that occur."""

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.results.identity import Setting
@@ -189,7 +189,7 @@ def anomaly_groups(
         header += [f"{group}: {label}" if len(groups) > 1 else label for label in labels]
     rows = []
     for environment, metric in itertools.product(board.environments, ("auc", "delay", "far")):
-        row = [ENVIRONMENTS[environment].title, metric_info(metric).title]
+        row = [title_of(environment), metric_info(metric).title]
         for group in groups:
             over = [environment], board.in_group(group), metric
             means = {e: board.mean(e, *over, intervals=intervals) for e in entries}
@@ -225,7 +225,7 @@ def by_anomaly(
     rows = []
     for e in board.environments:
         columns = [_Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
-        rows.append([ENVIRONMENTS[e].title, *_texts(board, entry, columns)])
+        rows.append([title_of(e), *_texts(board, entry, columns)])
     info = metric_info(metric)
     unit = " (%)" if info.unit == "percent" else ""
     title = f"{entry}: {info.title}{unit} by anomaly"
@@ -308,7 +308,8 @@ def notes(board: Board) -> list[str]:
     lines = [f"Split {board.split}, {facts}, test seeds per environment: {seeds}."]
     if board.limit is not None:
         lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
-    for group in filter(board.in_group, GROUPS):
+    benchmark = {*board.environments} <= {*ENVIRONMENTS}
+    for group in filter(board.in_group, GROUPS) if benchmark else ():
         own = [a for a in TABLE1 if ANOMALIES[a].group == group]
         if missing := [a for a in own if a not in board.anomalies]:
             lines.append(f"Means over {group} anomalies are without {', '.join(missing)}.")

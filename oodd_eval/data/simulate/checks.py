@@ -1,0 +1,183 @@
+"""Checks of environments and anomalies of one's own, before days of recording rest on them."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, info_of
+from oodd_eval.data.simulate.policies import Policy, load_policy
+from oodd_eval.data.simulate.record import (
+    SHORTEST_TWIN,
+    Episode,
+    Setup,
+    measure,
+    record_anomalous,
+)
+from oodd_eval.data.simulate.values import bound_of
+from oodd_eval.errors import OoddError, SimulationError
+
+SEEDS: Final = range(960_000_000, 960_000_008)  # outside every split and training
+PARTS: Final = (1 / 16, 1 / 4, 1.0)  # of the bound: strengths whose effects are compared
+SLACK: Final = 0.9  # a stronger anomaly may seem this much weaker: trajectories are few
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is checked: an environment, and a kind of anomaly in it unless that is empty."""
+
+    environment: str
+    kind: str = ""
+
+    @functools.cached_property
+    def policy(self) -> Policy:
+        """The environment's policy."""
+        return load_policy(self.environment)
+
+    @functools.cached_property
+    def setup(self) -> Setup:
+        """What all episodes have in common; the sensors have been measured."""
+        measure(self.environment, self.policy)
+        return Setup(self.environment, self.policy)
+
+    @functools.cached_property
+    def twins(self) -> list[Episode]:
+        """Nominal episodes that are long enough for an onset."""
+        found = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
+        long = [e for e in found if e.trajectory.transitions >= SHORTEST_TWIN]
+        if len(long) < len(SEEDS) / 2:
+            raise SimulationError(
+                f"{len(long)} of {len(SEEDS)} nominal episodes have {SHORTEST_TWIN} transitions, "
+                f"expected at least {len(SEEDS) // 2}, for onsets: a better policy is needed"
+            )
+        return long
+
+    def anomalous(self, part: float) -> list[Episode]:
+        """Return an episode for each twin, at a part of the largest strength."""
+        strength = part * bound_of(self.environment, self.kind)
+        return [record_anomalous(self.setup, self.kind, strength, t, redraws=0) for t in self.twins]
+
+
+def _content(episode: Episode) -> bytes:
+    arrays = episode.trajectory.observations, episode.trajectory.actions, episode.rewards
+    return b"".join(array.tobytes() for array in arrays)
+
+
+def _fail(message: str) -> None:
+    raise SimulationError(message)
+
+
+def check_columns(subject: Subject) -> None:
+    """Half of the nominal episodes are long enough, as wide as the spec says, and finite."""
+    info = info_of(subject.environment)
+    for twin in subject.twins[:2]:
+        found = twin.trajectory.observation_dim, twin.trajectory.action_dim
+        if found != (info.observation_dim, info.action_dim):
+            _fail(f"an episode has {found[0]} sensors and {found[1]} actions")
+        if not np.isfinite(twin.rewards).all():
+            _fail(f"the rewards of seed {twin.seed} are not finite")
+
+
+def check_seed(subject: Subject) -> None:
+    """The seed decides the episode, whatever was recorded before; others give others."""
+    again = [subject.setup.record(twin.seed) for twin in reversed(subject.twins)]
+    for first, second in zip(subject.twins, reversed(again), strict=True):
+        if _content(first) != _content(second):
+            _fail(
+                f"two episodes of seed {first.seed} differ: draw everything from the generator "
+                "that reset(seed=...) seeds, and keep nothing between episodes"
+            )
+    if len({_content(twin) for twin in subject.twins}) < len(subject.twins):
+        _fail("different seeds give the same episode, expected another start or noise")
+
+
+def check_policy(subject: Subject) -> None:
+    """An action follows from the observation row alone."""
+    twin = subject.twins[0].trajectory
+    policy, discrete = load_policy(subject.environment), info_of(subject.environment).discrete
+    for t in reversed(range(twin.transitions)):
+        action = policy.act(twin.observations[t])
+        row = np.eye(twin.action_dim, dtype=np.float32)[action] if discrete else action
+        if not np.array_equal(row, twin.actions[t]):
+            _fail(
+                f"the policy gives another action for row {t} of seed {SEEDS[0]} when it is asked "
+                "alone: it may keep nothing between rows, nor draw at random"
+            )
+
+
+def check_zero_strength(subject: Subject) -> None:
+    """At strength 0 an episode is its twin, bit for bit."""
+    for episode, twin in zip(subject.anomalous(0.0), subject.twins, strict=True):
+        if _content(episode) != _content(twin):
+            _fail(f"with seed {twin.seed} it differs from its twin at strength 0")
+
+
+def check_onset(subject: Subject) -> None:
+    """At the largest strength episodes differ from their twins, and not before the onset."""
+    different = 0
+    for episode, twin in zip(subject.anomalous(1.0), subject.twins, strict=True):
+        rows, others = episode.trajectory.observations, twin.trajectory.observations
+        onset = episode.onset or 0
+        if rows[:onset].tobytes() != others[:onset].tobytes():
+            _fail(f"with seed {twin.seed} it differs from its twin before its onset, row {onset}")
+        different += rows.tobytes() != others.tobytes()
+    if different < len(subject.twins):
+        equal = len(subject.twins) - different
+        _fail(f"at the largest strength {equal} of {len(subject.twins)} episodes equal their twins")
+
+
+def check_draws(subject: Subject) -> None:
+    """The same is drawn at every strength, and episodes come again."""
+    weak, strong = subject.anomalous(PARTS[0]), subject.anomalous(1.0)
+    for one, other in zip(weak, strong, strict=True):
+        drawn = [{k: v for k, v in e.parameters.items() if k != "strength"} for e in (one, other)]
+        if drawn[0] != drawn[1]:
+            _fail(f"with seed {one.seed} it draws {drawn[0]} or {drawn[1]}, by its strength")
+    if [*map(_content, subject.anomalous(1.0))] != [*map(_content, strong)]:
+        _fail("two recordings differ: draw from the generator that make is given, nothing else")
+
+
+def check_strength(subject: Subject) -> None:
+    """A stronger anomaly takes episodes farther from their twins."""
+    distances = []
+    for part in PARTS:
+        gaps = []
+        for episode, twin in zip(subject.anomalous(part), subject.twins, strict=True):
+            rows, others = episode.trajectory.observations, twin.trajectory.observations
+            common = slice(episode.onset, min(len(rows), len(others)))
+            gaps.append(np.abs(rows[common] - others[common]).mean())
+        distances.append(float(np.mean(gaps)))
+    if any(b < SLACK * a for a, b in itertools.pairwise(distances)):
+        shown = ", ".join(f"{d:.3g} at {p:g}" for d, p in zip(distances, PARTS, strict=True))
+        _fail(f"the mean distance from the twins is {shown} of the bound, expected it to grow")
+
+
+_ENVIRONMENT: Final = (check_columns, check_seed, check_policy)
+_ANOMALY: Final = (check_zero_strength, check_onset, check_draws, check_strength)
+
+
+def check_own(
+    spec: EnvironmentSpec | AnomalySpec, environment: str
+) -> Iterator[tuple[str, Callable[[], str]]]:
+    """Yield the name of each check, and what carries it out: it returns what is wrong, or nothing.
+
+    `environment` is the one in which an anomaly is tried.
+    """
+    anomaly = isinstance(spec, AnomalySpec)
+    subject = Subject(environment, spec.name if anomaly else "")
+    for check in _ANOMALY if anomaly else _ENVIRONMENT:
+        name = check.__name__.removeprefix("check_").replace("_", "-")
+        yield name, functools.partial(_carried_out, check, subject)
+
+
+def _carried_out(check: Callable[[Subject], None], subject: Subject) -> str:
+    try:
+        check(subject)
+    except OoddError as error:
+        return str(error)
+    except Exception as error:  # noqa: BLE001  code of one's own may raise anything
+        return f"it raised {type(error).__name__}: {error}"
+    return ""

@@ -1,0 +1,407 @@
+"""Logs of one's own become a split that every command takes; mistakes are told with their place."""
+
+import csv
+import json
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+
+from oodd_eval import evaluate, live, load_split
+from oodd_eval.cli.main import main
+from oodd_eval.data.export import export
+from oodd_eval.data.facts import Quantity
+from oodd_eval.data.importing import import_data
+from oodd_eval.data.logs import quantity
+from oodd_eval.errors import TrajectoryError, UsageError
+
+ROWS, SENSORS = 60, 3
+PARTS = {"train": 4, "calibration": 5}
+TESTS = ("nominal", "clog", "fog")
+
+
+def episode(seed, onset=None):
+    """Observations and actions of a pump; from the onset on it runs hot."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(ROWS + 1, SENSORS)).cumsum(axis=0) * 0.1
+    if onset is not None:
+        rows[onset:, 0] += 5.0
+    return rows.astype(np.float32), rng.uniform(-1, 1, size=(ROWS, 1)).astype(np.float32)
+
+
+def parts():
+    """Names of the places with names, arrays and onsets of their episodes."""
+    for name, count in PARTS.items():
+        yield name, [(f"run-{i}", *episode([len(name), i]), None) for i in range(count)]
+    for k, name in enumerate(TESTS):
+        onsets = [None if k == 0 else 20 + i + k for i in range(3)]
+        yield f"test/{name}", [(f"run-{i}", *episode(i, o), o) for i, o in enumerate(onsets)]
+
+
+def as_numpy(root):
+    for part, episodes in parts():
+        (root / part).mkdir(parents=True)
+        for name, rows, actions, onset in episodes:
+            known = {} if onset is None else {"onset": onset}
+            arrays = {"observations": rows, "actions": actions, "rewards": np.ones(ROWS)}
+            np.savez_compressed(root / part / f"{name}.npz", **arrays, **known)
+
+
+def as_csv(root):
+    for part, episodes in parts():
+        (root / part).mkdir(parents=True)
+        onsets = [(f"{name}.csv", onset) for name, _, _, onset in episodes if onset is not None]
+        for name, rows, actions, _ in episodes:
+            commands = [*actions[:, 0].tolist(), ""]
+            with (root / part / f"{name}.csv").open("w", newline="") as file:
+                write = csv.writer(file).writerow
+                write(["time", "obs:pressure[bar]", "obs:flow", "obs:heat[°C]", "action:valve",
+                       "reward"])  # fmt: skip
+                for t, (row, command) in enumerate(zip(rows.tolist(), commands, strict=True)):
+                    write([0.1 * t, *row, command, "" if command == "" else 1])
+        if onsets:
+            with (root / part / "onsets.csv").open("w", newline="") as file:
+                csv.writer(file).writerows([("file", "onset"), *onsets])
+
+
+def as_hdf5(root):
+    for part, episodes in parts():
+        (root / part).parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(root / f"{part}.h5", "w") as file:
+            for name, rows, actions, onset in episodes:
+                group = file.create_group(name)
+                group["observations"], group["actions"] = rows, actions
+                group["rewards"] = np.ones(ROWS)
+                if onset is not None:
+                    group.attrs["onset"] = onset
+
+
+MAKE = {"numpy": as_numpy, "csv": as_csv, "hdf5": as_hdf5}
+NAMED = tuple(map(quantity, ("pressure[bar]", "flow", "heat[°C]")))
+
+
+def arguments(root, form):
+    end = ".h5" if form == "hdf5" else ""
+    return {"form": form, "train": root / f"train{end}", "calibration": root / f"calibration{end}",
+            "test": root / "test"}  # fmt: skip
+
+
+def imported(root, form, name="plant", environment="pump", **more):
+    named = {} if form == "csv" else {"sensors": NAMED, "actions": [Quantity("valve", "1")]}
+    given = {"groups": {"fog": "sensor"}, "output": root / name, **named, **more}
+    return import_data(name, environment, **(arguments(root, form) | given))
+
+
+@pytest.fixture(scope="module", params=MAKE)
+def form(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def root(form, tmp_path_factory):
+    root = tmp_path_factory.mktemp(form)
+    MAKE[form](root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def split(root, form):
+    return imported(root, form)
+
+
+def test_an_import_holds_what_was_logged(split):
+    data = split.environment("pump")
+    assert split.groups == {"clog": "dynamics", "fog": "sensor"}
+    assert data.sensors == NAMED
+    assert [q.name for q in data.actions] == ["valve"]
+    sizes = [len(part) for part in (data.train, data.calibration, data.twins)]
+    assert sizes == [4, 5, 3]
+    for part, episodes in parts():
+        own = {"train": data.train, "calibration": data.calibration, "test/nominal": data.twins}
+        found = own[part] if part in own else data.anomalous(part.removeprefix("test/"))
+        for one, (_, rows, actions, _) in zip(found, episodes, strict=True):
+            assert one.observations == pytest.approx(rows, abs=1e-6)
+            assert one.actions == pytest.approx(actions, abs=1e-6)
+        assert found.returns.tolist() == [ROWS] * len(episodes)
+    fog = data.anomalous("fog")
+    assert fog.onsets.tolist() == fog.effects.tolist() == [22, 23, 24]
+
+
+def test_every_command_takes_the_split(split, tmp_path, capsys):
+    place, output = str(split.path), str(tmp_path / "results")
+    assert main(["data", "verify", place]) == 0
+    assert main(["data", "info", place]) == 0
+    assert "imported" in capsys.readouterr().out
+    assert main(["run", "--detector", "range", "--env", "all", "--split", place,
+                 "--output", output]) == 0  # fmt: skip
+    assert main(["show", output, "--split", place]) == 0
+    shown = capsys.readouterr().out
+    assert "pump" in shown
+    assert "Means over" not in shown.replace("Means over cells", "")
+
+
+def test_a_detector_sees_the_anomaly_that_was_logged(split):
+    # The sensor leaves its range at the onset by many times its spread.
+    assert evaluate("mahalanobis", split).mean("auc_matched") > 0.95
+
+
+def test_formats_give_the_same_bytes(tmp_path):
+    found = set()
+    for form, make in MAKE.items():
+        make(tmp_path / form)
+        found.add(imported(tmp_path / form, form).digest)
+    assert len(found) == 1
+
+
+def test_a_further_environment_joins_a_split_and_none_is_replaced(tmp_path):
+    as_numpy(tmp_path)
+    one = imported(tmp_path, "numpy").digest
+    both = imported(tmp_path, "numpy", environment="drain")
+    assert both.environments == ("pump", "drain")
+    assert both.digest != one
+    assert all(check.ok for check in both.verify())
+    with pytest.raises(UsageError, match="has an environment 'drain' already"):
+        imported(tmp_path, "numpy", environment="drain")
+
+
+def test_without_tests_it_is_a_split_to_watch_with(tmp_path, capsys):
+    as_numpy(tmp_path)
+    split = imported(tmp_path, "numpy", test=None, groups={})
+    data = split.environment("pump")
+    assert (len(data.twins), data.anomalies) == (0, ())
+    assert main(["data", "info", str(split.path)]) == 0
+    assert main(["data", "verify", str(split.path)]) == 0
+    assert [export(split, tmp_path / "out", environments=["pump"])[-1]] == [
+        "oodd/plant/pump/calibration-v0"
+    ]
+    run = ["run", "--detector", "range", "--env", "all", "--split", str(split.path)]
+    assert main([*run, "--output", str(tmp_path / "r")]) == 4
+    assert "no anomalous episodes of pump" in capsys.readouterr().err
+    watchdog = live.Watchdog.fit("mahalanobis", data.train, data.calibration, 0.5)
+    assert watchdog.update(data.train[0].observations[0]).t == 0
+
+
+def test_actions_may_be_unknown_or_numbers(tmp_path):
+    for part, episodes in parts():
+        for kind in ("none", "discrete"):
+            (tmp_path / kind / part).mkdir(parents=True)
+            for name, rows, actions, onset in episodes:
+                more = {} if onset is None else {"onset": onset}
+                if kind == "discrete":
+                    more["actions"] = (actions[:, 0] > 0).astype(int) * 2
+                np.savez(tmp_path / kind / part / f"{name}.npz", observations=rows, **more)
+    given = arguments(tmp_path / "none", "numpy")
+    data = import_data("plant", "pump", output=tmp_path / "a", **given).environment("pump")
+    assert data.train[0].action_dim == 0
+    assert data.sensors[2] == Quantity("sensor 2", "1")
+    given = arguments(tmp_path / "discrete", "numpy")
+    with pytest.raises(UsageError, match="--discrete N"):
+        import_data("plant", "pump", output=tmp_path / "b", **given)
+    with pytest.raises(TrajectoryError, match=r"run-0.npz: action \d+ is 2, .* from 0 to 1"):
+        import_data("plant", "pump", discrete=2, output=tmp_path / "b", **given)
+    split = import_data("plant", "pump", discrete=3, output=tmp_path / "b", **given)
+    data = split.environment("pump")
+    assert data.discrete
+    assert data.train[0].actions.sum(axis=0)[1] == 0
+    assert set(data.train[0].actions.sum(axis=1)) == {1.0}
+
+
+@pytest.mark.parametrize("environment", ["cartpole", "hopper"])
+def test_an_exported_split_comes_back_as_it_was(tiny_split, tmp_path, environment):
+    split = load_split(tiny_split)
+    export(split, tmp_path, environments=[environment])
+    place = tmp_path / "oodd" / "tiny" / environment
+    back = import_data(
+        "back", "other", form="minari", train=place / "train-v0",
+        calibration=place / "calibration-v0", test=place, output=tmp_path / "back",
+    )  # fmt: skip
+    then, now = (s.manifest["environments"] for s in (split, back))
+    assert now["other"]["groups"].keys() == then[environment]["groups"].keys()
+    for name in ("train", "calibration", "test/nominal"):
+        assert now["other"]["groups"][name] == then[environment]["groups"][name]
+    was, is_now = split.environment(environment), back.environment("other")
+    assert (is_now.sensors, is_now.actions, is_now.discrete) == (
+        was.sensors, was.actions, environment == "cartpole",
+    )  # fmt: skip
+    assert is_now.anomalous("iid").parameters == was.anomalous("iid").parameters
+
+
+def test_a_dataset_that_minari_collected_is_read(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    gymnasium = pytest.importorskip("gymnasium")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    from minari.data_collector import EpisodeBuffer
+
+    rng = np.random.default_rng(0)
+    for part in ("train", "calibration"):
+        episodes = [
+            EpisodeBuffer(
+                id=i, observations=rng.normal(size=(n + 1, 4)).astype(np.float32),
+                actions=rng.integers(0, 2, n), rewards=[1.0] * n,
+                terminations=[False] * (n - 1) + [True], truncations=[False] * n,
+            )
+            for i, n in enumerate((12, 7, 30))
+        ]  # fmt: skip
+        minari.create_dataset_from_buffers(
+            f"own/{part}-v0", episodes, env=gymnasium.make("CartPole-v1"),
+            algorithm_name="random", author="me", author_email="me@example.org",
+            code_permalink="https://example.org", description="a test",
+            eval_env="CartPole-v1",
+        )  # fmt: skip
+    split = import_data("carts", "cart", form="minari", train=tmp_path / "own" / "train-v0",
+                        calibration=tmp_path / "own" / "calibration-v0",
+                        output=tmp_path / "split")  # fmt: skip
+    data = split.environment("cart")
+    theirs = minari.load_dataset("own/train-v0")
+    for mine, other in zip(data.train, theirs.iterate_episodes(), strict=True):
+        assert mine.observations == pytest.approx(other.observations)
+        assert mine.actions.argmax(axis=1).tolist() == other.actions.tolist()
+    assert data.train.terminated.all()
+
+
+def rewritten(path, **arrays):
+    with np.load(path) as stored:
+        kept = {name: stored[name] for name in stored.files}
+    np.savez(path, **{k: v for k, v in (kept | arrays).items() if v is not None})
+
+
+def broken_row(root):
+    rows = episode(0)[0]
+    rows[7, 1] = np.nan
+    rewritten(root / "train" / "run-1.npz", observations=rows)
+
+
+def huge(root):
+    with zipfile.ZipFile(root / "train" / "run-1.npz", "w") as archive:
+        header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000, 3), }"
+        start = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
+        archive.writestr("observations.npy", start + header)
+
+
+def objects(root):
+    rewritten(root / "train" / "run-1.npz", observations=np.array([[{}]], dtype=object))
+
+
+def changed(place, **arrays):
+    return lambda root: rewritten(root / place / "run-1.npz", **arrays)
+
+
+BROKEN = [
+    (broken_row, r"run-1.npz: observations hold 1 values .* row 7, column 1"),
+    (huge, r"run-1.npz, observations has 12000000000 bytes, expected at most"),
+    (objects, r"run-1.npz, observations has dtype \|O, expected numbers"),
+    (lambda r: (r / "train" / "run-1.npz").write_bytes(b"no zip"), r"run-1.npz cannot be read"),
+    (changed("train", observations=None), r"lacks the array obs"),
+    (changed("train", observations=np.ones((61, 2))),
+     r"run-1.npz has 2 sensors and 1 columns of actions, expected 3 and 1"),
+    (changed("train", actions=np.ones((61, 1))),
+     r"run-1.npz: a trajectory has one observation more than actions"),
+    (changed("train", observations=np.ones((1, 3)), actions=np.ones((0, 1)), rewards=None),
+     r"has 1 observation, expected at least 2"),
+    (changed("train", rewards=np.ones(3)), r"rewards have shape \(3,\)"),
+    (lambda r: (r / "test" / "fog" / "run-1.npz").unlink(), r"episode 'run-1' is missing"),
+    (lambda r: (r / "test" / "nominal" / "run-1.npz").unlink(), r"'run-1' has no nominal twin"),
+    (changed("test/fog", onset=None), r"run-1.npz has no onset"),
+    (changed("test/fog", onset=61), r"onset is row 61, expected 0 to 60"),
+    (changed("test/fog", onset=np.arange(3)), r"onset is an array"),
+    (changed("test/fog", observations=episode(1)[0]), r"equals its twin from its onset, row 23"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "message"), BROKEN)
+def test_what_is_wrong_with_an_episode_is_said_with_its_file(tmp_path, spoil, message):
+    as_numpy(tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(TrajectoryError, match=message):
+        imported(tmp_path, "numpy")
+    assert not (tmp_path / "plant" / "manifest.json").exists()
+    assert not [*(tmp_path / "plant").glob("*.h5")]
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "message"),
+    [
+        (5, "0.4,1,x,3,0,1", r"run-1.csv, line 5, column 'obs:flow': 'x', expected a number"),
+        (5, "0.4,1", r"run-1.csv, line 5, column 'obs:flow': nothing, expected a number"),
+        (5, "0.4,1,2,3,,1", r"run-1.csv, line 5, column 'action:valve': '', expected a number"),
+        (1, "time,obs:a", r"run-1.csv has the columns \['time', 'obs:a'\], expected those of"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_said_with_its_line(tmp_path, line, text, message):
+    as_csv(tmp_path)
+    path = tmp_path / "train" / "run-1.csv"
+    lines = path.read_text().splitlines()
+    lines[line - 1] = text
+    path.write_text("\n".join(lines))
+    with pytest.raises(TrajectoryError, match=message):
+        imported(tmp_path, "csv")
+
+
+def test_onsets_of_a_table_are_whole_numbers(tmp_path):
+    as_csv(tmp_path)
+    (tmp_path / "test" / "fog" / "onsets.csv").write_text("file,onset\nrun-0.csv,soon\n")
+    with pytest.raises(TrajectoryError, match=r"onsets.csv, line 2: .*expected the columns file"):
+        imported(tmp_path, "csv")
+
+
+def test_a_file_that_points_into_another_is_refused(tmp_path):
+    as_hdf5(tmp_path)
+    with h5py.File(tmp_path / "train.h5", "a") as file:
+        file["leak"] = h5py.ExternalLink("calibration.h5", "run-0")
+    with pytest.raises(TrajectoryError, match="holds leak, which points elsewhere: refused"):
+        imported(tmp_path, "hdf5")
+
+
+def test_a_dataset_of_dictionaries_is_refused(tiny_split, tmp_path):
+    export(load_split(tiny_split), tmp_path, environments=["hopper"])
+    place = tmp_path / "oodd" / "tiny" / "hopper"
+    file = place / "train-v0" / "data" / "metadata.json"
+    said = json.loads(file.read_text()) | {"observation_space": '{"type": "Dict"}'}
+    file.write_text(json.dumps(said))
+    with pytest.raises(TrajectoryError, match="observations are Dict and actions Box"):
+        import_data("back", "other", form="minari", train=place / "train-v0",
+                    calibration=place / "calibration-v0", output=tmp_path / "x")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"environment": "hopper"}, "'hopper' is the benchmark's environment"),
+        ({"name": "mini"}, "'mini' is the benchmark's split"),
+        ({"environment": "../x"}, "cannot be the name of a environment"),
+        ({"groups": {"smog": "sensor"}}, "did you mean 'fog'"),
+        ({"groups": {"fog": "weather"}}, "unknown group 'weather'"),
+        ({"sensors": NAMED[:2]}, r"there are 3 sensors, named pressure, flow: .* \(--sensors\)"),
+        ({"sensors": NAMED[:1] * 3}, "as many different names"),
+        ({"form": "npz"}, "unknown format 'npz'"),
+        ({"calibration": "nowhere"}, "'nowhere' does not exist, expected a folder with a file"),
+        ({"test": "train"}, "expected a place 'nominal'"),
+    ],
+)
+def test_a_wrong_request_is_refused_with_what_to_do(tmp_path, more, message, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    as_numpy(tmp_path)
+    from pathlib import Path
+
+    paths = {k: Path(v) if k in {"calibration", "test"} else v for k, v in more.items()}
+    with pytest.raises(UsageError, match=message):
+        imported(tmp_path, **({"form": "numpy"} | paths))
+
+
+def test_the_command_imports_and_says_where_it_is(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "splits"))
+    as_numpy(tmp_path)
+    command = [
+        "data", "import", "plant", "--env", "pump", "--format", "numpy",
+        "--train", f"{tmp_path}/train", "--calibration", f"{tmp_path}/calibration",
+        "--test", f"{tmp_path}/test", "--sensors", "pressure[bar],flow,heat[K]",
+        "--group", "fog=sensor",
+    ]  # fmt: skip
+    assert main(command) == 0
+    assert "pump test/fog" in capsys.readouterr().out
+    assert load_split("plant").environment("pump").sensors[2] == Quantity("heat", "K")
+    assert main(command) == 4
+    assert "has an environment 'pump' already" in capsys.readouterr().err
+    assert main(["data", "build", "plant", "--env", "cartpole", "--train", "1", "--calibration",
+                 "1", "--test", "1", "--seed-base", "77", "--cap", "60"]) == 4  # fmt: skip
