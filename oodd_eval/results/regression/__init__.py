@@ -372,10 +372,12 @@ def write_reference(
     known, lines = ("oodd_eval", "python", "numpy"), []
     for r in sorted(records, key=order):
         chosen = {name: m for name, m in r.metrics.items() if name in keep or not keep}
+        metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
+        terms = {name: r.per_trajectory[name] for name in keep if r.ok}
         kept = replace(
-            r, metrics={name: Metric(m.value, n=m.n) for name, m in chosen.items()},
-            per_trajectory={name: r.per_trajectory[name] for name in keep if r.ok}, scores="", seconds_fit=NAN, seconds_score=NAN, steps_scored=None,
-            peak_rss_mb=NAN, provenance={k: v for k, v in r.provenance.items() if k in known},
+            r, metrics=metrics, per_trajectory=terms, scores="", seconds_fit=NAN,
+            seconds_score=NAN, steps_scored=None, peak_rss_mb=NAN,
+            provenance={k: v for k, v in r.provenance.items() if k in known},
         )  # fmt: skip
         lines.append(kept.to_json() + "\n")
     content = "".join(lines).encode()
