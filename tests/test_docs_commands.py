@@ -73,6 +73,10 @@ KNOWN = dict(
             ),
         ),
         page(
+            "docs/how-to/own-environment.md",
+            files={"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"},
+        ),
+        page(
             "docs/how-to/live.md",
             rules=(Rule(r"(\w+_\w+\.py)", "fits in no time", r"\1 --detector mewma"),),
         ),
