@@ -73,6 +73,11 @@ KNOWN = dict(
             ),
         ),
         page(
+            "docs/how-to/own-data.md",
+            files={"make_logs.py": "```python"},
+            before=("python -m make_logs",),
+        ),
+        page(
             "docs/how-to/own-environment.md",
             files={"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"},
         ),
