@@ -209,10 +209,10 @@ def test_entries_of_other_kinds_are_kept(measured):
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=12))
 @settings(deadline=None)
-def test_the_min_max_formula_is_isotonic_regression(values):
+def test_the_curve_of_what_is_kept_is_an_isotonic_regression(values):
     x = np.arange(len(values))
     expected = IsotonicRegression(increasing=False).fit_transform(x, values)
-    np.testing.assert_allclose(calibrate.isotonic(np.array(values)), expected, atol=1e-9)
+    np.testing.assert_allclose(calibrate.falling(np.array(values)), expected, atol=1e-9)
 
 
 def test_crossings_worked_by_hand():

@@ -7,7 +7,7 @@ from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES, RANKING
-from oodd_eval.names import expression
+from oodd_eval.names import expression, select
 from oodd_eval.results import paired, regression
 from oodd_eval.results.regression import RecordSet, read_record_set, rendering, write_reference
 
@@ -38,7 +38,9 @@ def define(parser: Parser) -> None:
     add("--junit", metavar="FILE", help="write JUnit XML, a test case per cell and metric")
     add("--markdown", metavar="FILE", help="write Markdown, for a pull request")
     add("--write-reference", metavar="FILE",
-        help="write a small file of records to compare with later")
+        help="write a small file of records to compare with later; compressed if FILE ends in .gz")
+    add("--keep", metavar="METRICS", default="",
+        help="of these metrics alone, but with what their intervals are made of")
     # fmt: on
 
 
@@ -59,7 +61,8 @@ def run(options: argparse.Namespace) -> int:
     if options.write_reference:
         if not now.records:
             return say(f"no record of {options.results} is selected: no reference written", 5)
-        write_reference(now.records, options.write_reference)
+        keep = select("metric", options.keep, NAMES) if options.keep else ()
+        write_reference(now.records, options.write_reference, keep=keep)
         if options.verbosity >= 0:
             print(f"{len(now.records)} cells written to {options.write_reference}")
     return code

@@ -12,8 +12,9 @@ from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import layout
+from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import boards
 from oodd_eval.results.tables.rendering import csv_rows, report
 
@@ -74,6 +75,9 @@ def run(options: argparse.Namespace) -> int:
     for board in boards(records) if name else ():
         for entry in (e for e in board.entries if e.detector == name):
             reporter.table(layout.by_anomaly(board, entry, options.metric, intervals=intervals))
+            own = thresholds([r for r in board.records if r.setting == entry])
+            if own.get(entry):
+                reporter.table(ladder.by_place(board, entry, own, intervals=intervals))
     if not name:
         reporter.tables(records)
         for board in boards(records) if options.wide else ():

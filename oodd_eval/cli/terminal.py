@@ -28,7 +28,7 @@ from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import OwnSpec, Plugins, discover, printable
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.tables import layout
+from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import boards
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.scoring.plan import Plan, Unit
@@ -158,6 +158,8 @@ class TerminalReporter:
             for make in (layout.guaranteed, layout.attribution):
                 if table := make(board, intervals=self.intervals):
                     self.table(table)
+            for table in ladder.tables(board, intervals=self.intervals):
+                self.table(table)
             groups = [group for group in GROUPS if board.in_group(group)]
             for h, group in product(board.horizons, groups):
                 self.table(layout.anomaly_groups(board, h, [group], intervals=self.intervals))

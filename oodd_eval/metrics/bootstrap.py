@@ -229,10 +229,15 @@ def mean_over_seeds(parts: Sequence[Samples], *, key: str = "") -> Samples:
     if len(parts) == 1:
         return parts[0]
     stacked = np.array(parts)  # (seeds, R)
-    rng = np.random.default_rng([zlib.crc32(key.encode()), len(stacked)] if key else 0)
-    drawn = rng.integers(len(stacked), size=stacked.shape)
+    drawn = drawn_seeds(*stacked.shape, key=key)
     mean: Samples = stacked[drawn, np.arange(stacked.shape[1])].mean(axis=0)
     return mean
+
+
+def drawn_seeds(seeds: int, resamples: int, *, key: str = "") -> NDArray[np.int64]:
+    """Return which of so many detector seeds each resample draws: shape (seeds, resamples)."""
+    rng = np.random.default_rng([zlib.crc32(key.encode()), seeds] if key else 0)
+    return rng.integers(seeds, size=(seeds, resamples))
 
 
 def sample_cells(cells: Sequence[DrawnCell]) -> Samples:

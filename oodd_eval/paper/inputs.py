@@ -12,7 +12,7 @@ from typing import Final
 
 from pydantic import TypeAdapter
 
-from oodd_eval.data.facts import TABLE1
+from oodd_eval.data.facts import TABLE1, split_condition
 from oodd_eval.data.files import GZIP, write_bytes
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
@@ -87,8 +87,8 @@ def keep_inputs(directory: Path, reproduction: Reproduction, split: Split) -> No
     found = {}
     for name in split.environments:
         with contextlib.closing(split.environment(name)) as data:
-            sets = {"nominal": data.twins} | {a: data.anomalous(a) for a in data.anomalies}
-            found[name] = {kind: s.returns.tolist() for kind, s in sets.items()}
+            sets = {"nominal": data.twins} | {c: data.anomalous(c) for c in data.anomalies}
+            found[name] = {split_condition(c)[0]: s.returns.tolist() for c, s in sets.items()}
     write_changed(directory / RETURNS, dump_returns(found, split.digest))
 
 

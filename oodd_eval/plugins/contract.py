@@ -51,6 +51,9 @@ TOLERANCE: Final = 1e-5
 Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
 """
 
+FAR_TOLERANCE: Final = 1e-4
+"""The same at horizons above 1: each step of a forecast multiplies what was rounded before it."""
+
 PROBE_TOLERANCE: Final = 1e-3
 """The same for the prefixes of a run at horizon 1."""
 ROLLOUT_TOLERANCE: Final = 5e-3
@@ -109,7 +112,7 @@ class StreamingDetector(Detector, Protocol):
     ) -> float:
         """Return the score of the next observation: that of `score`.
 
-        They may differ by 1e-5 of the spread of scores (`difference`).
+        They may differ by 1e-5 of the spread of scores, 1e-4 at horizons above 1 (`difference`).
 
         Parameters
         ----------

@@ -14,12 +14,13 @@ from oodd_eval.data.parts import TWINS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
-from oodd_eval.names import check_known
+from oodd_eval.names import check_known, select
 from oodd_eval.results import paired, plots
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.episode import ScoredEpisode
 from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.ladder import FOUND, Point, curve, threshold_rows
 from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout
@@ -190,6 +191,15 @@ class Results(Sequence[Record]):
             raise UsageError(f"{cell} has no episode {i}: expected 0 to {len(found) - 1}")
         return found[i]
 
+    def thresholds(self) -> list[dict[str, Any]]:
+        """Return a flat mapping for each row, environment and anomaly with several strengths.
+
+        Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's unit:
+        0 where it is below the ``weakest`` strength, infinity where it is above the ``strongest``.
+        ``kept99`` is the strength that costs 1 % of the return.
+        """
+        return threshold_rows(self.records)
+
     def plot_trajectory(
         self, environment: str, anomaly: str, i: int = 0, *, row: str = "", seed: int | None = None
     ) -> Figure:
@@ -224,6 +234,42 @@ class Results(Sequence[Record]):
                 for e in self._scored(r.environment, r.condition, row=str(setting), seed=r.seed)
             ]  # fmt: skip
         return plots.power(curves)
+
+    def plot_ladder(
+        self, *rows: str, metric: str = FOUND, environments: str = "all", anomalies: str = "all"
+    ) -> Figure:  # fmt: skip
+        """Draw a metric against the strength of anomalies and against the return that they cost.
+
+        Parameters
+        ----------
+        rows
+            Names of rows; by default all.
+        metric
+            By default the share of episodes with an alarm within 100 rows, where at most 5 % of
+            nominal episodes have one; dotted is what false alarms alone give.
+        environments, anomalies
+            What is averaged over: comma lists and globs, as on the command line. Strengths are in
+            units of the strength that costs 1 % of the return, as each anomaly has its own unit.
+
+        Raises
+        ------
+        ResultsError
+            When there are no results at several strengths; others as those of `plot_trajectory`.
+        """
+        info = metric_info(metric)
+        places = (
+            select("environment", environments, dict.fromkeys(r.environment for r in self)),
+            select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self)),
+        )
+        chosen = [r for r in self if r.environment in places[0] and r.anomaly in places[1]]
+        settings = [self._row(name) for name in rows] or list({r.setting: 0 for r in chosen})
+        curves: list[dict[str, list[Point]]] = [
+            {str(s): curve([r for r in chosen if r.setting == s], name) for s in settings}
+            for name in filter(None, (metric, info.null))
+        ]
+        if not any(curves[0].values()):
+            raise ResultsError(f"no results at several strengths with {metric}: run a ladder split")
+        return plots.ladder(curves[0], curves[-1] if info.null else {}, info)
 
     def _row(self, name: str) -> Setting:
         if name or len(self.rows) == 1:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from oodd_eval.errors import MissingExtraError, ResultsError
+from oodd_eval.metrics.catalogue import MetricInfo
 from oodd_eval.results.episode import ScoredEpisode
+from oodd_eval.results.ladder import Point
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,13 +23,15 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E
 """Okabe and Ito's colours, which colour-blind readers can tell apart."""
 
 
-def _subplots(rows: int, height: float) -> tuple[Figure, Any]:
+def _subplots(rows: int, height: float, columns: int = 1) -> tuple[Figure, Any]:
     try:
         from matplotlib import pyplot as plt  # noqa: PLC0415
     except ImportError:
         wanted = "plots need matplotlib: pip install 'oodd-eval[plots]'"
         raise MissingExtraError(wanted) from None
-    figure, axes = plt.subplots(rows, sharex=True, figsize=(8, height), layout="constrained")
+    figure, axes = plt.subplots(
+        rows, columns, sharex="col", sharey="row", figsize=(8, height), layout="constrained"
+    )
     plt.close(figure)  # A notebook shows what a cell returns, and would show it twice.
     return figure, axes
 
@@ -98,4 +102,34 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
     axis.set_ylabel("episodes with an alarm (%)")
     axis.set_ylim(0, 100)
     _beside(axis)
+    return figure
+
+
+def ladder(
+    curves: Mapping[str, Sequence[Point]], nulls: Mapping[str, Sequence[Point]], metric: MetricInfo
+) -> Figure:
+    """Draw a metric against the strength and against the return that it costs, one line a detector.
+
+    What chance or false alarms alone give is dotted.
+    """
+    figure, (left, right) = _subplots(1, 3.6, columns=2)
+    percent = 100 if metric.unit == "percent" else 1
+    for (name, points), colour in zip(curves.items(), COLOURS * 9, strict=False):
+        for drawn, style in ((points, "o-"), (nulls.get(name, ()), ":")):
+            label = name if style == "o-" else None
+            for axis, x in (
+                (left, [p.strength for p in drawn]),
+                (right, [100 * p.lost for p in drawn]),
+            ):
+                known = ~np.isnan(x)
+                y = percent * np.array([p.value for p in drawn])
+                axis.plot(np.array(x)[known], y[known], style, color=colour, markersize=3,
+                          linewidth=1.2 if label else 0.8, label=label)  # fmt: skip
+    left.set_xscale("log")
+    left.set_xlabel("strength (1: costs 1 % of the return)")
+    right.set_xlabel("return lost (%)")
+    left.set_ylabel(metric.title + (" (%)" if metric.unit == "percent" else ""))
+    if metric.unit == "percent":
+        left.set_ylim(0, 102)
+    _beside(right)
     return figure

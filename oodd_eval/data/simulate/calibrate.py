@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
 from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER
+from oodd_eval.data.monotone import isotonic
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import (
     GENERATOR_VERSION,
@@ -86,22 +87,9 @@ def kept_shares(returns: Floats, nominal: Floats) -> Floats:
     return np.asarray(1 - (base - returns.mean(axis=-1)) / np.abs(base))
 
 
-def isotonic(values: Floats) -> Floats:
-    """Return the non-increasing least-squares fit along the last axis, of shape (..., n).
-
-    By the min-max formula: the smallest, over starts up to i, of the largest mean of a run that
-    holds i.
-    """
-    n = values.shape[-1]
-    sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), values.cumsum(axis=-1)], axis=-1)
-    fitted = np.empty_like(values)
-    for i in range(n):
-        runs = [
-            np.max([(sums[..., b + 1] - sums[..., a]) / (b + 1 - a) for b in range(i, n)], axis=0)
-            for a in range(i + 1)
-        ]
-        fitted[..., i] = np.min(runs, axis=0)
-    return fitted
+def falling(kept: Floats) -> Floats:
+    """Return the non-increasing curves nearest to what is kept at rising strengths: (K, ...)."""
+    return 1 - isotonic(1 - kept, np.ones_like(kept))
 
 
 def crossing(strengths: Floats, curve: Floats, level: float) -> float:
@@ -150,7 +138,7 @@ def next_strength(environment: str, kind: str, curve: Curve, nominal: Sequence[f
     weakest = float(strengths[0])
     if kept[0] < 0.995 and weakest > SMALLEST * bound * 1.01:
         return weakest / STEP
-    fitted = isotonic(kept)
+    fitted = falling(kept)
     for level in levels_of(environment, kind).values():
         i = int((fitted <= level).argmax()) if (fitted <= level).any() else 0
         if i and strengths[i] / strengths[i - 1] > STEP ** (0.5**HALVINGS) * 1.01:
@@ -172,8 +160,8 @@ def find_rungs(
     strengths, kept = _means(curve, nominal)
     base, returns = np.array(nominal), np.array([curve[s] for s in strengths])
     drawn = np.random.default_rng(0).integers(len(base), size=(DRAWS, len(base)))
-    draws = isotonic(kept_shares(returns[:, drawn], base[drawn]).T)
-    fitted = isotonic(kept)
+    draws = falling(kept_shares(returns[:, drawn], base[drawn])).T
+    fitted = falling(kept)
 
     def rung(level: float) -> dict[str, Any]:
         crossings = [min(crossing(strengths, own, level), bound) for own in draws]

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, paper_tables
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import EntryInfo
 from oodd_eval.leaderboard.sections import LeaderboardSection
 from oodd_eval.metrics import bootstrap, catalogue
@@ -55,10 +55,12 @@ def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]
     curves: list[Json] = []
     shown = [_board(section, units, curves) for section in sections]
     names = dict.fromkeys(name for board in shown for name in board["metrics"])
+    used = {*TABLE1, *(name for board in shown for name in board["anomalies"])}
+    kinds = [a for a in ANOMALIES.values() if a.id in used]
     data = {
         "threshold": THRESHOLD, "drift": DRIFT, "metrics": {name: _metric(name) for name in names},
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
-        "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in ANOMALIES.values()},
+        "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
     }  # fmt: skip
     return data, curves

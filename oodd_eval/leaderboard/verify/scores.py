@@ -17,7 +17,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.errors import OoddError, ResultsError
@@ -34,7 +34,7 @@ from oodd_eval.results.record import Record
 
 MOST_VALUES: Final = 20_000_000  # of a file: its size says little of its decompressed one
 
-PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in ANOMALIES))
+PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in TABLE1))
 """Groups of a score file."""
 
 ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}  # curves have three digits and five decimals

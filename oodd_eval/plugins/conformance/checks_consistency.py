@@ -24,7 +24,7 @@ from oodd_eval.plugins.conformance.trial import (
     noisy_from,
     offered,
 )  # fmt: skip
-from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector
+from oodd_eval.plugins.contract import Detector, StorableDetector
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 
 _PICKLE_SUFFIXES = frozenset({".pkl", ".pickle", ".joblib", ".dill"})
@@ -84,7 +84,7 @@ def check_score_many(trial: Trial) -> None:
             raise CheckFailedError(f"score_many returned {len(found)} score arrays for {n}")
         for i, x, scores in zip(chosen, company, found, strict=True):
             what = f"score_many of {n} differs from score"
-            must_equal(as_scores(scores, x), alone[i], what, tolerance=TOLERANCE)
+            must_equal(as_scores(scores, x), alone[i], what, tolerance=trial.tolerance)
 
 
 def check_inputs_unchanged(trial: Trial) -> None:
@@ -133,7 +133,7 @@ def check_causality(trial: Trial) -> None:
         # The action of the row before was chosen after its observation came.
         actions = np.concatenate([trajectory.actions[: row - 1], -trajectory.actions[row - 1 :]])
         found = trial.scores(Trajectory(noisy_from(trajectory, row).observations, actions))
-        must_equal(found[:row], whole, what, advice, TOLERANCE)
+        must_equal(found[:row], whole, what, advice, trial.tolerance)
 
 
 def check_prefix(trial: Trial) -> None:
@@ -142,7 +142,7 @@ def check_prefix(trial: Trial) -> None:
     whole = trial.scores(trajectory)
     for n in (1, 2, *_rows(trial), len(trajectory) - 1):
         what = f"the first {n} of {len(trajectory)} observations alone have other scores"
-        must_equal(trial.scores(trajectory[:n]), whole, what, tolerance=TOLERANCE)
+        must_equal(trial.scores(trajectory[:n]), whole, what, tolerance=trial.tolerance)
 
 
 def check_streaming(trial: Trial) -> None:
@@ -157,7 +157,7 @@ def check_streaming(trial: Trial) -> None:
             scores = map(detector.update, trajectory.observations, [None, *trajectory.actions])
             found = np.array(list(scores), dtype=np.float64)
         what = "update differs from score of the whole episode"
-        must_equal(found, whole, what, tolerance=TOLERANCE)
+        must_equal(found, whole, what, tolerance=trial.tolerance)
 
 
 def check_explain(trial: Trial) -> None:

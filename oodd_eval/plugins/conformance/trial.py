@@ -18,7 +18,14 @@ from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, settings, watch
-from oodd_eval.plugins.contract import Detector, DetectorSpec, Scores, difference
+from oodd_eval.plugins.contract import (
+    FAR_TOLERANCE,
+    TOLERANCE,
+    Detector,
+    DetectorSpec,
+    Scores,
+    difference,
+)
 from oodd_eval.plugins.isolation.worker import reason_of
 
 SENSORS: Final = 3
@@ -57,6 +64,7 @@ class Trial:
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
         self.arguments = {"seed": seed, "horizon": horizon, **self.parameters}
         self.rows = ROWS + horizon  # of an ordinary episode
+        self.tolerance = TOLERANCE if horizon == 1 else FAR_TOLERANCE
         self.events = Events()  # of all checks so far
         self._settings_before = settings()
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.files import write_text
+from oodd_eval.data.files import GZIP, compress, write_bytes
 from oodd_eval.data.parts import CONDITIONS
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
@@ -352,10 +352,14 @@ def read_record_set(path: Path | str) -> RecordSet:
     return RecordSet.of(records, str(path))
 
 
-def write_reference(records: Iterable[Record], path: Path | str) -> None:
+def write_reference(
+    records: Iterable[Record], path: Path | str, *, keep: Collection[str] = ()
+) -> None:
     """Write a file of records to compare with later: values, without intervals and costs.
 
-    Records stand in the order of the benchmark, whatever the order in which cells ran.
+    Records stand in the order of the benchmark, whatever the order in which cells ran. Metrics to
+    `keep` are the only ones then, with their terms, from which intervals can be made again. A name
+    that ends in ``.gz`` gets a compressed file.
     """
     records = list(records)
     environments = in_order((r.environment for r in records), ENVIRONMENTS)
@@ -367,10 +371,14 @@ def write_reference(records: Iterable[Record], path: Path | str) -> None:
 
     known, lines = ("oodd_eval", "python", "numpy"), []
     for r in sorted(records, key=order):
+        chosen = {name: m for name, m in r.metrics.items() if name in keep or not keep}
+        metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
+        terms = {name: r.per_trajectory[name] for name in keep if r.ok}
         kept = replace(
-            r, metrics={name: Metric(m.value, n=m.n) for name, m in r.metrics.items()},
-            per_trajectory={}, scores="", seconds_fit=NAN, seconds_score=NAN, steps_scored=None,
-            peak_rss_mb=NAN, provenance={k: v for k, v in r.provenance.items() if k in known},
+            r, metrics=metrics, per_trajectory=terms, scores="", seconds_fit=NAN,
+            seconds_score=NAN, steps_scored=None, peak_rss_mb=NAN,
+            provenance={k: v for k, v in r.provenance.items() if k in known},
         )  # fmt: skip
         lines.append(kept.to_json() + "\n")
-    write_text(Path(path), "".join(lines))
+    content = "".join(lines).encode()
+    write_bytes(Path(path), compress(content) if Path(path).suffix == GZIP else content)

@@ -11,7 +11,7 @@ from oodd_eval.data.facts import GROUPS
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record
-from oodd_eval.results.tables import layout
+from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import Board, RankedBoard, Value, boards
 from oodd_eval.results.tables.layout import Table
 
@@ -28,6 +28,7 @@ def _section(board: Board, *, intervals: bool) -> str:
         layout.separability(board, intervals=intervals),
         layout.guaranteed(board, intervals=intervals),
         layout.attribution(board, intervals=intervals),
+        *ladder.tables(board, intervals=intervals, places=True),
         *(layout.anomaly_groups(board, h, intervals=intervals) for h in board.horizons),
         layout.all_metrics(board, intervals=intervals),
         *layout.all_alarms(board, intervals=intervals),

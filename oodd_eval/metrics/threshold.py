@@ -1,0 +1,227 @@
+"""Detection thresholds: the weakest strength of an anomaly that is found in half of the episodes.
+
+An anomaly is recorded at several strengths, the rungs of a ladder. The share of episodes in which a
+detector finds it is made monotone (isotonic regression), and the strength at which it reaches one
+half is read off between rungs, in the logarithm of the strength. Where the weakest rung is found
+often enough already, or the strongest is not, the threshold is *censored*: known to lie below or
+above the ladder.
+
+Resamples draw test episodes and detector seeds as `metrics.bootstrap` does, so that thresholds of
+several detectors are paired.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.monotone import isotonic
+from oodd_eval.metrics.bootstrap import LEVEL, drawn_seeds, shared_weights
+
+Floats = NDArray[np.float64]
+
+HALF: Final = 0.5
+"""Share of the episodes in which an anomaly at the threshold is found."""
+
+_NOTHING: Final = 1e-9  # weight of a rung without episodes: it takes the share of the rung below
+_ROUNDING: Final = 1e-8  # what such weights may take off a share
+
+
+def crossing(shares: Floats, strengths: Floats) -> Floats:
+    """Return the logarithm of the strength at which shares reach one half.
+
+    Parameters
+    ----------
+    shares
+        Of episodes, non-decreasing along the rungs: shape (K, ...).
+    strengths
+        Of the rungs, positive and non-decreasing: shape (K,).
+
+    Returns
+    -------
+    Floats
+        Of shape (...): linear in the logarithm of the strength between rungs, minus infinity where
+        the weakest rung has one half already, infinity where the strongest has less.
+
+    Examples
+    --------
+    >>> np.exp(crossing(np.array([[0.0], [0.25], [0.75]]), np.array([1.0, 4.0, 16.0]))).round(9)
+    array([8.])
+    """
+    logs = np.log(strengths)
+    few = (shares < HALF - _ROUNDING).sum(axis=0)
+    above = np.minimum(np.maximum(few, 1), len(logs) - 1)
+    below = np.maximum(above - 1, 0)
+    low, high = (np.take_along_axis(shares, k[None], axis=0)[0] for k in (below, above))
+    part = np.clip((HALF - low) / np.maximum(high - low, _ROUNDING), 0.0, 1.0)
+    found = logs[below] + part * (logs[above] - logs[below])
+    return np.where(few == 0, -np.inf, np.where(few == len(logs), np.inf, found))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionThreshold:
+    """The threshold of a detector for one anomaly in one environment, made by `of`.
+
+    `weakest` and `strongest` are the ends of its ladder. `logs` are logarithms of the threshold, of
+    the episodes as they are first and then of every resample: shape (1 + R,). Minus infinity is
+    below the ladder, infinity above it; the first is NaN where no episode counts.
+    """
+
+    weakest: float
+    strongest: float
+    logs: Floats
+
+    @classmethod
+    def of(
+        cls, environment: str, strengths: Sequence[float], found: Floats, counted: Floats
+    ) -> "DetectionThreshold":
+        """Estimate the threshold.
+
+        Parameters
+        ----------
+        environment
+            Its name: what is found in one environment is resampled with the same episodes.
+        strengths
+            Of the K rungs, positive and non-decreasing.
+        found
+            1 where a detector seed found an episode's anomaly in time, else 0: shape
+            (detector seeds, K, episodes). An episode is of the same test seed on every rung.
+        counted
+            1, or 0 for an episode that does not count, such as one with an early alarm.
+
+        Returns
+        -------
+        DetectionThreshold
+
+        Raises
+        ------
+        ValueError
+            For strengths that are not positive and non-decreasing, one a rung.
+        """
+        ends = np.asarray(strengths, dtype=np.float64)
+        if len(ends) != found.shape[1] or not (ends > 0).all() or (np.diff(ends) < 0).any():
+            raise ValueError(
+                f"strengths {ends.tolist()} of {found.shape[1]} rungs: expected as many positive "
+                "numbers, the weakest first"
+            )
+        drawn_found, drawn_total = (_drawn(environment, terms) for terms in (found, counted))
+        empty = drawn_total == 0
+        shares = isotonic(drawn_found, np.where(empty, _NOTHING, drawn_total))
+        logs = crossing(shares, ends)
+        if empty[:, 0].all():
+            logs[0] = np.nan
+        return cls(float(ends[0]), float(ends[-1]), logs)
+
+    @property
+    def value(self) -> float:
+        """The threshold: 0 below the ladder, infinity above it, NaN where no episode counts."""
+        return float(np.exp(self.logs[0]))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 95 % interval, whose ends are 0 or infinity where they are beyond the ladder."""
+        low, high = _ends(self.logs)
+        return math.exp(low), math.exp(high)
+
+    @property
+    def beyond(self) -> int:
+        """-1 where it is below the ladder, 1 where it is above it, else 0."""
+        return int(np.sign(self.logs[0])) if np.isinf(self.logs[0]) else 0
+
+    @property
+    def within(self) -> Floats:
+        """`logs`, those beyond the ladder replaced by the end that they are beyond."""
+        return np.clip(self.logs, math.log(self.weakest), math.log(self.strongest))
+
+    def text(self, value: float) -> str:
+        """Return a threshold, or an end of its interval, as printed.
+
+        >>> found = DetectionThreshold(0.5, 8.0, np.zeros(1))
+        >>> [found.text(x) for x in (0.0, 2.34567, math.inf)]
+        ['≤0.5', '2.35', '>8']
+        """
+        if value == 0:
+            return f"≤{self.weakest:.3g}"
+        return f">{self.strongest:.3g}" if math.isinf(value) else f"{value:.3g}"
+
+
+class MeanThreshold(NamedTuple):
+    """The geometric mean of thresholds, each over a unit of its own, with its 95 % interval.
+
+    `below` and `above` of its `pairs` of environment and anomaly are censored, and count as the
+    end of the ladder that they are beyond. `side` says what that makes of the mean: ``"≤"`` where
+    the true one is at most this, ``">"`` where it is more, ``"~"`` where it may be either.
+    """
+
+    value: float
+    low: float
+    high: float
+    pairs: int
+    below: int
+    above: int
+    side: str
+
+    def text(self, *, interval: bool = True) -> str:
+        """Return the mean as printed.
+
+        >>> MeanThreshold(0.5, 0.25, 1.0, pairs=7, below=1, above=0, side="≤").text()
+        '≤0.5 [0.25, 1]'
+        """
+        ends = f" [{self.low:.3g}, {self.high:.3g}]" if interval else ""
+        return f"{self.side}{self.value:.3g}{ends}"
+
+
+def geometric_mean(
+    thresholds: Sequence[DetectionThreshold], units: Sequence[DetectionThreshold | float]
+) -> MeanThreshold:
+    """Return the geometric mean of the ratios of thresholds to units.
+
+    Parameters
+    ----------
+    thresholds
+        At least one, none of them undefined.
+    units
+        As many strengths, or thresholds of another detector at the same places, whose resamples are
+        then paired with these.
+    """
+    ratios, censored, sides = [], [], set()
+    for own, unit in zip(thresholds, units, strict=True):
+        other = unit.within if isinstance(unit, DetectionThreshold) else math.log(unit)
+        ratios.append(own.within - other)
+        censored.append(own.beyond)
+        if unit is not own:
+            sides |= {own.beyond, -unit.beyond if isinstance(unit, DetectionThreshold) else 0}
+    logs = np.mean(ratios, axis=0)
+    low, high = _ends(logs)
+    return MeanThreshold(
+        math.exp(logs[0]), math.exp(low), math.exp(high), len(ratios), censored.count(-1),
+        censored.count(1), "~" if {-1, 1} <= sides else "≤" * (-1 in sides) + ">" * (1 in sides),
+    )  # fmt: skip
+
+
+def _drawn(environment: str, terms: Floats) -> Floats:
+    """Return sums of terms (seeds, K, n) over all, then over what each resample draws: (K, 1 + R).
+
+    The terms are 0 and 1, so that their sums are exact in any order.
+    """
+    seeds, rungs, n = terms.shape
+    weights = shared_weights(environment, n)
+    by_seed = (terms.reshape(-1, n) @ weights.T).reshape(seeds, rungs, -1)
+    chosen = drawn_seeds(seeds, len(weights))
+    drawn = np.take_along_axis(by_seed, chosen[:, None], axis=0).sum(axis=0)
+    return np.concatenate([terms.sum(axis=(0, 2))[:, None], drawn], axis=1)
+
+
+def _ends(logs: Floats) -> tuple[float, float]:
+    """Return the percentiles of resamples, which may be infinite, next beyond the level.
+
+    The interval contains the value itself, which comes first.
+    """
+    ordered = np.sort(logs[1:])
+    last = len(ordered) - 1
+    low = ordered[math.floor((1 - LEVEL) / 2 * last)]
+    high = ordered[math.ceil((1 + LEVEL) / 2 * last)]
+    return min(float(low), float(logs[0])), max(float(high), float(logs[0]))

@@ -1,0 +1,259 @@
+"""Tables, thresholds and plots of results at several strengths, from records made by hand."""
+
+import io
+import math
+
+import pytest
+from helpers_records import example, make_record
+from rich.console import Console
+
+from oodd_eval.cli.main import main
+from oodd_eval.cli.terminal import TerminalReporter
+from oodd_eval.data.ladder import Rung
+from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
+from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.results import ladder as of_records
+from oodd_eval.results.collection import Results
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.ladder import FOUND, at_rung, curve, ladders, thresholds
+from oodd_eval.results.tables import ladder, layout
+from oodd_eval.results.tables.board import Board
+from oodd_eval.results.tables.rendering import report
+
+NULL = "found_within_100_null_at_5pct"
+UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
+TIMES = {"4th": (1 / 4, math.nan), "kept99": (1, 0.99), "kept90": (4, 0.9), "kept50": (16, 0.5)}
+
+
+@pytest.fixture(autouse=True)
+def small_ladder(monkeypatch):
+    """Three places; in ant no gravity costs half of the return."""
+
+    def small(environment, kind):
+        if (environment, kind) not in UNITS:
+            raise SplitError(f"no strengths of {kind} are calibrated in {environment}")
+        unit = UNITS[environment, kind]
+        names = [n for n in TIMES if (environment, kind, n) != ("ant", "gravity", "kept50")]
+        return {n: Rung(unit * TIMES[n][0], kept=TIMES[n][1]) for n in names}
+
+    monkeypatch.setattr(of_records, "rungs_of", small)
+
+
+def at(detector, place, shares, **fields):
+    """Records of one detector and place; a share of 4 episodes is found at each rung."""
+    return [
+        make_record(
+            detector, *place, strength=name,
+            values={FOUND: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
+                    "auc_matched": [0.5 + share / 2] * 4},
+            **fields,
+        ) for name, share in shares.items()
+    ]  # fmt: skip
+
+
+def all_of(detector, *shares, **fields):
+    """Records in all three places with the same shares."""
+    own = dict(zip(TIMES, shares, strict=True))
+    less = {n: s for n, s in own.items() if n != "kept50"}
+    shares = {place: less if place[1] == "gravity" else own for place in UNITS}
+    return [r for place, given in shares.items() for r in at(detector, place, given, **fields)]
+
+
+# riqn reaches one half at 4 units, rf at 8 in two places and nowhere in the third, pe below all.
+RECORDS = [
+    *all_of("riqn", 0, 0.25, 0.5, 1),
+    *all_of("rf", 0, 0, 0.25, 0.75),
+    *all_of("pe", 0.5, 0.75, 1, 1),
+]
+
+
+def rows_of(table):
+    return {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
+
+
+def table_of(records, start, **settings):
+    made = ladder.tables(Board(records), **settings)
+    return next(t for t in made if t.title.startswith(start))
+
+
+def test_thresholds_are_by_row_and_place_in_the_anomalys_unit():
+    found = {str(s): {p: t.value for p, t in places.items()}
+             for s, places in thresholds(RECORDS).items()}  # fmt: skip
+    assert found["riqn"] == pytest.approx({p: 4 * u for p, u in UNITS.items()})
+    iids = {p: 8 * u for p, u in UNITS.items() if p[1] == "iid"}
+    assert found["rf"] == pytest.approx({**iids, ("ant", "gravity"): math.inf})
+    assert found["pe"] == dict.fromkeys(UNITS, 0)
+
+
+def test_the_overview_has_multiples_of_riqns_thresholds_the_lowest_first():
+    rows = rows_of(table_of(RECORDS, "Detection thresholds, lower"))
+    assert list(rows) == ["pe", "riqn", "rf"]
+    assert rows["riqn"]["threshold"] == "1 [1, 1]"
+    assert rows["pe"]["threshold"].startswith("≤0.0625 [")  # a quarter of a unit against four
+    assert rows["rf"]["threshold"].startswith(">1.59 [")  # 2, 2, and 4 units against 4: 4 ** (1/3)
+    assert [rows["rf"][c] for c in ("pairs", "below", "above")] == ["3", "0", "1"]
+    assert [rows["pe"][c] for c in ("pairs", "below", "above")] == ["3", "3", "0"]
+    # Where no gravity costs half of the return, the largest counts: 0.75, 0.75 and 0.25.
+    shares = [rows["rf"][name] for name in TIMES]
+    assert shares == ["0.0", "0.0", "25.0", "58.3"]
+
+
+def test_without_riqn_thresholds_are_in_units_of_what_costs_one_percent():
+    table = table_of([r for r in RECORDS if r.detector != "riqn"], "Detection thresholds, lower")
+    assert rows_of(table)["rf"]["threshold"].startswith(">6.35 [")  # (8 * 8 * 4) ** (1/3)
+    assert "of the strength that costs 1 % of the return" in table.note
+
+
+def test_matched_auc_is_shown_by_rung():
+    rows = rows_of(table_of(RECORDS, "Matched AUC"))
+    assert [rows["pe"][n] for n in TIMES] == ["75.0", "87.5", "100.0", "100.0"]
+
+
+def test_means_by_kind_say_on_which_side_censored_ones_are():
+    rows = rows_of(table_of(RECORDS, "Detection thresholds by anomaly"))
+    assert rows["riqn"] == {"detector": "riqn", "iid": "4", "gravity": "4"}
+    assert rows["rf"] == {"detector": "rf", "iid": "8", "gravity": ">4"}
+    assert rows["pe"] == {"detector": "pe", "iid": "≤0.25", "gravity": "≤0.25"}
+    mixed = [*at("rf", ("ant", "iid"), dict(zip(TIMES, (1, 1, 1, 1), strict=True))),
+             *at("rf", ("hopper", "iid"), dict(zip(TIMES, (0, 0, 0, 0), strict=True)))]  # fmt: skip
+    assert rows_of(table_of(mixed, "Detection thresholds by anomaly"))["rf"]["iid"] == "~2"
+    rows = rows_of(table_of(RECORDS, "Detection thresholds by anomaly", intervals=True))
+    assert rows["riqn"]["iid"].startswith("4 [")
+
+
+def test_one_rows_thresholds_are_shown_by_place():
+    table = table_of(RECORDS, "rf: detection thresholds", places=True)
+    assert rows_of(table) == {
+        "Ant": {"Environment": "Ant", "iid": "16", "gravity": ">4"},
+        "Hopper": {"Environment": "Hopper", "iid": "80", "gravity": ""},
+    }
+    table = table_of(RECORDS, "rf: detection thresholds", places=True, intervals=True)
+    # The one episode of four that is found may be drawn three times: 3/4, from 1 to 4.
+    assert rows_of(table)["Ant"]["gravity"] == ">4 [2.52, >4]"
+
+
+def test_a_place_with_a_missing_or_failed_rung_has_no_threshold():
+    missing = [r for r in RECORDS if (r.detector, r.environment) != ("rf", "hopper")
+               or r.strength != "kept90"]  # fmt: skip
+    places = {str(s): set(own) for s, own in thresholds(missing).items()}
+    assert places["rf"] == {("ant", "iid"), ("ant", "gravity")}
+    assert places["riqn"] == {*UNITS}
+    row = rows_of(table_of(missing, "Detection thresholds, lower"))["rf"]
+    assert row["threshold"].endswith("]*")
+    assert row["pairs"] == "2"
+    failed = [*all_of("riqn", 0, 0, 1, 1), *all_of("rf", 0, 0, 1, 1, status="oom", reason="big")]
+    row = rows_of(table_of(failed, "Detection thresholds, lower"))["rf"]
+    assert (row["threshold"], row["pairs"], row["kept99"]) == (UNDEFINED, "0", "oom")
+
+
+def test_all_detector_seeds_count():
+    shares = ((0, 0, 0, 1), (0, 1, 1, 1))
+    both = [r for seed, own in enumerate(shares) for r in all_of("rf", *own, seed=seed)]
+    (own,) = thresholds(both).values()
+    assert own["ant", "iid"].value == pytest.approx(2)  # half of all from kept99 on
+    assert own["ant", "iid"].interval == (pytest.approx(1), pytest.approx(16))
+    del both[-1]
+    assert ("ant", "gravity") not in next(iter(thresholds(both).values()))
+
+
+def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
+    at_end = at_rung(RECORDS, "kept50")
+    assert {(r.environment, r.anomaly, r.strength) for r in at_end} == {
+        ("ant", "iid", "kept50"), ("hopper", "iid", "kept50"), ("ant", "gravity", "kept90"),
+    }  # fmt: skip
+    # A rung that was not run is missing.
+    fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
+    assert {r.environment for r in at_rung(fewer, "kept50")} == {"ant"}
+    fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
+    assert not at_rung(fewer, "kept50")
+
+
+def test_strengths_that_no_ladder_has_are_left_out():
+    cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
+    other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
+    assert ladders(other) == {}
+    assert not ladder.tables(Board(other))
+    assert ladders(RECORDS + other).keys() == UNITS.keys()
+
+
+def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
+    bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
+    assert [t.title for t in ladder.tables(Board(bare), places=True)] == [
+        "Matched AUC (%) by strength"
+    ]
+
+
+def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
+    assert "strength" not in report(example())
+    text = report(RECORDS)
+    shown = io.StringIO()
+    TerminalReporter(Console(file=shown, width=100)).tables(RECORDS)
+    for title in ("Detection thresholds, lower is better", "Matched AUC (%) by strength",
+                  "Detection thresholds by anomaly"):  # fmt: skip
+        assert f"### {title}" in text
+        assert title in shown.getvalue()
+    assert "### rf: detection thresholds" in text
+
+
+def test_the_other_tables_are_means_over_the_rungs():
+    own = [r for r in RECORDS if r.detector == "rf"]
+    mean = sum(r.value("auc_matched") for r in own) / len(own)
+    assert layout.separability(Board(own)).rows[0][1] == f"{100 * mean:.1f}"
+
+
+def test_show_prints_thresholds(tmp_path, capsys):
+    ResultsDirectory(tmp_path).merge_records(RECORDS)
+    assert main(["show", str(tmp_path), "--stored"]) == 0
+    assert "Detection thresholds by anomaly" in capsys.readouterr().out
+    assert main(["show", str(tmp_path), "--stored", "--detector", "rf", "--intervals"]) == 0
+    out = capsys.readouterr().out
+    assert "rf: detection thresholds by anomaly" in out
+    assert ">4 [2.52, >4]" in out
+
+
+# Results
+
+
+def test_thresholds_come_as_flat_rows():
+    rows = Results(RECORDS).thresholds()
+    assert len(rows) == 9
+    row = next(r for r in rows if r["row"] == "rf" and r["anomaly"] == "gravity")
+    assert row == {
+        "row": "rf", "environment": "ant", "anomaly": "gravity", "threshold": math.inf,
+        "low": pytest.approx(4 ** (2 / 3)), "high": math.inf, "weakest": 0.25, "strongest": 4.0,
+        "kept99": 1.0,
+    }  # fmt: skip
+
+
+def test_a_curve_has_the_mean_over_places_at_each_rung():
+    points = curve([r for r in RECORDS if r.detector == "rf"], FOUND)
+    assert [p.value for p in points] == pytest.approx([0, 0, 0.25, (0.75 + 0.75 + 0.25) / 3])
+    strengths = [1 / 4, 1, 4, (16 * 16 * 4) ** (1 / 3)]
+    assert [p.strength for p in points] == pytest.approx(strengths)
+    assert math.isnan(points[0].lost)
+    assert [p.lost for p in points[1:]] == pytest.approx([0.01, 0.1, (0.5 + 0.5 + 0.1) / 3])
+
+
+def test_curves_are_drawn_against_strength_and_return_lost():
+    pytest.importorskip("matplotlib")
+    figure = Results(RECORDS).plot_ladder("rf", "pe", environments="hopper", anomalies="i*")
+    left, right = figure.axes
+    assert left.get_xscale() == "log"
+    assert [line.get_label() for line in left.lines][::2] == ["rf", "pe"]
+    own, null = left.lines[:2]
+    assert list(own.get_xdata()) == pytest.approx([1 / 4, 1, 4, 16])
+    assert list(own.get_ydata()) == pytest.approx([0, 0, 25, 75])
+    assert list(null.get_ydata()) == [0, 0, 0, 0]
+    # What the weakest rung costs is not known.
+    assert list(right.lines[0].get_xdata()) == pytest.approx([1, 10, 50])
+    by_auc = Results(RECORDS).plot_ladder(metric="auc_matched").axes[0]
+    assert by_auc.get_ylabel() == "matched AUC (%)"
+
+
+def test_what_cannot_be_drawn_is_told():
+    with pytest.raises(ResultsError, match="no results at several strengths with found_within_100"):
+        Results(example()).plot_ladder()
+    with pytest.raises(UnknownNameError, match="unknown anomaly 'fog'"):
+        Results(RECORDS).plot_ladder(anomalies="fog")
+    with pytest.raises(UnknownNameError, match="unknown metric 'auk'"):
+        Results(RECORDS).plot_ladder(metric="auk")
