@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-gymnasium = pytest.importorskip("gymnasium", reason="needs the extra sim")
+pytest.importorskip("gymnasium", reason="needs the extra sim")
 from helpers_own import TANK
 from helpers_plugins import install
 
@@ -133,6 +133,8 @@ def test_a_wrong_spec_makes_its_plugin_broken(tank, monkeypatch, capsys, old, ne
 
 
 def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
+    import gymnasium
+
     digests = set()
     for name in ("CartPole-v1", "Acrobot-v1"):
         make = functools.partial(gymnasium.make, name)
