@@ -144,7 +144,7 @@ def measured(monkeypatch, tmp_path):
             return done
 
     monkeypatch.setattr(calibrate, "measure", measure)
-    monkeypatch.setattr(calibrate, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(calibrate, "workers", Pool)
     monkeypatch.setattr(calibrate, "return_of", lambda _: 100.0)
     monkeypatch.setattr(calibrate, "twins_of", lambda *_: [None] * 32)
 
@@ -194,6 +194,7 @@ def test_a_calibration_goes_on_where_it_was_interrupted(measured):
     calls.clear()
     assert go() == whole
     assert len(calls) == made - 3
+    assert len([x for x in work.read_text().splitlines() if x.endswith("}")]) == made + 1
     calls.clear()
     assert go() == whole
     assert calls == []

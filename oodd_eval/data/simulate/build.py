@@ -124,7 +124,7 @@ def build_split(
         chunks = [c for planned in todo.values() for c in planned]
         missing = [c for c in chunks if not (work / c.file_name).exists()]
         done = len(chunks) - len(missing)
-        for chunk in _run(missing, work, jobs or os.cpu_count() or 1):
+        for chunk in _run(missing, work, jobs):
             done += 1
             progress(done, len(chunks), f"{chunk.environment} {chunk.part}")
         further = {e: _further(definition, planned, work) for e, planned in todo.items()}
@@ -275,18 +275,11 @@ def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> l
     return [dataclasses.replace(last, first_seed=seed, count=1) for seed in seeds]
 
 
-def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
+def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
     """Record chunks in worker processes, yielding each when its file is there."""
     if not chunks:
         return
-    context = multiprocessing.get_context("spawn")
-    # Sums depend on the number of threads of matrix libraries, which these read when they load,
-    # before any code of ours runs in a child.
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    with (
-        patch.dict(os.environ, single),
-        ProcessPoolExecutor(jobs, context, _begin, (registered(), dict(MEASURED))) as pool,
-    ):
+    with workers(jobs) as pool:
         running = {pool.submit(record_chunk, chunk, work): chunk for chunk in chunks}
         try:
             for future in as_completed(running):
@@ -294,6 +287,20 @@ def _run(chunks: list[Chunk], work: Path, jobs: int) -> Iterator[Chunk]:
                 yield running[future]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
+    """Give worker processes for recording, by default one per core; they end with this one."""
+    context, count = multiprocessing.get_context("spawn"), jobs or os.cpu_count() or 1
+    # Sums depend on the number of threads of matrix libraries, which these read when they load,
+    # before any code of ours runs in a child.
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with (
+        patch.dict(os.environ, single),
+        ProcessPoolExecutor(count, context, _begin, (registered(), dict(MEASURED))) as pool,
+    ):
+        yield pool
 
 
 def _begin(

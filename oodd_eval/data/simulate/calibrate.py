@@ -11,13 +11,10 @@ A measured strength is one line of JSON in a work file: an interrupted calibrati
 import functools
 import json
 import math
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any, Final
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +23,7 @@ from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
 from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER
 from oodd_eval.data.monotone import isotonic
+from oodd_eval.data.simulate.build import workers
 from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.simulate.record import (
     GENERATOR_VERSION,
@@ -204,16 +202,11 @@ def calibrate(
     `output` are kept.
     """
     places = [(e, kind) for e in environments for kind in kinds]
-    measured = _read_work(work)
+    measured, broken = _read_work(work)
     key = {e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e)] for e, _ in places}
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    spawn = multiprocessing.get_context("spawn")
     work.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        patch.dict(os.environ, single),
-        ProcessPoolExecutor(jobs or os.cpu_count() or 1, spawn) as pool,
-        work.open("a", encoding="utf-8") as lines,
-    ):
+    with workers(jobs) as pool, work.open("a", encoding="utf-8") as lines:
+        lines.write("\n" * broken)
 
         def keep(e: str, kind: str, strength: float, returns: list[float]) -> None:
             line = {"key": key[e], "environment": e, "kind": kind, "strength": strength}
@@ -261,12 +254,13 @@ def _identity(line: Mapping[str, Any]) -> tuple[str, str, str, float]:
     return str(line["key"]), line["environment"], line["kind"], line["strength"]
 
 
-def _read_work(work: Path) -> dict[tuple[str, str, str, float], list[float]]:
-    found = {}
-    for text in work.read_text(encoding="utf-8").splitlines() if work.exists() else ():
+def _read_work(work: Path) -> tuple[dict[tuple[str, str, str, float], list[float]], bool]:
+    """Return measured returns, and whether the last line is the begin of an interrupted write."""
+    found, content = {}, work.read_text(encoding="utf-8") if work.exists() else ""
+    for text in content.splitlines():
         try:
             line = json.loads(text)
-        except json.JSONDecodeError:  # the end of an interrupted write
+        except json.JSONDecodeError:
             continue
         found[_identity(line)] = line["returns"]
-    return found
+    return found, not content.endswith("\n") and bool(content)
