@@ -67,6 +67,31 @@ def test_what_was_fitted_is_kept(example, tmp_path):
     assert (other.rule, other.sensors) == (one.rule, one.sensors)
 
 
+@pytest.fixture
+def swimmer(monkeypatch):
+    """The specs of the swimmer, known in this process as long as the test runs."""
+    pytest.importorskip("mujoco", reason="needs the extra mujoco")
+    from oodd_eval.data import own
+
+    monkeypatch.syspath_prepend(str(EXAMPLE.parent / "oodd-swimmer"))
+    import oodd_swimmer
+
+    own.register([*oodd_swimmer.oodd_environments(), *oodd_swimmer.oodd_anomalies()])
+    yield own
+    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
+        known.clear()
+
+
+def test_the_swimmer_swims_and_passes_its_checks(swimmer):
+    from oodd_eval.data.simulate.checks import check_own
+    from oodd_eval.data.simulate.policies import load_policy
+    from oodd_eval.data.simulate.record import evaluate_policy
+
+    assert evaluate_policy("swimmer", load_policy("swimmer"), episodes=3).min() > 60
+    for spec in swimmer.registered():
+        assert not [wrong for _, carry_out in check_own(spec, "swimmer") if (wrong := carry_out())]
+
+
 @pytest.mark.docs
 def test_the_notebook_prints_what_is_stored_in_it(capsys):
     for library in ("matplotlib", "pandas", "torch"):

@@ -1,5 +1,7 @@
 """Environments and anomalies of plug-ins are recorded, evaluated and listed as the benchmark's."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,17 @@ def test_a_wrong_spec_makes_its_plugin_broken(tank, monkeypatch, capsys, old, ne
     install(monkeypatch, tank / "other", "tank", code, header="")
     assert build("mine", "--env", "tank", "--strength", "leak=1") == 4
     assert message in capsys.readouterr().err
+
+
+def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
+    import gymnasium
+
+    digests = set()
+    for name in ("CartPole-v1", "Acrobot-v1"):
+        make = functools.partial(gymnasium.make, name)
+        own.register([own.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
+        digests.add(own.code_digest("one", []))
+    assert len(digests) == 2
 
 
 def test_spaces_that_are_not_as_the_spec_says_are_refused(tank, monkeypatch, capsys):
