@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers_own import forget_own
 from PIL import Image
 
 from oodd_eval import load_split
@@ -78,8 +79,7 @@ def swimmer(monkeypatch):
 
     own.register([*oodd_swimmer.oodd_environments(), *oodd_swimmer.oodd_anomalies()])
     yield own
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
+    forget_own()
 
 
 def test_the_swimmer_swims_and_passes_its_checks(swimmer):

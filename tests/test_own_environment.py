@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium", reason="needs the extra sim")
-from helpers_own import TANK
+from helpers_own import TANK, forget_own
 from helpers_plugins import install
 
 from oodd_eval import load_split
@@ -20,8 +20,7 @@ SIZES = ["--train", "6", "--calibration", "6", "--test", "3", "--seed-base", "77
 def forgotten():
     """No environment of one test is known in the next."""
     yield
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
+    forget_own()
 
 
 @pytest.fixture

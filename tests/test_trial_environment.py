@@ -20,15 +20,11 @@ def test_what_a_newcomer_writes_is_under_60_lines():
 
 @pytest.fixture
 def session(tmp_path, monkeypatch):
-    from oodd_eval.data import own
-
     (tmp_path / "oodd_pendulum.py").write_text(block("python"))
     (tmp_path / "pyproject.toml").write_text(block("toml"))
     session = Session(tmp_path, monkeypatch)
     yield session
     session.forget()
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
 
 
 def test_the_page_leads_to_a_board_of_ones_own(session, capsys):
