@@ -10,10 +10,10 @@ from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.ladder import rungs_of
-from oodd_eval.data.own import AnomalySpec
+from oodd_eval.data.own import AnomalySpec, OwnSpec
 from oodd_eval.data.simulate.values import unit_of
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins.discovery import Offer, OwnSpec
+from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
 
 Lines = Iterator[tuple[str, str]]

@@ -23,10 +23,10 @@ from tabulate import tabulate
 from oodd_eval._version import __version__
 from oodd_eval.cli import say
 from oodd_eval.data.facts import GROUPS, PROTOCOL
-from oodd_eval.data.own import register
+from oodd_eval.data.own import OwnSpec, register
 from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.plugins import hookimpl
-from oodd_eval.plugins.discovery import OwnSpec, Plugins, discover, printable
+from oodd_eval.plugins.discovery import Plugins, discover, printable
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import boards

@@ -108,6 +108,9 @@ class AnomalySpec:
     environments: tuple[str, ...] = ()
 
 
+OwnSpec = EnvironmentSpec | AnomalySpec
+
+
 class Measured(NamedTuple):
     """What nominal rows show: the spread of each sensor, and the sensors that may break."""
 

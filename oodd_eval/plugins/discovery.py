@@ -5,6 +5,8 @@ and the exit code, and nothing of it is used. (pluggy's own loader stops at the 
 and silently drops the second of two that share a name.)
 """
 
+from __future__ import annotations
+
 import functools
 import inspect
 import os
@@ -14,17 +16,18 @@ from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pluggy
 
 from oodd_eval import plugins as hooks
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, check_spec
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
 from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
 
-OwnSpec = EnvironmentSpec | AnomalySpec
+if TYPE_CHECKING:
+    # A worker discovers detectors, and is to know nothing of environments.
+    from oodd_eval.data.own import OwnSpec
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -93,6 +96,8 @@ class Plugin:
 
     def own_specs(self) -> list[OwnSpec]:
         """Return its environments and anomalies, checked."""
+        from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, check_spec  # noqa: PLC0415
+
         found: list[OwnSpec] = []
         for hook, kind in (("oodd_environments", EnvironmentSpec), ("oodd_anomalies", AnomalySpec)):
             for specs in getattr(self.hook, hook)():

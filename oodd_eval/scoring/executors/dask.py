@@ -122,7 +122,7 @@ def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
         "version": __version__,
         "split": {"path": str(split.path.absolute()), "name": str(split.manifest["name"])},
         "plan": {"split": job.plan.split, "split_digest": job.plan.split_digest,
-                 "limit": job.plan.limit},
+                 "groups": dict(job.plan.groups), "limit": job.plan.limit},
         "unit": asdict(job.unit),
         "limits": asdict(limits),
     }  # fmt: skip
