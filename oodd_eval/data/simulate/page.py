@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, EnvironmentInfo
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import write_bytes, write_text
 from oodd_eval.data.ladder import FRACTIONS, PAPER, Rung, read_ladder, rungs_of
 from oodd_eval.data.simulate.policies import FROZEN
@@ -74,17 +74,17 @@ def pictured(environment: str, kind: str) -> tuple[str, float]:
 def overview() -> str:
     """Return the text of ``environments.md``."""
     environments = [
-        (f"[{e}]({NAME}/{e}.md)", f"![{i.title}: a frame]({NAME}/{e}.png)", f"`{i.simulator}`",
-         i.policy, *_returns(e), i.observation_dim, _actions(i), i.episode_cap)
+        (f"[{e}]({NAME}/{e}.md)",
+         f'<img src="{NAME}/{e}.png" alt="{i.title}: a frame" width="160">',
+         *_returns(e), i.observation_dim, f"{i.action_dim}{', one a step' * i.discrete}")
         for e, i in ENVIRONMENTS.items()
     ]  # fmt: skip
     kinds = [(f"`{k}`", a.title, a.group, a.summary) for k, a in ANOMALIES.items()]
     strengths = [(f"`{k}`", *(_overview_strength(e, k) for e in ENVIRONMENTS)) for k in ANOMALIES]
-    columns = ("environment", "", "simulator", "policy", "return", "the paper's", "sensors",
-               "actions", "longest episode")  # fmt: skip
+    columns = ("environment", "", "return", "the paper's", "sensors", "actions")
     return f"""# Environments and anomalies
 
-{len(ENVIRONMENTS)} environments with a trained policy each, and {len(ANOMALIES)} kinds of
+There are {len(ENVIRONMENTS)} environments with a trained policy each, and {len(ANOMALIES)} kinds of
 anomalies. Each environment has a page: its sensors and actions, and for each kind what it does
 there, its strengths, what they cost the policy, and an episode beside its twin. These pages are
 written by `{COMMAND}`.
@@ -159,8 +159,8 @@ sensor anomaly corrupts {count} of those that may break, drawn for each episode.
 
 A rung is a strength at which the policy keeps that share of its return; `4th`, `16th` and `64th`
 are these parts of the strength of `kept99`, and cost nothing yet. At `{PAPER}` the policy loses
-what the paper's Table 2 says. Intervals are 95 %: of the strength at which the share is kept, and of the
-share that is kept at the strength.
+what the paper's Table 2 says. Intervals are 95 %: of the strength at which the share is kept, and
+of the share that is kept at the strength.
 
 A plot shows one sensor of an episode (orange) and of its nominal twin (grey) around the onset: of
 the sensors that may have changed, the one that differs most. A dot marks the end of the episode.
@@ -208,9 +208,9 @@ def _rung(name: str, rung: Rung) -> Sequence[str]:
     if name in FRACTIONS:
         return f"`{name}`", f"{rung.strength:g}", "", ""
     kept, low, high = (f"{100 * x:.0f}" for x in (rung.kept, rung.kept_low, rung.kept_high))
-    strength = f"{rung.strength:g} ({rung.low:g} to {rung.high:g})"
+    interval = f" ({rung.low:g} to {rung.high:g})" if rung.low < rung.high else ""
     reached = "yes" if rung.reached else "no: this is the largest"
-    return f"`{name}`", strength, f"{kept} % ({low} to {high})", reached
+    return f"`{name}`", f"{rung.strength:g}{interval}", f"{kept} % ({low} to {high})", reached
 
 
 def _overview_strength(environment: str, kind: str) -> str:
@@ -263,10 +263,6 @@ def _returns(environment: str) -> tuple[str, str]:
     told: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
     ours = f"{told['mean_return']:.1f} ± {told['std_return']:.1f}"
     return ours, f"{ENVIRONMENTS[environment].paper_return:.1f}"
-
-
-def _actions(info: EnvironmentInfo) -> str:
-    return f"{info.action_dim}{', one a step' if info.discrete else ''}"
 
 
 def _unit(unit: str) -> str:

@@ -22,7 +22,7 @@ from oodd_eval.data.simulate.values import VALUES, spread_of
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
 BEFORE, AFTER = 30, 90  # rows of a plot before and after the onset
 WIDTH, HEIGHT = 480, 190
-LEFT, RIGHT, TOP, BOTTOM = 52, 472, 44, 152  # of the plot's axes
+LEFT, RIGHT, TOP, BOTTOM = 60, 472, 44, 152  # of the plot's axes
 TWIN, CORRUPTED, INK, LINE = "#555555", "#d55e00", "#222222", "#bbbbbb"
 
 Image = NDArray[np.uint8]
@@ -130,9 +130,10 @@ def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
         f'<path d="M{x(onset):.1f} {TOP}V{BOTTOM + 6}" stroke="{INK}" stroke-dasharray="4 3"/>',
     ]
     for value in (low, high):
-        shapes.append(_text(LEFT - 6, y(value) + 4, f"{value:.3g}", "end"))
+        shapes.append(_text(LEFT - 6, y(value) + 4, f"{value:.2g}", "end"))
         shapes.append(f'<path d="M{LEFT} {y(value):.1f}H{RIGHT}" stroke="{LINE}"/>')
-    shapes += [_text(x(s), BOTTOM + 16, f"{s}") for s in (first, last)]
+    ends = (first, "start"), (last, "end")
+    shapes += [_text(x(step), BOTTOM + 16, f"{step}", anchor) for step, anchor in ends]
     for colour, line in lines.items():
         points = " ".join(f"{x(first + i):.1f},{y(value):.1f}" for i, value in enumerate(line))
         shapes.append(f'<polyline points="{points}" stroke="{colour}" stroke-width="1.5"/>')
