@@ -9,6 +9,8 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from helpers_own import forget_own
+
 ROOT = Path(__file__).parents[1]
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
@@ -189,7 +191,8 @@ class Session:
         return 0
 
     def forget(self):
-        """Forget the modules that this page's plug-ins brought: another page has others."""
+        """Forget what this page's plug-ins brought: another page has others."""
+        forget_own()
         for name, module in list(sys.modules.items()):
             if str(getattr(module, "__file__", None)).startswith(f"{self.directory}{os.sep}"):
                 del sys.modules[name]

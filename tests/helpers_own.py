@@ -1,5 +1,14 @@
 """A plug-in with environments and kinds of anomalies of its own, which needs no simulator."""
 
+from oodd_eval.data import own
+
+
+def forget_own():
+    """Forget environments and anomalies that were registered: another test has others."""
+    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
+        known.clear()
+
+
 TANK = '''
 import gymnasium
 import numpy as np

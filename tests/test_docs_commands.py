@@ -1,7 +1,9 @@
 """Every command that the documents show is carried out, page by page, in the order of the page."""
 
 import re
+import shutil
 import textwrap
+from pathlib import Path
 
 import pytest
 from helpers_docs import (
@@ -37,9 +39,10 @@ SOMETHING = Rule(r"--detector rf\b", "a page's own example, on a detector that f
                  "--detector persistence")  # fmt: skip
 
 
-def page(path, *, before=(), rules=(), files=None, fails=()):
+def page(path, *, before=(), rules=(), files=None, folders=(), fails=()):
     """What a page takes for granted, and which of its commands are meant to fail."""
-    return path, {"before": before, "rules": rules, "files": files or {}, "fails": fails}
+    known = {"before": before, "rules": rules, "files": files or {}, "folders": folders}
+    return path, known | {"fails": fails}
 
 
 KNOWN = dict(
@@ -73,9 +76,19 @@ KNOWN = dict(
             ),
         ),
         page(
+            "docs/how-to/own-data.md",
+            files={"make_logs.py": "```python"},
+            before=("python -m make_logs",),
+        ),
+        page(
+            "docs/how-to/own-environment.md",
+            files={"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"},
+        ),
+        page(
             "docs/how-to/live.md",
             rules=(Rule(r"(\w+_\w+\.py)", "fits in no time", r"\1 --detector mewma"),),
         ),
+        page("examples/oodd-swimmer/README.md", folders=("examples/oodd-swimmer",)),
         page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
         page(
             "docs/submitting.md",
@@ -127,6 +140,8 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
     known = KNOWN.get(name(path), page("")[1])
     for file, source in known["files"].items():
         (tmp_path / file).write_text(text_of(source, path))
+    for folder in known["folders"]:
+        shutil.copytree(ROOT / folder, tmp_path / Path(folder).name)
     session = Session(tmp_path, monkeypatch)
     request.addfinalizer(session.forget)
     for command in (*known["before"], *commands(path.read_text())):

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers_own import forget_own
 from PIL import Image
 
 from oodd_eval import load_split
@@ -65,6 +66,30 @@ def test_what_was_fitted_is_kept(example, tmp_path):
     one = example.prepare("mewma", 0.1, tmp_path / "fit")
     other = example.prepare("any", 0.5, tmp_path / "fit")
     assert (other.rule, other.sensors) == (one.rule, one.sensors)
+
+
+@pytest.fixture
+def swimmer(monkeypatch):
+    """The specs of the swimmer, known in this process as long as the test runs."""
+    pytest.importorskip("mujoco", reason="needs the extra mujoco")
+    from oodd_eval.data import own
+
+    monkeypatch.syspath_prepend(str(EXAMPLE.parent / "oodd-swimmer"))
+    import oodd_swimmer
+
+    own.register([*oodd_swimmer.oodd_environments(), *oodd_swimmer.oodd_anomalies()])
+    yield own
+    forget_own()
+
+
+def test_the_swimmer_swims_and_passes_its_checks(swimmer):
+    from oodd_eval.data.simulate.checks import check_own
+    from oodd_eval.data.simulate.policies import load_policy
+    from oodd_eval.data.simulate.record import evaluate_policy
+
+    assert evaluate_policy("swimmer", load_policy("swimmer"), episodes=3).min() > 60
+    for spec in swimmer.registered():
+        assert not [wrong for _, carry_out in check_own(spec, "swimmer") if (wrong := carry_out())]
 
 
 @pytest.mark.docs

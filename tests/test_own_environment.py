@@ -1,10 +1,12 @@
 """Environments and anomalies of plug-ins are recorded, evaluated and listed as the benchmark's."""
 
+import functools
+
 import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium", reason="needs the extra sim")
-from helpers_own import TANK
+from helpers_own import TANK, forget_own
 from helpers_plugins import install
 
 from oodd_eval import load_split
@@ -18,8 +20,7 @@ SIZES = ["--train", "6", "--calibration", "6", "--test", "3", "--seed-base", "77
 def forgotten():
     """No environment of one test is known in the next."""
     yield
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
+    forget_own()
 
 
 @pytest.fixture
@@ -128,6 +129,17 @@ def test_a_wrong_spec_makes_its_plugin_broken(tank, monkeypatch, capsys, old, ne
     install(monkeypatch, tank / "other", "tank", code, header="")
     assert build("mine", "--env", "tank", "--strength", "leak=1") == 4
     assert message in capsys.readouterr().err
+
+
+def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
+    import gymnasium
+
+    digests = set()
+    for name in ("CartPole-v1", "Acrobot-v1"):
+        make = functools.partial(gymnasium.make, name)
+        own.register([own.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
+        digests.add(own.code_digest("one", []))
+    assert len(digests) == 2
 
 
 def test_spaces_that_are_not_as_the_spec_says_are_refused(tank, monkeypatch, capsys):

@@ -29,7 +29,7 @@ OBSERVATIONS, ACTIONS, BATCH = 4, 2, 6
 def learner(monkeypatch):
     monkeypatch.setitem(td3.HYPER_PARAMETERS, "layers", [7, 5])
     tiny = SimpleNamespace(observation_dim=OBSERVATIONS, action_dim=ACTIONS)
-    monkeypatch.setattr(td3, "ENVIRONMENTS", {"tiny": tiny})
+    monkeypatch.setattr(td3, "info_of", {"tiny": tiny}.get)
     torch.manual_seed(3)
     return td3.TD3("tiny")
 

@@ -47,9 +47,7 @@ def run(options: argparse.Namespace) -> int:
     except UnknownNameError:
         if options.detector in plugins.own_specs:
             return _own(options, wanted)
-        known = [*plugins.own_specs, *plugins.offers]
-        kind = "detector, environment or anomaly of a plug-in"
-        raise UnknownNameError(kind, options.detector, known) from None
+        raise
     offer.require()
     spec = offer.spec
     check_known("check", CHECKS, *expecting)

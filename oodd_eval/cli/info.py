@@ -8,8 +8,10 @@ from tabulate import tabulate
 
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import discovered
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
+from oodd_eval.data.ladder import rungs_of
 from oodd_eval.data.own import AnomalySpec
+from oodd_eval.data.simulate.values import unit_of
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer, OwnSpec
 from oodd_eval.plugins.parameters import parameters_of
@@ -75,9 +77,16 @@ def _own(spec: OwnSpec, origin: str) -> Lines:
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:
-    yield "anomaly", f"{info.id} ({info.title} of the paper)"
+    of_paper = " of the paper" if info.id in TABLE1 else ""
+    yield "anomaly", f"{info.id} ({info.title}{of_paper})"
     yield "group", info.group
     yield "what it changes", info.summary
+    for environment in ENVIRONMENTS:
+        rungs = rungs_of(environment, info.id)
+        ends = f"{rungs['kept99'].strength:.3g} to {[*rungs.values()][-1].strength:.3g}"
+        strongest = [*rungs][-1]
+        told = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
+        yield f"strength in {environment}", told
 
 
 def _detector(offer: Offer) -> Lines:

@@ -83,7 +83,11 @@ def _splits() -> Rows:
         else:
             sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"
         text = "{train} train, {calibration} calibration, {test} test seeds"
-        yield name, text.format_map(sizes), where
+        further = {"ladder": ", graded", "paper": ", the paper's losses"}
+        recipe = SPLITS.get(name)
+        noise = f", noise {recipe.noise:.0%}" if recipe and recipe.noise else ""
+        suite = further.get(recipe.suite, "") if recipe else ""
+        yield name, text.format_map(sizes) + suite + noise, where
 
 
 def _metrics() -> Rows:

@@ -95,7 +95,7 @@ def _run(options: argparse.Namespace) -> int:
         limits = Limits(options.timeout, options.memory)
         settings = RunSettings(jobs=jobs, limits=limits, fresh=options.fresh,
                                deadline=options.budget, command=options.invocation)  # fmt: skip
-        plan = Plan(split.name, split.digest, tuple(left))
+        plan = Plan(split.name, split.digest, tuple(left), split.groups)
         outcome = carry_out(plan, split, plugins, settings, results, observers=[progress])
     code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
     if outcome.left:

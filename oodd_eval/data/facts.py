@@ -76,6 +76,13 @@ Suite = Literal["table1", "ladder", "paper"]
 def split_condition(condition: str) -> tuple[str, str]:
     """Return the anomaly and the strength of a condition; the strength may be empty.
 
+    Parameters
+    ----------
+    condition
+        Such as ``"iid@kept99"``.
+
+    Examples
+    --------
     >>> split_condition("iid@kept99"), split_condition("iid")
     (('iid', 'kept99'), ('iid', ''))
     """
@@ -84,7 +91,13 @@ def split_condition(condition: str) -> tuple[str, str]:
 
 
 def join_condition(anomaly: str, strength: str) -> str:
-    """Return the text of an anomaly and its strength, where it has one."""
+    """Return the text of an anomaly and its strength, where it has one.
+
+    Parameters
+    ----------
+    anomaly, strength
+        Names; an empty strength is none.
+    """
     return f"{anomaly}@{strength}" if strength else anomaly
 
 
@@ -181,8 +194,14 @@ PART_OFFSETS: Final = MappingProxyType({"train": 0, "calibration": 300_000, "tes
 def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     """Return names, each once: known ones in their order, then the others as they come.
 
-    A condition that is not known, such as ``"iid@0.5"``, has the place of its anomaly.
+    Parameters
+    ----------
+    names, known
+        Environments, anomalies or conditions. A condition that is not known, such as
+        ``"iid@0.5"``, has the place of its anomaly.
 
+    Examples
+    --------
     >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
     ['cartpole', 'hopper', 'mine']
     """
@@ -194,7 +213,13 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def title_of(environment: str) -> str:
-    """Return the paper's title of an environment; of one's own, its name."""
+    """Return the paper's title of an environment; of one's own, its name.
+
+    Parameters
+    ----------
+    environment
+        Its name.
+    """
     return ENVIRONMENTS[environment].title if environment in ENVIRONMENTS else environment
 
 

@@ -140,12 +140,12 @@ def check_spec(spec: EnvironmentSpec | AnomalySpec) -> None:
             "letters, digits and hyphens, and no name of the benchmark"
         )
     for function in _functions(spec):
-        inner = function.func if isinstance(function, functools.partial) else function
+        inner = _inner(function)
         name, home = getattr(inner, "__qualname__", ""), getattr(inner, "__module__", "")
-        if not name or getattr(sys.modules.get(home), name, None) is not inner:
+        if not name or getattr(sys.modules.get(home), name, None) is not inner or not _file(inner):
             raise PluginError(
                 f"{kind} {spec.name!r} names {inner!r:.80}, expected a function or class at the "
-                "top level of a module, which other processes can import"
+                "top level of a module in a file, which other processes can import"
             )
 
 
@@ -156,6 +156,7 @@ def register(specs: Iterable[EnvironmentSpec | AnomalySpec]) -> None:
         if isinstance(spec, EnvironmentSpec):
             _environments[spec.name] = spec
             _infos.pop(spec.name, None)
+            MEASURED.pop(spec.name, None)
         else:
             _anomalies[spec.name] = spec
 
@@ -211,12 +212,29 @@ def kinds_of(environment: str) -> list[str]:
 
 
 def code_digest(environment: str, kinds: Iterable[str]) -> str:
-    """Return the SHA-256 of the modules that specs of one's own name; empty for the benchmark's."""
+    """Return the SHA-256 of the modules that specs of one's own name; empty for the benchmark's.
+
+    Arguments of a ``functools.partial`` count, too.
+    """
     specs = [environment_spec(environment), *map(anomaly_spec, kinds)]
     named = [f for spec in specs if spec for f in _functions(spec)]
-    files = {str(inspect.getsourcefile(getattr(f, "func", f))) for f in named}
-    content = b"".join(hashlib.sha256(Path(f).read_bytes()).digest() for f in sorted(files))
-    return hashlib.sha256(content).hexdigest() if files else ""
+    given = [repr((f.args, f.keywords)) for f in named if isinstance(f, functools.partial)]
+    files = sorted({_file(_inner(f)) for f in named})
+    digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
+    return hashlib.sha256(repr((digests, given)).encode()).hexdigest() if files else ""
+
+
+def _inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function.func if isinstance(function, functools.partial) else function
+
+
+def _file(function: Callable[..., Any]) -> str:
+    """Return the file of a function's code; empty where it is in none."""
+    try:
+        file = inspect.getsourcefile(function) or ""
+    except TypeError:
+        return ""
+    return file if Path(file).is_file() else ""
 
 
 def _functions(spec: EnvironmentSpec | AnomalySpec) -> list[Callable[..., Any]]:

@@ -181,7 +181,13 @@ class EnvironmentData:
         return AnomalousSet(self._file, f"test/{anomaly}")
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:
-        """Return the datasets of a part as they are stored."""
+        """Return the datasets of a part as they are stored.
+
+        Parameters
+        ----------
+        part
+            Such as ``"train"``.
+        """
         return {name: dataset[:] for name, dataset in self._file[part].items()}
 
     def close(self) -> None:

@@ -106,7 +106,13 @@ class Split:
         return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
     def conditions(self, environment: str) -> tuple[str, ...]:
-        """Return the anomalies of an environment, each with its strength if it has several."""
+        """Return the anomalies of an environment, each with its strength if it has several.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+        """
         return anomalies_in(self.manifest["environments"][environment]["groups"])
 
     @property
@@ -123,7 +129,17 @@ class Split:
         return found
 
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
-        """Return the environments and anomalies that comma lists, globs or ``"all"`` select.
+        """Return the names that comma lists, globs or ``"all"`` select.
+
+        Parameters
+        ----------
+        environments, anomalies
+            Texts as on the command line.
+
+        Returns
+        -------
+        tuple
+            Names of environments, and of anomalies that any of these has.
 
         Raises
         ------
@@ -144,7 +160,13 @@ class Split:
         return tuple(dict.fromkeys((*kinds, *every)))
 
     def train_digest(self, environment: str) -> str:
-        """Return the digest of an environment's training part: what a fit depends on."""
+        """Return the digest of an environment's training part: what a fit depends on.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+        """
         return str(self.manifest["environments"][environment]["groups"][TRAIN]["sha256"])
 
     def environment(self, name: str) -> EnvironmentData:

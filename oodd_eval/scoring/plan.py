@@ -4,7 +4,7 @@ From names to a plan: settings are resolved and keys are made here, once.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 from oodd_eval.data.facts import PROTOCOL, Group, split_condition
@@ -64,8 +64,8 @@ class Plan:
     split: str
     split_digest: str
     units: tuple[Unit, ...]
+    groups: Mapping[str, Group]
     limit: int | None = None
-    groups: Mapping[str, Group] = field(default_factory=dict)
 
     @property
     def cells(self) -> list[Cell]:
@@ -131,7 +131,7 @@ def make_plan(
         for horizon in horizons
         for seed in seeds
     )
-    return Plan(split.name, split.digest, units, limit, split.groups)
+    return Plan(split.name, split.digest, units, split.groups, limit)
 
 
 def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str, ...]:

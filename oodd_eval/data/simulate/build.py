@@ -130,28 +130,41 @@ def build_split(
         further = {e: _further(definition, planned, work) for e, planned in todo.items()}
         todo = {e: planned + further[e] for e, planned in todo.items()}
     for environment, chunks in todo.items():
-        files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
-        taken: dict[str, layout.Arrays] = {}
-        if definition.base:
-            with _base(definition.base, environment, digests[environment]) as base:
-                taken = {part: base.arrays(part) for part in (TRAIN, CALIBRATION)}
-        tests = [TWINS, *(f"test/{condition}" for condition, _ in chunks[-1].conditions)]
-        groups = (
-            (part, taken.get(part) or _joined(part, files[part.split("/")[0]]))
-            for part in (TRAIN, CALIBRATION, *tests)
-        )
-        target = directory / f"{environment}.h5"
-        info = info_of(environment)
-        kinds = {c: anomaly_info(split_condition(c)[0]).group for c, _ in chunks[-1].conditions}
-        entries[environment] = layout.write_environment(
-            target, groups, digests[environment], sensors=info.sensors, actions=info.actions,
-            own=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
-        ) | _strengths(definition, environment)  # fmt: skip
+        entries[environment] = _write(definition, chunks, work, directory)
     ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
     versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
     layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
     shutil.rmtree(work)
     return directory
+
+
+def _write(
+    definition: SplitDefinition, chunks: Sequence[Chunk], work: Path, directory: Path
+) -> dict[str, Any]:
+    """Join the chunks of an environment into its file; return its manifest entry."""
+    environment, policy = chunks[-1].environment, chunks[-1].policy_digest
+    conditions = [condition for condition, _ in chunks[-1].conditions]
+    info = info_of(environment)
+    kinds = {c: anomaly_info(split_condition(c)[0]).group for c in conditions}
+    files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
+    with contextlib.ExitStack() as stack:
+        taken: dict[str, layout.Arrays] = {}
+        if definition.base:
+            base = stack.enter_context(_base(definition.base, environment, policy))
+            taken = {part: base.arrays(part) for part in (TRAIN, CALIBRATION)}
+        # A file may hold hundreds of parts: to open it for each of them takes minutes.
+        held = {
+            file: stack.enter_context(np.load(file, allow_pickle=False)) for file in files["test"]
+        }
+        groups = (
+            (part, taken.get(part) or _joined(part, files[part.split("/")[0]], held))
+            for part in (TRAIN, CALIBRATION, TWINS, *(f"test/{c}" for c in conditions))
+        )
+        return layout.write_environment(
+            directory / f"{environment}.h5", groups, policy, sensors=info.sensors,
+            actions=info.actions,
+            own=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
+        ) | _strengths(definition, environment)  # fmt: skip
 
 
 def _check_sizes(definition: SplitDefinition) -> None:
@@ -361,13 +374,18 @@ def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _joined(part: str, files: Sequence[Path]) -> layout.Arrays:
-    """Return the datasets of a part from its chunks; rows in blocks, which may exceed memory."""
+def _joined(part: str, files: Sequence[Path], held: Mapping[Path, Any]) -> layout.Arrays:
+    """Return a part from its chunks, `held` open or not; rows in blocks: they may exceed memory."""
 
     def stored(name: str) -> Iterator[NDArray[Any]]:
         for file in files:
-            with np.load(file, allow_pickle=False) as chunk:
-                if f"{part}:{name}" in chunk.files:
+            kept = file in held
+            with (
+                contextlib.nullcontext(held[file])
+                if kept
+                else np.load(file, allow_pickle=False) as chunk
+            ):
+                if f"{part}:{name}" in chunk:
                     yield chunk[f"{part}:{name}"]
 
     lengths = np.concatenate(list(stored("lengths")))

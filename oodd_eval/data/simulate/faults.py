@@ -37,14 +37,38 @@ class Fault:
         self.parameters = parameters
 
     def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
-        """Prepare, once, before the transition onto the onset; `rows` are those seen until then."""
+        """Prepare, once, before the transition onto the onset.
+
+        Parameters
+        ----------
+        simulator
+            The episode's; ``simulator.env`` is the environment.
+        rows
+            Observation rows seen until then.
+        """
 
     def command(self, action: Command, simulator: Simulator) -> Command:
-        """Return what the simulator is given for an action; called before every transition."""
+        """Return what the simulator is given for an action; called before every transition.
+
+        Parameters
+        ----------
+        action
+            What the policy commanded.
+        simulator
+            The episode's.
+        """
         return action
 
     def observe(self, row: Row, step: int) -> Row:
-        """Return the observation row number `step` as the broken sensors report it."""
+        """Return an observation row as the broken sensors report it.
+
+        Parameters
+        ----------
+        row
+            What the simulator gave, float32 of shape (D,).
+        step
+            Its number in the episode.
+        """
         return row
 
 

@@ -140,6 +140,8 @@ def evaluate_policy(
     noise: float = 0.0,
 ) -> NDArray[np.float64]:  # fmt: skip
     """Return the returns of nominal episodes, a fresh simulator each, seeds ``seed + i``."""
+    if noise:
+        measure(environment, policy)
     setup = Setup(environment, policy, noise=noise)
     return np.array([return_of(setup.record(seed + i)) for i in range(episodes)])
 
