@@ -103,6 +103,11 @@ def define(parser: Parser) -> None:
     add("--format", required=True, choices=["minari"], help="minari: one dataset a part")
     add("--output", required=True, type=Path, metavar="DIR", help="root of the datasets")
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    add = action("page", "write the pages on environments and anomalies (extra sim)").options(
+        page, "data page docs"
+    )
+    add("directory", type=Path, metavar="DIR", help="directory of the documents")
+    add("--env", default="all", metavar="NAMES", help="environments to draw (default: all)")
     action("info", "describe a split").options(info, "data info mini")("name", help=split)
     # fmt: on
 
@@ -263,4 +268,15 @@ def export(options: argparse.Namespace) -> int:
 def info(options: argparse.Namespace) -> int:
     """Carry out ``data info``."""
     make_console().print(describe(load_split(options.name)))
+    return 0
+
+
+def page(options: argparse.Namespace) -> int:
+    """Carry out ``data page``; the overview names all environments."""
+    from oodd_eval.data.simulate.page import NAME, write_pages
+
+    notes = make_console(quiet=options.verbosity < 0)
+    environments = select("environment", options.env, ENVIRONMENTS)
+    write_pages(options.directory, environments=environments, progress=notes.print)
+    make_console().print(f"pages: {options.directory / NAME}.md and {len(environments)} more")
     return 0
