@@ -153,6 +153,20 @@ def test_a_plot_shows_both_lines_around_the_onset():
     assert "<circle" not in drawn
 
 
+def test_a_plot_lasts_until_the_effect_is_seen():
+    broken, twin = episodes({0: 1.0}, rows=400, onset=200)
+    drawn = pictures.plot("cartpole", "", replace(broken, onset=60), twin)
+    assert re.findall(r">(\d+)</text>", drawn) == ["0", "1", "30", "290"]
+    assert ">onset, step 60<" in drawn
+
+
+def test_labels_are_short_plain_numbers():
+    drawn = pictures.plot("cartpole", "", *episodes({0: -123.4}))
+    assert re.findall(r">(-?[\d.e+]+)</text>", drawn)[:2] == ["-120", "0"]
+    negative_zero = pictures.plot("cartpole", "", *episodes({0: -0.0}))
+    assert ">-0<" not in negative_zero
+
+
 def test_a_dot_marks_the_end_of_an_episode():
     broken, twin = episodes({0: 1.0})
     short = replace(broken, trajectory=Trajectory(broken.trajectory.observations[:91]))

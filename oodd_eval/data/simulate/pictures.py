@@ -20,7 +20,7 @@ from oodd_eval.data.simulate.record import SHORTEST_TWIN, Episode, record_anomal
 from oodd_eval.data.simulate.values import VALUES, spread_of
 
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
-BEFORE, AFTER = 30, 90  # rows of a plot before and after the onset
+BEFORE, AFTER = 30, 90  # rows of a plot before the onset and after the effect
 WIDTH, HEIGHT = 480, 190
 LEFT, RIGHT, TOP, BOTTOM = 60, 472, 44, 152  # of the plot's axes
 TWIN, CORRUPTED, INK, LINE = "#555555", "#d55e00", "#222222", "#bbbbbb"
@@ -92,12 +92,13 @@ def png(image: Image) -> bytes:
 
 
 def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
-    """Return the sensor that differs most from the twin's after the onset, in its spreads.
+    """Return the sensor that differs most from the twin's in the rows that are plotted, in spreads.
 
     Among the corrupted ones, or for an anomaly of the dynamics among all that may break.
     """
     rows, others = episode.trajectory.observations, twin.trajectory.observations
-    shown = slice(episode.onset, min(len(rows), len(others), (episode.onset or 0) + AFTER))
+    effect = episode.effect or 0
+    shown = slice(effect, min(len(rows), len(others), effect + AFTER))
     gap = np.abs(rows[shown] - others[shown]).mean(axis=0)
     among: list[int] = episode.parameters.get("sensors", VALUES["sensors"][environment])
     return max(among, key=lambda i: float(gap[i] / spread_of(environment)[i]))
@@ -106,8 +107,8 @@ def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
 def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
     """Return an SVG picture of one sensor of an episode and of its twin around the onset."""
     sensor = telling_sensor(environment, episode, twin)
-    onset = episode.onset or 0
-    first, last = max(0, onset - BEFORE), onset + AFTER
+    onset, effect = episode.onset or 0, episode.effect or 0  # which may come much later
+    first, last = max(0, onset - BEFORE), effect + AFTER
     lines = {
         colour: e.trajectory.observations[first : last + 1, sensor].astype(np.float64)
         for colour, e in ((TWIN, twin), (CORRUPTED, episode))
@@ -130,7 +131,8 @@ def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
         f'<path d="M{x(onset):.1f} {TOP}V{BOTTOM + 6}" stroke="{INK}" stroke-dasharray="4 3"/>',
     ]
     for value in (low, high):
-        shapes.append(_text(LEFT - 6, y(value) + 4, f"{value:.2g}", "end"))
+        label = f"{float(f'{value:.2g}') + 0:g}"  # neither 1.2e+02 nor -0
+        shapes.append(_text(LEFT - 6, y(value) + 4, label, "end"))
         shapes.append(f'<path d="M{LEFT} {y(value):.1f}H{RIGHT}" stroke="{LINE}"/>')
     ends = (first, "start"), (last, "end")
     shapes += [_text(x(step), BOTTOM + 16, f"{step}", anchor) for step, anchor in ends]
