@@ -43,6 +43,8 @@ NOT_RUN = [
 
 PARSED_ONLY = [
     Rule(r"^oodd-eval data build (standard|paper|reduced)\b", "hours of simulation"),
+    Rule(r"^oodd-eval data (build ladder|calibrate)\b", "minutes of simulation; test_ladder"),
+    Rule(r"--split ladder\b", "takes minutes to build; test_ladder runs over a small one"),
     Rule(r"^oodd-eval data fetch https?:", "needs a network; test_transfer serves one"),
     Rule(r"^oodd-eval reproduce .*--render-only", "renders what hours computed; "
          "test_reproduce_run renders what minutes did"),
