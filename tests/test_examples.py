@@ -107,9 +107,13 @@ def test_the_notebook_prints_what_is_stored_in_it(capsys):
         value = eval(compile(ast.Expression(last.value), "cell", "eval"), space) if shown else None  # noqa: S307
         outputs = cell["outputs"]
         printed = [o for o in outputs if o["output_type"] == "stream"]
-        # The ensemble is small, and other machines train it to other last digits.
+        # The ensemble is small, and other machines train it to other last digits: an alarm may come
+        # some rows sooner or later.
         told, expected = capsys.readouterr().out, "".join(t for o in printed for t in o["text"])
-        assert re.sub(r"\d+%", "", told) == re.sub(r"\d+%", "", expected)
+        told, expected = (re.sub(r"\d+%", "", text) for text in (told, expected))
+        assert re.sub(r"\d+", "", told) == re.sub(r"\d+", "", expected)
+        rows = [[int(n) for n in re.findall(r"\d+", text)] for text in (told, expected)]
+        assert rows[0] == pytest.approx(rows[1], abs=5)
         pictures = [o for o in outputs if "image/png" in o.get("data", {})]
         assert bool(pictures) == hasattr(value, "savefig")
         if html := [o["data"]["text/html"] for o in outputs if "text/html" in o.get("data", {})]:
