@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.tables import ladder
+from oodd_eval.results.tables.board import boards
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "results.md").read_text()
@@ -97,3 +101,24 @@ def test_verdicts_are_counted_rightly():
     assert f"Of {sum(counted.values())} claims" in text
     for verdict, many in counted.items():
         assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
+
+
+GRADED = ROOT / "leaderboard" / "graded" / "ladder"
+
+
+def test_the_ladder_is_that_of_its_records():
+    (board,) = boards(ResultsDirectory(GRADED).records())
+    overview = ladder.tables(board)[0]
+    names = overview.header[5:]
+    found = re.findall(r"^\| `([a-z-]+)` \| (\S+ \[[^]]+\]) \| (.+) \|$", PAGE, re.MULTILINE)
+    assert [f"`{name}`" for name in names] == re.findall(r"`\w+`", PAGE.split("| threshold |")[1])[
+        : len(names)
+    ]
+    expected = [(row[0], row[1], " | ".join(row[5:])) for row in overview.rows]
+    assert found == expected
+
+
+def test_the_page_of_the_ladder_is_printed_from_its_records(capsys):
+    assert main(["show", str(GRADED), "--stored", "--markdown"]) == 0
+    told = "run `oodd-eval show leaderboard/graded/ladder --stored --markdown`"
+    assert capsys.readouterr().out == (GRADED / "README.md").read_text(encoding="utf-8"), told
