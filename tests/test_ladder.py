@@ -110,6 +110,9 @@ def test_unknown_rungs_and_what_is_not_calibrated_are_refused(own_ladder):
 # Calibration
 
 
+STEP = 0.3  # from here on the policy fails, in one kind
+
+
 def curve(strength, scale):
     """A policy that keeps half of its return at a strength of `scale`."""
     return 100 / (1 + strength / scale)
@@ -123,6 +126,8 @@ def measured(monkeypatch, tmp_path):
 
     def measure(environment, kind, strength, *_):
         calls.append((kind, strength))
+        if kind == "bias":
+            return [100.0 if strength < STEP else 40.0] * 32
         returns = curve(strength, 0.2) if kind != "stuck" else 100.0
         return list(returns + noise * strength)
 
@@ -169,6 +174,17 @@ def test_strengths_are_where_a_known_curve_has_the_levels(measured):
         assert rungs[name]["kept_low"] - 0.01 <= kept <= rungs[name]["kept_high"] + 0.01
         assert rungs[name]["reached"]
     assert rungs["16th"]["strength"] == pytest.approx(rungs["kept99"]["strength"] / 16, rel=1e-3)
+
+
+def test_a_step_is_found_and_levels_on_it_share_its_two_sides(measured):
+    go, _, _ = measured
+    rungs = go(kinds=["bias"])["bias"]["rungs"]
+    assert [*rungs] == [*FRACTIONS, "kept99", "kept50"]
+    (before, after) = (rungs[name] for name in ("kept99", "kept50"))
+    assert STEP / calibrate.FINEST <= before["strength"] < STEP <= after["strength"]
+    assert after["strength"] <= STEP * calibrate.FINEST
+    for rung, kept in (before, 1.0), (after, 0.4):
+        assert (rung["kept_low"], rung["kept"], rung["kept_high"]) == (kept, kept, kept)
 
 
 def test_a_kind_that_costs_nothing_stops_at_its_bound_and_says_so(measured):
@@ -222,7 +238,9 @@ def test_crossings_worked_by_hand():
     assert calibrate.crossing(strengths, kept, 0.7) == pytest.approx(8.0)
     assert calibrate.crossing(strengths, kept, 0.99) == pytest.approx(0.5)
     assert calibrate.crossing(strengths, kept, 0.4) == math.inf
-    assert calibrate.value_at(strengths, kept, 8.0) == pytest.approx(0.7)
+    assert [calibrate.nearest(kept, level) for level in (0.99, 0.91, 0.6, 0.1)] == [0, 1, 2, 2]
+    flat = np.array([1.0, 1.0, 0.4, 0.4])
+    assert [calibrate.nearest(flat, level) for level in (0.99, 0.5)] == [1, 2]
 
 
 def test_what_is_kept_counts_negative_returns_alike():

@@ -1,9 +1,11 @@
 """Find the strengths at which a policy keeps given shares of its return: what a ladder stands on.
 
 Returns are measured on seeds of their own, the same for all strengths, with the first draw of each
-episode. The curve of what is kept against strength is the isotonic regression of these means; a
-level's strength is where the curve crosses it, linear in the logarithm of the strength. Intervals
-are percentiles of a bootstrap over the seeds.
+episode. The curve of what is kept against strength is the isotonic regression of these means. Where
+it crosses a level, more strengths are measured between its neighbours until one of them keeps the
+level or they are nearly the same. A rung is always a measured strength, and what it keeps is what
+was measured there: many curves are steps, and a line drawn between two strengths tells nothing of
+them. Intervals are percentiles of a bootstrap over the seeds.
 
 A measured strength is one line of JSON in a work file: an interrupted calibration goes on.
 """
@@ -38,7 +40,8 @@ FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluat
 ROBOTS_CAP: Final = 300  # as in mini; the others run to their end
 STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass
 SMALLEST: Final = 4.0**-7  # of the bound; weaker strengths are not tried
-HALVINGS: Final = 2  # of each level's bracket
+FINEST: Final = 1.03  # ratio of neighbours between which nothing is measured any more
+NEAR: Final = 0.1  # of the return that a level loses: so near to it a strength is the level's
 DRAWS: Final = 1000
 
 Floats = NDArray[np.float64]
@@ -106,14 +109,14 @@ def crossing(strengths: Floats, curve: Floats, level: float) -> float:
     return float(strengths[i - 1] * (strengths[i] / strengths[i - 1]) ** share)
 
 
-def value_at(strengths: Floats, curves: Floats, strength: float) -> Floats:
-    """Return curves of shape (..., n) at a strength."""
-    if len(strengths) == 1:
-        return np.asarray(curves[..., 0])
-    x, logs = np.log(strength), np.log(strengths)
-    i = int(np.clip(np.searchsorted(logs, x, side="right"), 1, len(logs) - 1))
-    share = np.clip((x - logs[i - 1]) / (logs[i] - logs[i - 1]), 0, 1)
-    return np.asarray((1 - share) * curves[..., i - 1] + share * curves[..., i])
+def nearest(curve: Floats, level: float) -> int:
+    """Return which strength keeps nearest to a level on a non-increasing curve.
+
+    Among equal ones it is that beside the place where the curve crosses the level.
+    """
+    i = int((curve <= level).argmax()) if (curve <= level).any() else len(curve) - 1
+    before = max(i - 1, 0)
+    return before if abs(curve[before] - level) < abs(curve[i] - level) else i
 
 
 def levels_of(environment: str, kind: str) -> dict[str, float]:
@@ -131,23 +134,32 @@ def next_strength(environment: str, kind: str, curve: Curve, nominal: Sequence[f
     bound = bound_of(environment, kind)
     if not curve:
         return bound
-    strengths, kept = _means(curve, nominal)
+    strengths, returns, base = _arrays(curve, nominal)
+    kept = kept_shares(returns, base)
     # Down from the bound, until the policy keeps all but nothing.
     weakest = float(strengths[0])
     if kept[0] < 0.995 and weakest > SMALLEST * bound * 1.01:
-        return weakest / STEP
+        return _rounded(weakest / STEP)
     fitted = falling(kept)
+    errors = (returns - base).std(axis=1, ddof=1) / math.sqrt(len(base)) / abs(base.mean())
     for level in levels_of(environment, kind).values():
         i = int((fitted <= level).argmax()) if (fitted <= level).any() else 0
-        if i and strengths[i] / strengths[i - 1] > STEP ** (0.5**HALVINGS) * 1.01:
-            return float(math.sqrt(strengths[i] * strengths[i - 1]))
+        if not i or (ratio := strengths[i] / strengths[i - 1]) <= FINEST:
+            continue
+        near = nearest(fitted, level)
+        # Nearer than half a standard error no measurement could tell.
+        if abs(fitted[near] - level) <= max(NEAR * (1 - level), errors[near] / 2):
+            continue
+        share = math.log(crossing(strengths, fitted, level) / strengths[i - 1]) / math.log(ratio)
+        # Neither end, so that steps are found, too.
+        return _rounded(strengths[i - 1] * ratio ** min(max(share, 0.25), 0.75))
     return 0.0
 
 
-def _means(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats]:
-    strengths = np.array(sorted(curve))
-    returns = np.array([curve[s] for s in strengths])
-    return strengths, kept_shares(returns, np.array(nominal))
+def _arrays(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats, Floats]:
+    """Return strengths, rising, their returns of shape (strengths, seeds), and nominal returns."""
+    strengths = sorted(curve)
+    return np.array(strengths), np.array([curve[s] for s in strengths]), np.array(nominal)
 
 
 def find_rungs(
@@ -155,24 +167,23 @@ def find_rungs(
 ) -> dict[str, Any]:
     """Return the entry of a kind in ``ladder.json`` from measured returns."""
     bound = bound_of(environment, kind)
-    strengths, kept = _means(curve, nominal)
-    base, returns = np.array(nominal), np.array([curve[s] for s in strengths])
+    strengths, returns, base = _arrays(curve, nominal)
+    kept = kept_shares(returns, base)
     drawn = np.random.default_rng(0).integers(len(base), size=(DRAWS, len(base)))
-    draws = falling(kept_shares(returns[:, drawn], base[drawn])).T
-    fitted = falling(kept)
+    draws = kept_shares(returns[:, drawn], base[drawn])
+    fitted, curves = falling(kept), falling(draws).T
 
     def rung(level: float) -> dict[str, Any]:
-        crossings = [min(crossing(strengths, own, level), bound) for own in draws]
-        found = crossing(strengths, fitted, level)
-        strength = _rounded(min(found, bound))
+        i = nearest(fitted, level)
+        crossings = [min(crossing(strengths, own, level), bound) for own in curves]
         low, high = np.percentile(crossings, [2.5, 97.5])
-        at = value_at(strengths, draws, strength)
-        kept_low, kept_high = np.percentile(at, [2.5, 97.5])
+        kept_low, kept_high = np.percentile(draws[i], [2.5, 97.5])
         return {
-            "strength": strength, "low": _rounded(low), "high": _rounded(high),
-            "kept": _rounded(float(value_at(strengths, fitted, strength))),
+            "strength": float(strengths[i]),
+            "low": _rounded(min(low, strengths[i])), "high": _rounded(max(high, strengths[i])),
+            "kept": _rounded(kept[i]),
             "kept_low": _rounded(kept_low), "kept_high": _rounded(kept_high),
-            "reached": bool(found <= bound),
+            "reached": bool(fitted[-1] <= level),
         }  # fmt: skip
 
     levels = levels_of(environment, kind)
