@@ -10,15 +10,17 @@ import numpy as np
 from helpers_records import make_record
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
+from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard.entry import EntryInfo, read_entries
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.sections import graded_sections, sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
-from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS
+from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
+from oodd_eval.results.ladder import FOUND
 from oodd_eval.results.record import Metric
 
 DIGEST = "ab" * 32
@@ -47,6 +49,25 @@ def write_entry(root, identity, records, *, curves=(), **fields):
         split_digest=first.split_digest, protocol=first.protocol, environment={}, **given,
     )  # fmt: skip
     (directory / "entry.json").write_text(entry.to_json(), encoding="utf-8")
+
+
+GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
+"""Share of episodes that a row finds at the weakest and at the strongest rung of a ladder."""
+
+
+def graded(root):
+    """Sections of a leaderboard in `root` with three rows on one ladder."""
+    names = list(rungs_of("cartpole", "iid"))
+    lines = []
+    for row, (first, last) in GRADED_ROWS.items():
+        for name, share in zip(names, np.linspace(first, last, len(names)), strict=True):
+            values = {FOUND: [float(i < 8 * share) for i in range(8)], RANKING: [0.5] * 8}
+            fields = {"strength": name, "values": values}
+            lines.append(make_record(row, "cartpole", "iid", **fields).to_json() + "\n")
+    own = root / "graded" / "small"
+    own.mkdir(parents=True)
+    (own / "records.jsonl").write_text("".join(lines), encoding="utf-8")
+    return graded_sections(root)
 
 
 def make_curves(record, seed, twins_seed=0):

@@ -156,6 +156,18 @@ def test_all_detector_seeds_count():
     assert ("ant", "gravity") not in next(iter(thresholds(both).values()))
 
 
+def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
+    usual = of_records.rungs_of
+
+    def without(*place):
+        return {n: r for n, r in usual(*place).items() if place[0] != "ant" or n != "kept90"}
+
+    monkeypatch.setattr(of_records, "rungs_of", without)
+    found = {(r.environment, r.anomaly): r.strength for r in at_rung(RECORDS, "kept90")}
+    assert found["ant", "iid"] == found["ant", "gravity"] == "kept99"
+    assert found["hopper", "iid"] == "kept90"
+
+
 def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
     at_end = at_rung(RECORDS, "kept50")
     assert {(r.environment, r.anomaly, r.strength) for r in at_end} == {

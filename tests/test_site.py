@@ -12,6 +12,7 @@ import pytest
 
 from oodd_eval import __version__
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
+from oodd_eval.data.ladder import rungs_of
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
@@ -58,6 +59,11 @@ def embedded(page, name="data"):
 def row(data, label, board=0):
     (found,) = [r for r in data["boards"][board]["rows"] if r["label"] == label]
     return found
+
+
+@pytest.fixture(scope="module")
+def graded(tmp_path_factory):
+    return helpers_site.graded(tmp_path_factory.mktemp("board"))
 
 
 # -- the page -------------------------------------------------------------------------------------
@@ -285,6 +291,27 @@ def test_the_papers_digits_are_those_of_its_table(page):
     assert set(paper) == set(ENVIRONMENTS)
 
 
+def test_weaker_anomalies_have_a_table_and_a_line_a_row(entries, graded):
+    (power,) = embedded(site.page(sections(entries), graded))["power"]
+    assert power["split"].startswith("mini")
+    overview = power["tables"][0]
+    assert [line[0] for line in overview["rows"]] == ["rf", "riqn", "clock"]
+    assert [row["label"] for row in power["rows"]] == ["rf", "riqn", "clock"]
+    assert [row["trivial"] for row in power["rows"]] == [False, False, True]
+    rungs = rungs_of("cartpole", "iid")
+    for row in power["rows"]:
+        first, last = helpers_site.GRADED_ROWS[row["label"]]
+        found, matched = row["points"]
+        assert [point[0] for point in found] == pytest.approx(
+            [rung.strength / rungs["kept99"].strength for rung in rungs.values()], rel=1e-3
+        )
+        assert (found[0][2], found[-1][2]) == (first, last)
+        assert {point[2] for point in matched} == {0.5}
+        lost = [1 - rung.kept for rung in rungs.values() if rung.kept == rung.kept]
+        assert [p[1] for p in found if p[1] is not None] == pytest.approx(lost, abs=1e-3)
+    assert embedded(page_of(entries))["power"] == []
+
+
 def test_undefined_values_are_null(tmp_path):
     record = helpers_site.make_record(values={"delay": [None, None]})
     helpers_site.write_entry(tmp_path, "one", [record])
@@ -400,7 +427,7 @@ def test_a_full_site_of_two_splits_is_below_five_megabytes(monkeypatch):
     data, curves = helpers_site.full()
     assert len(curves) == sum(len(b["rows"]) for b in data["boards"]) == 28
     assert all(len(r["cells"]) == 56 for b in data["boards"] for r in b["rows"])
-    monkeypatch.setattr(site, "site_data", lambda _: (data, curves))
+    monkeypatch.setattr(site, "site_data", lambda *_: (data, curves))
     assert len(site.page([]).encode()) < 5e6
 
 

@@ -30,16 +30,17 @@ def entries(tmp_path_factory):
     return helpers_site.example(tmp_path_factory.mktemp("results"))
 
 
-def written(entries, directory):
+def written(entries, directory, graded=()):
     """Address of a site of some entries."""
     file = directory / site.PAGE
-    file.write_text(site.page(sections(entries)), encoding="utf-8")
+    file.write_text(site.page(sections(entries), graded), encoding="utf-8")
     return file.as_uri()
 
 
 @pytest.fixture(scope="module")
 def url(entries, tmp_path_factory):
-    return written(entries, tmp_path_factory.mktemp("site"))
+    directory = tmp_path_factory.mktemp("site")
+    return written(entries, directory, helpers_site.graded(directory))
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def test_the_first_view_is_the_ranking_of_the_first_board(browser):
     assert browser.texts(LABELS) == [
         "riqn", "riqn[h=10]", "rf", "persistence", "clock", "mine[window=3]",
     ]  # fmt: skip
-    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text("caption")
+    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text("#ranking caption")
     assert "digest abababababab, protocol 1, 2 test seeds" in browser.texts("#notes li")[0]
     assert browser.run("return document.querySelector('[aria-sort=descending]').textContent")
 
@@ -97,7 +98,7 @@ def test_trivial_rows_are_marked_and_can_be_left_out(browser):
     assert "trivial" in browser.texts("tr.trivial .badge")
     browser.click("#filters [name=trivial]")
     assert browser.texts(LABELS) == ["riqn", "riqn[h=10]", "rf", "mine[window=3]"]
-    assert "4 of 6 rows" in browser.text("caption")
+    assert "4 of 6 rows" in browser.text("#ranking caption")
 
 
 def test_a_click_sorts_and_a_second_one_turns_round(browser):
@@ -179,11 +180,11 @@ def test_the_keyboard_reaches_every_control_and_opens_a_detector(browser):
 def test_the_arrow_keys_choose_columns_and_filters(browser):
     browser.run("document.querySelector('[name=view]:checked').focus()")
     browser.press("right")
-    assert browser.text("caption").startswith("AUCs:")
+    assert browser.text("#ranking caption").startswith("AUCs:")
     assert browser.run("return document.activeElement.value") == "aucs"
     browser.run("document.querySelector('[name=group]').focus()")
     browser.press("down")
-    assert "sensor anomalies" in browser.text("caption")
+    assert "sensor anomalies" in browser.text("#ranking caption")
     assert browser.run("return document.activeElement.name") == "group"
 
 
@@ -274,7 +275,7 @@ def test_costs_are_shown(browser):
 def test_the_cost_does_not_depend_on_what_is_selected(browser):
     browser.click("#filters [value=cost]")
     browser.choose("environment", "Hopper")
-    assert browser.text("caption") == "Cost: all fits of a row, whatever is selected (6 rows)"
+    assert browser.text("#ranking caption") == "Cost: all fits of a row, whatever is selected (6 rows)"
 
 
 def test_a_delay_stands_beside_what_false_alarms_alone_give(browser):
@@ -291,21 +292,21 @@ def test_the_address_says_what_is_shown(browser, url):
     browser.click("#filters [value=alarms]")
     browser.click("[data-sort=missed]")
     browser.click("#filters [name=trivial]")
-    address, caption = browser.run("return location.href"), browser.text("caption")
+    address, caption = browser.run("return location.href"), browser.text("#ranking caption")
     labels = browser.texts(LABELS)
     assert sorted(labels) == ["mine[window=3]", "rf", "riqn", "riqn[h=10]"]
     browser.open("about:blank")
     browser.open(address)
-    assert (browser.text("caption"), browser.texts(LABELS)) == (caption, labels)
+    assert (browser.text("#ranking caption"), browser.texts(LABELS)) == (caption, labels)
     assert browser.run("return document.querySelector('[name=trivial]').checked") is False
     # Back from a row, the table is as it was left; the name of the site leads to the first view.
     open_row(browser, "rf")
     browser.click(".back a")
     browser.wait_for("document.querySelector('#detector').hidden")
-    assert browser.text("caption") == caption
+    assert browser.text("#ranking caption") == caption
     browser.click("header a")
     browser.wait_for("location.hash === '#/'")
-    assert browser.text("caption").startswith("Ranking: all environments, all anomalies")
+    assert browser.text("#ranking caption").startswith("Ranking: all environments, all anomalies")
 
 
 @pytest.mark.parametrize(
@@ -353,10 +354,10 @@ def test_curves_are_drawn_from_the_entrys_numbers(browser, entries):
     assert len(browser.texts(".alarms.anomalous line")) == len(example["alarms"])
     assert len(browser.texts(".alarms.twin line")) == len(example["twin_alarms"])
     assert f"onset τ = {example['onset']}" in browser.texts(".onset text")
-    assert f"Test trajectory {example['index']}," in browser.texts("figcaption")[2]
+    assert f"Test trajectory {example['index']}," in browser.texts("#detector figcaption")[2]
     first = next(t for t in example["alarms"] if t >= example["onset"]) - example["onset"]
     when = "at the onset" if first == 0 else f"{first} step{'s' * (first > 1)} after the onset"
-    assert f"anomalous {when}" in browser.texts("figcaption")[2]
+    assert f"anomalous {when}" in browser.texts("#detector figcaption")[2]
     # Every point of the ROC curve, and its corner, is on the line.
     path = browser.run("return document.querySelector('#cell .line.anomalous').getAttribute('d')")
     assert path.count("L") == len(unit["roc"]["fpr"])
@@ -458,6 +459,26 @@ def test_an_address_opens_a_cell_directly(browser, url):
     browser.open(f"{url}{address}/hopper/drift")
     assert browser.text("#cell h2") == "Hopper, Sensor Drift"
     assert browser.run("return document.title").startswith("riqn")
+
+
+# -- weaker anomalies -----------------------------------------------------------------------------
+
+
+def test_weaker_anomalies_are_drawn_over_strength_and_over_their_cost(browser):
+    assert browser.texts("#power .legend li") == ["rf", "riqn", "trivial rows"]
+    assert browser.texts("#power tbody tr th")[:3] == ["rf", "riqn", "clock"]
+    paths = "return [...document.querySelectorAll('#power path')].map((p) => p.getAttribute('d'))"
+    drawn = browser.run(paths)
+    assert len(drawn) == 3
+    for control, label in (("axis", "return lost"), ("metric", "matched AUC")):
+        browser.run(
+            "document.querySelectorAll(`[name='power-${arguments[0]}']`)[1].click()", control
+        )
+        name = browser.run("return document.querySelector('#power svg').ariaLabel")
+        assert label in name.replace("Matched", "matched")
+        assert browser.run(paths) != drawn
+        focus = browser.run("return document.activeElement.name")
+        assert focus == f"power-{control}"
 
 
 # -- all of it ------------------------------------------------------------------------------------
@@ -569,7 +590,7 @@ def large(tmp_path_factory):
     """Address of the page of 14 detectors on two splits, all cells and curves: some 4 MB."""
     data, curves = helpers_site.full()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(site, "site_data", lambda _: (data, curves))
+        patch.setattr(site, "site_data", lambda *_: (data, curves))
         return written([], tmp_path_factory.mktemp("site"))
 
 

@@ -13,7 +13,13 @@ from oodd_eval.data.files import write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.sections import TABLES, LeaderboardSection, sections
+from oodd_eval.leaderboard.sections import (
+    GRADED,
+    TABLES,
+    GradedSection,
+    LeaderboardSection,
+    sections,
+)
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.layout import Table
@@ -30,19 +36,21 @@ MANY: Final = 6  # findings beyond which they are folded away
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
-def build(entries: Sequence[SubmittedEntry], output: Path) -> list[str]:
+def build(
+    entries: Sequence[SubmittedEntry], output: Path, graded: Sequence[GradedSection] = ()
+) -> list[str]:
     """Write page, tables and site, the same bytes for the same entries; return their names.
 
     The page is the first. ResultsError: the entries contradict one another.
     """
     found = sections(entries)
     address = f"{SITE}/{site.PAGE}"
-    files = {PAGE: page(found, site=address)}
+    files = {PAGE: page(found, graded, site=address)}
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    files[address] = site.page(found)
+    files[address] = site.page(found, graded)
     for name, text in files.items():
         write_text(output / name, text)
     return list(files)
@@ -67,7 +75,9 @@ def _files(output: Path) -> set[str]:
     return {path.relative_to(output).as_posix() for path in paths if path.is_file()}
 
 
-def page(sections: Sequence[LeaderboardSection], *, site: str = "") -> str:
+def page(
+    sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = (), *, site: str = ""
+) -> str:
     """Return the whole page, which links to the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
     parts = [TEXTS["introduction"]]
@@ -75,6 +85,7 @@ def page(sections: Sequence[LeaderboardSection], *, site: str = "") -> str:
         parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
+    parts += [_graded(section) for section in graded]
     parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
     return "\n".join(parts)
 
@@ -133,6 +144,14 @@ def _section(section: LeaderboardSection) -> str:
         *(f"- {escape(line)}" for line in layout.notes(board)),
     ]
     return "\n".join(parts) + "\n"
+
+
+def _graded(section: GradedSection) -> str:
+    """Return what rows find of anomalies of graded strength, with a link to all tables."""
+    place = f"{GRADED}/{section.name}/{PAGE}"
+    text = TEXTS["graded"].format(split=escape(section.board.split), place=place)
+    title = f"## Weaker anomalies: {escape(_title(section.board))}\n"
+    return "\n".join([title, text, *map(table, section.tables[:1])])
 
 
 def about_split(board: Board) -> str:

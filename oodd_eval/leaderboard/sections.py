@@ -4,15 +4,27 @@ import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import TRUST, SubmittedEntry, Trust, place_of
+from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import RankedBoard, boards, grouped, primary_settings, ranked
+from oodd_eval.results.tables import ladder
+from oodd_eval.results.tables.board import (
+    Board,
+    RankedBoard,
+    boards,
+    grouped,
+    primary_settings,
+    ranked,
+)
+from oodd_eval.results.tables.layout import Table
 
 TABLES: Final = "tables"  # directory of the CSV files
+GRADED: Final = "graded"  # directory of results at graded strengths, one directory a split
 
 _SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
 """Order of the boards: the leaderboard's own split, then from the most data to the least."""
@@ -53,6 +65,24 @@ class LeaderboardSection:
         # Whole splits before limited ones, the newest protocol first.
         limit = -1 if board.limit is None else int(board.limit)
         return known, name, limit, -board.protocol, board.digest
+
+
+@dataclass(frozen=True, slots=True)
+class GradedSection:
+    """A board of anomalies of graded strength: its directory's name, records and tables."""
+
+    name: str
+    board: Board
+    tables: list[Table]
+
+
+def graded_sections(place: Path) -> list[GradedSection]:
+    """Return what a leaderboard's directory has of results at graded strengths."""
+    return [
+        GradedSection(own.name, board, ladder.tables(board))
+        for own in sorted((place / GRADED).glob("*")) if own.is_dir()
+        for board in boards(ResultsDirectory(own).records())
+    ]  # fmt: skip
 
 
 def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:

@@ -58,16 +58,15 @@ def rung_names(records: Iterable[Record]) -> list[str]:
 
 
 def at_rung(records: Sequence[Record], name: str) -> list[Record]:
-    """Return the records at a rung.
+    """Return the records at a rung, or in places without it at the next weaker one.
 
-    Where the largest sensible strength does not cost what the rung stands for, the ladder ends
-    below it, and the records are those at its end.
+    A place has no rung of its own for a level where the strength of a weaker rung is nearest to it:
+    its largest sensible strength costs less, or the policy fails between two near strengths.
     """
     chosen = {}
     for place in ladders(records):
-        known = list(rungs_of(*place))
-        beyond = name not in known and RUNGS.index(name) > RUNGS.index(known[-1])
-        chosen[place] = known[-1] if beyond else name
+        known = [n for n in rungs_of(*place) if RUNGS.index(n) <= RUNGS.index(name)]
+        chosen[place] = known[-1] if known else name
     return [r for r in records if r.strength and r.strength == chosen.get(_place(r))]
 
 

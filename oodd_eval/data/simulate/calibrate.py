@@ -13,8 +13,8 @@ A measured strength is one line of JSON in a work file: an interrupted calibrati
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, as_completed
 from pathlib import Path
 from typing import Any, Final
 
@@ -225,33 +225,28 @@ def calibrate(
             lines.flush()
             measured[_identity(line)] = returns
 
-        def results(tasks: Mapping[Any, tuple[str, str, float]]) -> Iterator[tuple[str, str]]:
-            pending = dict(tasks)
-            while pending:
-                done = next(as_completed(pending))
-                e, kind, strength = pending.pop(done)
-                keep(e, kind, strength, done.result())
-                yield e, kind
-                if found := following(e, kind):
-                    pending[pool.submit(measure, *found)] = found
-
         def curve(e: str, kind: str) -> Curve:
             return {i[3]: r for i, r in measured.items() if i[:3] == (str(key[e]), e, kind)}
 
-        def following(e: str, kind: str) -> tuple[str, str, float] | None:
-            own = curve(e, kind)
-            if not own or (nominal := curve(e, "")) == {}:
-                return e, kind, bound_of(e, kind)
-            strength = next_strength(e, kind, own, nominal[0.0])
-            return (e, kind, strength) if strength else None
+        pending: dict[Future[list[float]], tuple[str, str, float]] = {}
+
+        def go_on(e: str, kind: str) -> None:
+            if strength := next_strength(e, kind, curve(e, kind), curve(e, "")[0.0]):
+                pending[pool.submit(measure, e, kind, strength)] = e, kind, strength
 
         for e in dict.fromkeys(e for e, _ in places):
             if not curve(e, ""):
                 keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e)])
-        first = {p: following(*p) for p in places}
-        tasks = {pool.submit(measure, *task): task for task in first.values() if task}
-        for count, (e, kind) in enumerate(results(tasks), 1):
+        for place in places:
+            go_on(*place)
+        count = 0
+        while pending:
+            done = next(as_completed(pending))
+            e, kind, strength = pending.pop(done)
+            keep(e, kind, strength, done.result())
+            count += 1
             progress(f"{count}  {e} {kind}")
+            go_on(e, kind)
         found = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
         for e, kind in places:
             own = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0])

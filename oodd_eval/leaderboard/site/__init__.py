@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_eval.leaderboard.sections import LeaderboardSection
+from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
 from oodd_eval.leaderboard.site.data import Json, site_data
 from oodd_eval.metrics.cusum import THRESHOLD
 
 PAGE: Final = "index.html"
 
 SCRIPTS: Final = (
-    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "detector.js",
-    "main.js",
+    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "power.js",
+    "detector.js", "main.js",
 )  # fmt: skip
 """Parts of the page's one script, in order."""
 
@@ -35,9 +35,9 @@ HEAVY: Final = 30  # A largest value this many times the typical one asks for a 
 _STATIC = Path(__file__).with_name("static")
 
 
-def page(sections: Sequence[LeaderboardSection]) -> str:
+def page(sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = ()) -> str:
     """Return the site of a leaderboard; the same entries give the same text."""
-    data, curves = site_data(sections)
+    data, curves = site_data(sections, graded)
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     tags = (

@@ -11,14 +11,23 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import EntryInfo
-from oodd_eval.leaderboard.sections import LeaderboardSection
+from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
 from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell
-from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, metric_info
+from oodd_eval.metrics.catalogue import (
+    GUARANTEED,
+    HEADLINE,
+    LEVELS,
+    METRICS,
+    RANKING,
+    metric_info,
+)
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Standing, contribution
+from oodd_eval.results.tables.board import Board, Standing, contribution
 
 _COMPARED: Final = (
     "false_episodes", "early", "delay", "delay_censored", "missed", "found_within_20",
@@ -45,7 +54,9 @@ Units = Mapping[str, list[Json]]  # curves of single cells by the id of their en
 SelectedCell = tuple[str, str]  # environment and anomaly
 
 
-def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]:
+def site_data(
+    sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = ()
+) -> tuple[Json, list[Json]]:
     """Return the data that the page needs at once, and the curves of single rows.
 
     A row names its place in the list of curves, which are by ``environment/anomaly``.
@@ -62,8 +73,35 @@ def site_data(sections: Sequence[LeaderboardSection]) -> tuple[Json, list[Json]]
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
+        "power": [_power(section) for section in graded],
     }  # fmt: skip
     return data, curves
+
+
+def _power(section: GradedSection) -> Json:
+    """Return tables of a board of graded strengths, and each row's means along the ladder.
+
+    Points are (strength, share of the return lost, value), the weakest strength first.
+    """
+    board, tables = section.board, section.tables[:2]
+    by_name = {str(row): row for row in board.entries}
+    rows = [by_name[line[0]] for line in tables[0].rows] if tables else []
+    metrics = [metric_info(name) for name in (FOUND, RANKING)]
+    return {
+        **_fields(board, "split", "digest"),
+        "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],
+        "metrics": [_metric(info.name) | {"chance": info.name == RANKING} for info in metrics],
+        "rows": [
+            {"label": str(row), "trivial": board.is_trivial(row),
+             "points": [_points(board, row, info.name) for info in metrics]}
+            for row in rows
+        ],
+    }  # fmt: skip
+
+
+def _points(board: Board, row: Setting, metric: str) -> list[list[float | None]]:
+    own = [r for r in board.records if r.setting == row]
+    return [[_short(value) for value in point] for point in curve(own, metric)]
 
 
 def _fields(thing: object, *names: str) -> Json:

@@ -32,7 +32,7 @@ _SIDES: Final = (
 )
 _RUNGS: Final = (
     "At keptN the policy keeps N % of its return; 4th, 16th and 64th are those parts of kept99's "
-    "strength. A ladder that ends below a rung counts there with its strongest one."
+    "strength. A ladder without a rung counts there with its next weaker one."
 )
 
 

@@ -42,6 +42,7 @@ function decoded(piece) {
 
 const TITLE = document.title;
 
+drawPower();
 if (DATA.boards.length) {
   window.addEventListener("hashchange", route);
   route();
