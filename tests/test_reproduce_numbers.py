@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+import json
 import math
 
 import numpy as np
@@ -23,7 +24,15 @@ from oodd_eval.paper.experiments import (
     read_tables,
     scope,
 )
-from oodd_eval.paper.inputs import KINDS, RETURNS, Reproduction, dump_returns, load_returns
+from oodd_eval.paper.inputs import (
+    HEADER,
+    KINDS,
+    RETURNS,
+    Other,
+    Reproduction,
+    dump_returns,
+    load_returns,
+)
 from oodd_eval.paper.page import (
     caption,
     front_page,
@@ -244,6 +253,35 @@ def test_csv_reads_back_to_the_same_numbers():
         assert read == pytest.approx(value, rel=1e-5, nan_ok=True)
         assert row["state"] == ("" if number.estimate.environments else "not run")
     assert sum(bool(line[header.index("value")]) for line in lines) > 10
+
+
+def test_another_reproduction_stands_beside_in_tables_and_claims(tmp_path):
+    there, here = tmp_path / "there", tmp_path / "here"
+    first = everywhere("riqn", [0.8, 0.6]), {"acrobot": {k: [-80.0, -90.0] for k in KINDS}}
+    publish(there, header(split="mild"), *first, figures=False)
+    (there / HEADER).write_text(
+        json.dumps({"schema": 1, **dataclasses.asdict(header(split="mild"))})
+    )
+    (there / RETURNS).write_text(dump_returns(first[1], "ab" * 32))
+    other = Other.load(there)
+    found = {"acrobot": {k: [-70.0, -70.0] for k in KINDS}}
+    records = [*everywhere("riqn", [0.4, 0.4]), *everywhere("rf", [0.9, 0.9])]
+    publish(here, header(), records, found, figures=False, other=other)
+    page = (here / "README.md").read_text()
+    lines = [[c.strip() for c in line.split("|")[1:-1]] for line in page.splitlines()]
+    below = next(i for i, c in enumerate(lines) if c[:3] == ["Acrobot", "IQN", "ours"])
+    assert lines[below][3].startswith("-70.0")
+    assert lines[below + 2][2:4] == ["mild", "-85.0 \\[-90.0, -80.0]"]
+    ours = next(i for i, c in enumerate(lines) if c[:3] == ["Ant", "AUC (%)", "ours"])
+    assert lines[ours + 2][2] == "mild"
+    place = next(i for i, cell in enumerate(lines[ours]) if cell.startswith("40.0"))
+    assert lines[ours + 2][place].startswith("70.0 \\[60.0, 80.0]")
+    (titles,) = [c for c in lines if c and c[0] == "Claim"]
+    column = titles.index("On mild")
+    (claim,) = [c for c in lines if c and c[0] == "RIQN has a higher AUC than RF, Δ = 1"]
+    assert "Verdicts that differ:" in page
+    assert claim[column] == "not run; not run"
+    assert claim[column - 2].startswith("undecided")  # two environments of seven
 
 
 def test_nothing_missing_is_printed_as_zero(tmp_path):

@@ -88,7 +88,9 @@ def test_the_first_view_is_the_ranking_of_the_first_board(browser):
     assert browser.texts(LABELS) == [
         "riqn", "riqn[h=10]", "rf", "persistence", "clock", "mine[window=3]",
     ]  # fmt: skip
-    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text("#ranking caption")
+    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text(
+        "#ranking caption"
+    )
     assert "digest abababababab, protocol 1, 2 test seeds" in browser.texts("#notes li")[0]
     assert browser.run("return document.querySelector('[aria-sort=descending]').textContent")
 
@@ -275,7 +277,9 @@ def test_costs_are_shown(browser):
 def test_the_cost_does_not_depend_on_what_is_selected(browser):
     browser.click("#filters [value=cost]")
     browser.choose("environment", "Hopper")
-    assert browser.text("#ranking caption") == "Cost: all fits of a row, whatever is selected (6 rows)"
+    assert (
+        browser.text("#ranking caption") == "Cost: all fits of a row, whatever is selected (6 rows)"
+    )
 
 
 def test_a_delay_stands_beside_what_false_alarms_alone_give(browser):

@@ -11,7 +11,7 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
 from oodd_eval.names import check_known, seconds, select
 from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, TIERS
-from oodd_eval.paper.inputs import Reproduction, keep_inputs, load_records, load_returns
+from oodd_eval.paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
 from oodd_eval.paper.page import publish
 from oodd_eval.paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
 from oodd_eval.plugins.isolation.supervisor import Limits
@@ -47,6 +47,9 @@ def define(parser: Parser) -> None:
         help="run nothing; make tables and figures again from the directory's records")
     add("--records", nargs="+", metavar="DIR",
         help="with --render-only: read all results below these directories instead")
+    add("--beside", metavar="DIR",
+        help="show the numbers of another reproduction beside these, such as one of Table 1's "
+             "strengths beside one of the paper's losses")
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
     # fmt: on
 
@@ -123,11 +126,12 @@ def _render(options: argparse.Namespace, header: Reproduction, records: list[Rec
     """Write tables and figures; 1 when units failed, as far as there are records."""
     console, directory = make_console(), Path(options.output)
     returns = load_returns(directory, header.split_digest)
+    other = Other.load(Path(options.beside)) if options.beside else None
     try:
-        publish(directory, header, records, returns, figures=options.figures)
+        publish(directory, header, records, returns, figures=options.figures, other=other)
     except MissingExtraError as error:
         console.print(f"without figures: {error}")
-        publish(directory, header, records, returns, figures=False)
+        publish(directory, header, records, returns, figures=False, other=other)
     if options.verbosity >= 0:
         console.print(f"tables, figures and claims in {directory / 'README.md'}")
     return int(not all(r.ok for r in header.own(records)))

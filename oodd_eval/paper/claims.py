@@ -18,7 +18,7 @@ from oodd_eval.metrics.catalogue import NAMES, metric_info
 from oodd_eval.names import check_known
 from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
 from oodd_eval.paper.experiments import read_tables
-from oodd_eval.paper.inputs import Returns
+from oodd_eval.paper.inputs import Other, Returns
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import csv_rows
 
@@ -177,16 +177,34 @@ def summary(made: Sequence[Ruling]) -> str:
     return f"{text} {settled} more {are} settled by definition or by construction and not counted."
 
 
-def claims_table(made: Sequence[Ruling]) -> Table:
-    """Return one row per claim."""
+def changed(made: Sequence[Ruling], other: Other) -> str:
+    """Return in how many claims the verdict is another one than that of another reproduction."""
+    counts = []
+    for kind, judged in (("paper", [r.own for r in made]), ("fair", [r.fair for r in made])):
+        pairs = [
+            (j.verdict, other.claims[r.claim.id, kind]["verdict"])
+            for r, j in zip(made, judged, strict=True)
+            if j and not r.claim.settled and (r.claim.id, kind) in other.claims
+        ]
+        both = [pair for pair in pairs if NOT_RUN not in pair]
+        counts.append(f"{sum(a != b for a, b in both)} of {len(both)}")
+    return f"{counts[0]} by the paper's measures, {counts[1]} by the others"
+
+
+def claims_table(made: Sequence[Ruling], other: Other | None = None) -> Table:
+    """Return one row per claim, with the verdicts of another reproduction if there is one."""
     header = ["Claim", "By the paper's measure", "By matched AUC or censored delay", "Number",
               "True if", "Seeds", "Place in the paper"]  # fmt: skip
+    header[3:3] = [f"On {other.name}"] if other else []
     rows = []
     for r in made:
         c = r.claim
         text = f"{c.text} ({c.note})" if c.note else c.text
         true_if = c.region.describe(c.metric) + (f" ({c.source})" if c.source else "")
-        judged = _shown(r.own), _shown(r.fair) if r.fair else ""
+        judged: tuple[str, ...] = _shown(r.own), _shown(r.fair) if r.fair else ""
+        if other:
+            found = [other.claims.get((c.id, kind), {}) for kind in ("paper", "fair")]
+            judged = *judged, "; ".join(line["verdict"] for line in found if line)
         rows.append([text, *judged, c.number, true_if, str(r.own.estimate.seeds or ""), c.place])
     return Table("Claims", header, rows, labels=len(header))
 

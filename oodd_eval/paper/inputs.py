@@ -4,11 +4,12 @@
 """
 
 import contextlib
+import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import TypeAdapter
 
@@ -76,6 +77,39 @@ class Reproduction:
     def __str__(self) -> str:
         data = f"digest {self.split_digest[:12]}, protocol {self.protocol}"
         return f"of tier {self.tier.name} on split {self.split} ({data})"
+
+
+class Other(NamedTuple):
+    """What another reproduction has written, to be shown beside one: its tables, as they are.
+
+    Lines of CSV by their first columns: of tables by experiment, environment, series, anomalies and
+    metric; of claims by claim and kind. Returns are those of the policies.
+    """
+
+    name: str
+    numbers: Mapping[tuple[str, ...], Mapping[str, str]]
+    claims: Mapping[tuple[str, str], Mapping[str, str]]
+    returns: Returns | None
+
+    @classmethod
+    def load(cls, directory: Path) -> "Other":
+        """Read a directory in which ``oodd-eval reproduce`` has written."""
+        header = Reproduction.load(directory)
+        named = ("environment", "series", "anomalies", "metric")
+        numbers = {
+            (e.id, *(line[column] for column in named)): line
+            for e in EXPERIMENTS for line in _lines(directory / "tables" / f"{e.id}.csv")
+        }  # fmt: skip
+        claims = {(line["claim"], line["kind"]): line for line in _lines(directory / "claims.csv")}
+        return cls(header.split, numbers, claims, load_returns(directory, header.split_digest))
+
+
+def _lines(path: Path) -> list[dict[str, str]]:
+    """Read a CSV file; nothing where there is none."""
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def keep_inputs(directory: Path, reproduction: Reproduction, split: Split) -> None:

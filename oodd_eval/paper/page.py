@@ -22,10 +22,25 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.paper.claims import NOT_RUN, Ruling, claims_csv, claims_table, rulings, summary
-from oodd_eval.paper.estimates import Estimate, Estimator, Numbers, compute, mean_return
+from oodd_eval.paper.claims import (
+    NOT_RUN,
+    Ruling,
+    changed,
+    claims_csv,
+    claims_table,
+    rulings,
+    summary,
+)
+from oodd_eval.paper.estimates import (
+    Estimate,
+    Estimator,
+    Numbers,
+    TableNumber,
+    compute,
+    mean_return,
+)
 from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, Experiment
-from oodd_eval.paper.inputs import KINDS, Reproduction, Returns, write_changed
+from oodd_eval.paper.inputs import KINDS, Other, Reproduction, Returns, write_changed
 from oodd_eval.paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.layout import Table
@@ -43,20 +58,21 @@ def fill(name: str, /, **values: Any) -> str:
 
 def publish(
     directory: Path, reproduction: Reproduction, records: Sequence[Record],
-    returns: Returns | None, *, figures: bool = True,
+    returns: Returns | None, *, figures: bool = True, other: Other | None = None,
 ) -> None:  # fmt: skip
     """Write every table and figure of what there is; what is missing says so.
 
-    Without `figures` none is drawn, and those that are there already are linked.
+    Without `figures` none is drawn, and those that are there already are linked. Tables and claims
+    have the numbers of the `other` reproduction beside their own.
     """
     own = reproduction.own(records)
     estimator = Estimator(own)
     made = rulings(estimator, returns)
     write_changed(directory / "claims.csv", claims_csv(made))
-    sections = [_of_returns(reproduction, returns)]
-    sections += [_of_experiment(reproduction, e, estimator) for e in EXPERIMENTS]
+    sections = [_of_returns(reproduction, returns, other)]
+    sections += [_of_experiment(reproduction, e, estimator, other) for e in EXPERIMENTS]
     lines = [line for one in sections for line in _write(directory, one, figures=figures)]
-    write_changed(directory / "README.md", front_page(reproduction, own, made, lines))
+    write_changed(directory / "README.md", front_page(reproduction, own, made, lines, other))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +107,9 @@ def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
     return [f"## {one.title}", "", one.caption, "", *links, *one.shown, ""]
 
 
-def _of_experiment(r: Reproduction, experiment: Experiment, estimator: Estimator) -> _Section:
+def _of_experiment(
+    r: Reproduction, experiment: Experiment, estimator: Estimator, other: Other | None
+) -> _Section:
     name = experiment.id
     title = f"{name.replace('-', ' ').capitalize()}: {experiment.title}"
     if not estimator.has(experiment.settings):
@@ -100,32 +118,34 @@ def _of_experiment(r: Reproduction, experiment: Experiment, estimator: Estimator
     tables: list[str] = []
     parts = {"As in the paper": experiment.metrics, "Beyond": experiment.beyond}
     for heading, metrics in parts.items():
-        set_out = layout(experiment, numbers, metrics)
+        set_out = layout(experiment, numbers, metrics, other=other)
         tables += [f"## {heading}", "", *map(markdown_table, set_out)] if metrics else []
     # Wide tables stand on the page without their intervals.
     wide = experiment.across == "scopes" and experiment.rows != "mean"
-    brief = layout(experiment, numbers, experiment.metrics, intervals=not wide)
+    brief = layout(experiment, numbers, experiment.metrics, intervals=not wide, other=other)
     shown = [*map(markdown_table, brief), fill("files", name=name)]
     text, pictures = caption(r, experiment, numbers), pictures_of(experiment, numbers)
     return _Section(name, title, text, numbers_csv(numbers), tables, pictures, shown)
 
 
-def _of_returns(r: Reproduction, returns: Returns | None) -> _Section:
+def _of_returns(r: Reproduction, returns: Returns | None, other: Other | None) -> _Section:
     name, title = TABLE_2, "Table 2: returns of the policies, nominal and under each anomaly"
     if not returns:
         return _Section(name, title)
-    table, lines = returns_tables(returns)
+    table, lines = returns_tables(returns, other)
     text, pictures = markdown_table(table), {name: returns_picture(returns)}
     shown = [text, f"[{name}.csv](tables/{name}.csv)"]
     return _Section(name, title, returns_caption(r), lines, [text], pictures, shown)
 
 
 def layout(
-    experiment: Experiment, numbers: Numbers, metrics: Sequence[str], *, intervals: bool = True
-) -> list[Table]:
+    experiment: Experiment, numbers: Numbers, metrics: Sequence[str], *, intervals: bool = True,
+    other: Other | None = None,
+) -> list[Table]:  # fmt: skip
     """Set numbers out as the paper does: a table per scope, or per metric where scopes go across.
 
-    Rows are by environment and metric, or by environment and series, with the paper's digits below.
+    Rows are by environment and metric, or by environment and series, with the paper's digits below,
+    and then those of another reproduction.
     """
     labels = {s.label: s.label for s in experiment.series}
     scopes = {s.id: s.title for s in experiment.scopes}
@@ -147,8 +167,23 @@ def layout(
                 theirs = ["" if math.isnan(value) else info.text(value) for value, info in paper]
                 if any(theirs):
                     rows.append(["", "", "paper", *theirs])
+                if other:
+                    found = [_of_other(other, experiment, n) for n in own]
+                    texts = [show(e, n.metric, intervals=intervals)
+                             for e, n in zip(found, own, strict=True)]  # fmt: skip
+                    rows.append(["", "", other.name, *texts])
         tables.append(Table(title, header, rows, labels=3))
     return tables
+
+
+def _of_other(other: Other, experiment: Experiment, n: TableNumber) -> Estimate:
+    """Return what another reproduction has in the place of a number."""
+    line = other.numbers.get((experiment.id, n.environment, n.series.label, n.scope.id, n.metric))
+    if line is None:
+        return Estimate()
+    value, low, high = (float(line[column] or "nan") for column in ("value", "low", "high"))
+    run, state = int(line["environments"]), line["state"].replace(NOT_RUN, "")
+    return Estimate(value, low, high, run, n.estimate.expected, state=state)
 
 
 def show(estimate: Estimate, metric: str, *, intervals: bool = True) -> str:
@@ -176,7 +211,7 @@ def numbers_csv(numbers: Numbers) -> list[list[str]]:
     return lines
 
 
-def returns_tables(returns: Returns) -> tuple[Table, list[list[str]]]:
+def returns_tables(returns: Returns, other: Other | None = None) -> tuple[Table, list[list[str]]]:
     """Return Table 2, ours with intervals and the paper's below it, and its lines of CSV."""
     header = ["Environment", "Policy", "", "Nominal", *(ANOMALIES[a].title for a in TABLE1)]
     rows = []
@@ -189,16 +224,22 @@ def returns_tables(returns: Returns) -> tuple[Table, list[list[str]]]:
             group, digits = ANOMALIES[kind].group if kind in ANOMALIES else "", float(paper[kind])
             numbers = *map(number, e.ends), str(n), number(digits)
             lines.append([environment, kind, group, *numbers])
-            printed = f"{e.value:.1f} [{e.low:.1f}, {e.high:.1f}]"
-            ours.append(printed if e.environments else "not recorded")
+            ours.append(_printed(e))
             theirs.append(f"{digits:.1f}")
         rows += [ours, theirs]
+        if other:
+            its = (_printed(mean_return(other.returns or {}, environment, k)) for k in KINDS)
+            rows.append(["", "", other.name, *its])
     return Table("Mean return", header, rows, labels=3), lines
+
+
+def _printed(e: Estimate) -> str:
+    return f"{e.value:.1f} [{e.low:.1f}, {e.high:.1f}]" if e.environments else "not recorded"
 
 
 def front_page(
     reproduction: Reproduction, records: Sequence[Record], made: Sequence[Ruling],
-    sections: Sequence[str],
+    sections: Sequence[str], other: Other | None = None,
 ) -> str:  # fmt: skip
     """Return the page: the run, the claims, the sections, and what failed."""
     tier = reproduction.tier
@@ -223,7 +264,8 @@ def front_page(
         split="" if reproduction.split == tier.split else reproduction.split,
         made="".join(f"- Made with {one}.\n" for one in software),
         updates=" or ".join(map(str, updates)), summary=summary(made),
-        claims=markdown_table(claims_table(made)).split("\n", 2)[2],
+        claims=markdown_table(claims_table(made, other)).split("\n", 2)[2],
+        other=other.name if other else "", changed=changed(made, other) if other else "",
         sections="\n".join(sections),
     )  # fmt: skip
 
