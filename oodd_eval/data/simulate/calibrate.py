@@ -40,7 +40,7 @@ FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluat
 ROBOTS_CAP: Final = 300  # as in mini; the others run to their end
 STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass
 SMALLEST: Final = 4.0**-7  # of the bound; weaker strengths are not tried
-FINEST: Final = 1.03  # ratio of neighbours between which nothing is measured any more
+FINEST: Final = 1.1  # ratio of neighbours between which nothing is measured any more
 NEAR: Final = 0.1  # of the return that a level loses: so near to it a strength is the level's
 DRAWS: Final = 1000
 
@@ -147,8 +147,8 @@ def next_strength(environment: str, kind: str, curve: Curve, nominal: Sequence[f
         if not i or (ratio := strengths[i] / strengths[i - 1]) <= FINEST:
             continue
         near = nearest(fitted, level)
-        # Nearer than half a standard error no measurement could tell.
-        if abs(fitted[near] - level) <= max(NEAR * (1 - level), errors[near] / 2):
+        # Nearer than its standard error no measurement could tell.
+        if abs(fitted[near] - level) <= max(NEAR * (1 - level), errors[near]):
             continue
         share = math.log(crossing(strengths, fitted, level) / strengths[i - 1]) / math.log(ratio)
         # Neither end, so that steps are found, too.
