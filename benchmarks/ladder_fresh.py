@@ -3,8 +3,9 @@
     python benchmarks/ladder_fresh.py --env cartpole,acrobot --episodes 200
 
 prints, per environment, how many rungs keep a share inside their 95 % interval, and the rungs that
-do not. Rungs of a kind share their seeds, so that those outside come in groups. The exit code is 1
-where fewer than nine in ten are inside.
+do not. Each interval is widened by 1.96 standard errors of the fresh mean, so that fewer than one
+in twenty are outside by chance. Rungs of a kind share their seeds: those outside come in groups.
+The exit code is 1 where fewer than nine in ten are inside.
 """
 
 import argparse

@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.bootstrap import bootstrap_weights
 from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.paper.claims import changed, rulings
 from oodd_eval.paper.estimates import Estimate, Estimator, Side, compute
 from oodd_eval.paper.experiments import (
     EXPERIMENTS,
@@ -279,9 +281,24 @@ def test_another_reproduction_stands_beside_in_tables_and_claims(tmp_path):
     (titles,) = [c for c in lines if c and c[0] == "Claim"]
     column = titles.index("On mild")
     (claim,) = [c for c in lines if c and c[0] == "RIQN has a higher AUC than RF, Δ = 1"]
-    assert "Verdicts that differ:" in page
+    assert "Verdicts that differ: " in page
     assert claim[column] == "not run; not run"
     assert claim[column - 2].startswith("undecided")  # two environments of seven
+
+
+def test_verdicts_that_differ_are_counted():
+    made = rulings(Estimator(everywhere("riqn", [0.8, 0.6], environments=ENVIRONMENTS)), None)
+    claims = {
+        (r.claim.id, kind): {"verdict": judged.verdict}
+        for r in made for kind, judged in (("paper", r.own), ("fair", r.fair)) if judged
+    }  # fmt: skip
+    other = Other("mild", {}, claims, None)
+    counts = re.match(r"0 of (\d+) by the paper's measures, 0 of (\d+) ", changed(made, other))
+    open_ = [r for r in made if not r.claim.settled and r.own.verdict != "not run"]
+    assert len(open_) == int(counts[1]) > 1
+    for r, verdict in zip(open_[:2], ("turned", "not run"), strict=True):
+        claims[r.claim.id, "paper"] = {"verdict": verdict}
+    assert changed(made, other).startswith(f"1 of {len(open_) - 1} by the paper's measures, 0 of")
 
 
 def test_nothing_missing_is_printed_as_zero(tmp_path):

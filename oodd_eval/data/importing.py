@@ -33,7 +33,7 @@ from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import check_known
 
 IMPORTED: Final = "imported"
-"""What stands in a manifest in place of the recipe and of the policy's digest."""
+"""Word that a manifest has in place of the recipe and of the policy's digest."""
 
 MOST_EPISODES: Final = 200_000
 

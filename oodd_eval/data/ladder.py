@@ -1,8 +1,8 @@
 """Strengths of anomalies by what they cost the policy: the rungs of the suite ladder.
 
-``ladder.json`` is written by ``oodd-eval data calibrate``. A rung ``kept90`` is the strength at
-which the policy keeps .90 of its nominal return; ``4th``, ``16th`` and ``64th`` are these parts of
-the strength of ``kept99``: they cost nothing yet.
+``ladder.json`` is written by ``oodd-eval data calibrate``. A rung ``kept90`` is the measured
+strength at which the policy keeps nearest to .90 of its nominal return. ``4th``, ``16th`` and
+``64th`` are these parts of the strength of ``kept99``: they cost nothing yet.
 """
 
 import functools
@@ -79,8 +79,9 @@ def _entry(environment: str, kind: str) -> Mapping[str, Any]:
 def rungs_of(environment: str, kind: str) -> dict[str, Rung]:
     """Return the rungs of a kind in an environment by name, weakest first.
 
-    Levels that the largest sensible strength does not reach share one rung, that of the highest of
-    them. `SplitError` where nothing is calibrated.
+    Levels to which the same strength is nearest share one rung, that of the highest of them; so do
+    those that the largest sensible strength does not reach. `SplitError` where nothing is
+    calibrated.
     """
     return {name: Rung(**rung) for name, rung in _entry(environment, kind)["rungs"].items()}
 

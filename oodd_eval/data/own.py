@@ -112,7 +112,7 @@ OwnSpec = EnvironmentSpec | AnomalySpec
 
 
 class Measured(NamedTuple):
-    """What nominal rows show: the spread of each sensor, and the sensors that may break."""
+    """The spread of each sensor in nominal rows, and the numbers of the sensors that may break."""
 
     spread: tuple[float, ...]
     sensors: tuple[int, ...]
@@ -130,7 +130,7 @@ _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
 _infos: Final[dict[str, EnvironmentInfo]] = {}
 MEASURED: Final[dict[str, Measured]] = {}
-"""What recording has measured of environments of one's own, by name."""
+"""Spreads and sensors of environments of one's own, by name; recording measures them."""
 
 
 def check_spec(spec: EnvironmentSpec | AnomalySpec) -> None:

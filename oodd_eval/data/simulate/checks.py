@@ -27,7 +27,7 @@ SLACK: Final = 0.9  # a stronger anomaly may seem this much weaker: trajectories
 
 @dataclass(frozen=True)
 class Subject:
-    """What is checked: an environment, and a kind of anomaly in it unless that is empty."""
+    """An environment to check, and a kind of anomaly in it; an empty kind is none."""
 
     environment: str
     kind: str = ""
@@ -39,7 +39,7 @@ class Subject:
 
     @functools.cached_property
     def setup(self) -> Setup:
-        """What all episodes have in common; the sensors have been measured."""
+        """The policy and limits of all episodes; their sensors are measured first."""
         measure(self.environment, self.policy)
         return Setup(self.environment, self.policy)
 

@@ -43,7 +43,7 @@ EVALUATION_SEED: Final = 900_000_000  # outside every split and training
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What all episodes of an environment have in common.
+    """The policy, the cap and the noise of all episodes of an environment.
 
     `episode_cap` is the longest episode in transitions, None for the simulator's own limit; `noise`
     is that of every sensor in every row, in shares of the sensor's spread.
