@@ -27,6 +27,11 @@ with warnings.catch_warnings(), contextlib.suppress(ImportError):
     import Box2D  # noqa: F401
 
 
+def pytest_addoption(parser):
+    """Add the option that turns seconds of random attacks into hours."""
+    parser.addoption("--long", action="store_true", help="random attacks: many thousands of them")
+
+
 @pytest.fixture(scope="session")
 def tiny_split(tmp_path_factory):
     """Directory of a synthetic split with two environments; tests must not write to it."""

@@ -1,0 +1,24 @@
+"""How many attacks there are, by family, and how many of them broke something.
+
+``pytest tests/attacks`` runs them all; with ``--long``, for hours instead of seconds.
+"""
+
+from collections import Counter
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print the count: a case is one test of this directory, its family is its module."""
+    held, broke = Counter(), Counter()
+    for outcome, count in (("passed", held), ("failed", broke), ("error", broke)):
+        for report in terminalreporter.stats.get(outcome, ()):
+            path, _, _ = report.nodeid.partition("::")
+            if "tests/attacks/" in path:
+                count[path.rpartition("/test_")[2].removesuffix(".py")] += 1
+    if held or broke:
+        terminalreporter.section("attacks")
+    for family in sorted(held | broke):
+        tried = held[family] + broke[family]
+        terminalreporter.line(f"{family:12} {tried:4} cases, {broke[family]} broke something")
+    if held or broke:
+        tried = held.total() + broke.total()
+        terminalreporter.line(f"{'all':12} {tried:4} cases, {broke.total()} broke something")
