@@ -12,6 +12,7 @@ from helpers_records import make_record
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard.entry import EntryInfo, read_entries
+from oodd_eval.leaderboard.grants import Grant, digest_of, read_grants, write_grants
 from oodd_eval.leaderboard.sections import graded_sections, sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
@@ -29,8 +30,8 @@ SIMILAR = {"delay_censored_null": "delay_null", "missed_null": "missed"}
 """Metrics without a level whose numbers stand in for guaranteed alarms; otherwise ``far_twin``."""
 
 
-def write_entry(root, identity, records, *, curves=(), **fields):
-    """Write one entry; `curves` names the detectors whose cells get some."""
+def write_entry(root, identity, records, *, curves=(), trust="reported", **fields):
+    """Write one entry and grant it its trust; `curves` names detectors whose cells get some."""
     directory = root / identity
     directory.mkdir(parents=True)
     lines = [record.to_json() + "\n" for record in records]
@@ -41,14 +42,18 @@ def write_entry(root, identity, records, *, curves=(), **fields):
     first = records[0]
     given = {
         "title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
-        "url": "https://example.org/page", "trust": "reported", "created": "2026-11-21",
+        "url": "https://example.org/page", "created": "2026-11-21",
         "command": "oodd-eval run --detector all", "caption": "", "plugins": [],
     } | fields  # fmt: skip
     entry = EntryInfo(
         id=identity, detectors=sorted({r.detector for r in records}), split=first.split,
         split_digest=first.split_digest, protocol=first.protocol, environment={}, **given,
     )  # fmt: skip
-    (directory / "entry.json").write_text(entry.to_json(), encoding="utf-8")
+    text = entry.to_json()
+    (directory / "entry.json").write_text(text, encoding="utf-8")
+    if trust != "reported":
+        given = Grant(digest_of(text.encode()), trust, "C. Hecker", "2026-11-22", "fresh seeds")
+        write_grants(root, read_grants(root) | {identity: given})
 
 
 GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
@@ -119,6 +124,7 @@ SKILLS = {"riqn": 0.9, "rf": 0.7, "persistence": 0.55, "clock": 0.5}
 
 def example(root):
     """Three entries on two boards: two environments, four anomalies, horizons, a failure, seeds."""
+    root = root / "results"
     rng = np.random.default_rng(0)
     cells = [(e, a) for e in ("cartpole", "hopper") for a in ("iid", "drift", "gravity",
                                                               "components")]  # fmt: skip

@@ -15,6 +15,7 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
+from oodd_eval.leaderboard.grants import Grant
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results.identity import Setting
@@ -78,10 +79,10 @@ def board():
     return records
 
 
-def entry(name, records, **meta):
+def entry(name, records, trust="reported", **meta):
     first = records[0]
     given = {
-        "title": "An entry", "citation": "", "url": "", "trust": "reported", "caption": "",
+        "title": "An entry", "citation": "", "url": "", "caption": "",
         "command": f"oodd-eval run --detector {name} --env all", "submitter": "Somebody",
     }  # fmt: skip
     about = EntryInfo(
@@ -92,7 +93,8 @@ def entry(name, records, **meta):
         environment={"python": "3.11.7", "platform": "Linux", "packages": {"numpy": "2.4.6"}},
         **given | meta,
     )  # fmt: skip
-    return SubmittedEntry(Path(name), about, records)
+    grant = None if trust == "reported" else Grant("", trust, "us", "2026-11-22", "fresh seeds")
+    return SubmittedEntry(Path(name), about, records, grant)
 
 
 def entries():
@@ -104,7 +106,7 @@ def entries():
     return [
         entry("reference", others, caption="Reduced: one network | all sensors.",
               citation="Danesh & Fern 2021", url="https://example.org/riqn"),
-        entry("trivial", trivial, trust="re-run", rerun={"by": "us", "how": "fresh seeds"}),
+        entry("trivial", trivial, trust="re-run"),
         entry("other-split", other_split),
     ]  # fmt: skip
 
@@ -512,33 +514,24 @@ def test_nothing_depends_on_the_order_of_entries_or_records():
 
 def test_a_cell_in_two_entries_is_refused():
     twice = [entry("first", board()), entry("second", board()[:1])]
-    with pytest.raises(ResultsError, match=r"'first' and 'second' both hold mini/ant/iid::riqn"):
+    with pytest.raises(ResultsError, match=r"'first' and 'second' both hold row 'riqn'"):
         sections(twice)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("plugin", "oodd-x:x"),
-        ("detector_version", "2.0"),
-        ("parameters", {"members": 9}),
-        ("plugin_source", "other"),
-    ],
-)
-def test_a_row_of_two_different_things_is_refused(field, value):
-    one = record("riqn", [0.5] * SEEDS)
-    other = dataclasses.replace(record("riqn", [0.5] * SEEDS, environment="ant"), **{field: value})
-    with pytest.raises(ResultsError, match=r"row 'riqn' .* in entry 'first' .* in entry 'second'"):
-        sections([entry("first", [one]), entry("second", [other])])
-
-
-def test_further_seeds_from_another_entry_join_their_row_with_the_lowest_trust():
+def test_further_seeds_of_a_row_from_another_entry_are_refused():
     first = entry("first", [record("riqn", [0.5] * SEEDS)], trust="re-run")
-    second = entry("second", [record("riqn", [0.7] * SEEDS, seed=1)], trust="re-scored")
+    second = entry("second", [record("riqn", [0.7] * SEEDS, seed=1)])
+    with pytest.raises(ResultsError, match="'first' and 'second' both hold row 'riqn'"):
+        sections([first, second])
+
+
+def test_a_row_has_the_trust_of_its_entry():
+    first = entry("first", [record("riqn", [0.5] * SEEDS)], trust="re-run")
+    second = entry("second", [record("rf", [0.7] * SEEDS)])
     (section,) = sections([first, second])
-    (standing,) = section.ranks.standings
-    assert standing.seeds == 2
-    assert section.trust == {standing.entry: "re-scored"}
+    assert {row.detector: level for row, level in section.trust.items()} == {
+        "riqn": "re-run", "rf": "reported",
+    }  # fmt: skip
 
 
 def test_two_rows_with_the_same_name_are_refused():

@@ -92,14 +92,14 @@ def test_placeholders_in_names_stay_as_they_are(tmp_path):
     record = helpers_site.describe(helpers_site.make_record("riqn", reason="@style@"))
     helpers_site.write_entry(tmp_path, "one", [record], caption="@script@ @data@")
     page = page_of(read_entries(tmp_path))
-    assert embedded(page)["boards"][0]["rows"][0]["entries"][0]["caption"] == "@script@ @data@"
+    assert embedded(page)["boards"][0]["rows"][0]["entry"]["caption"] == "@script@ @data@"
 
 
 def test_markup_in_an_entry_cannot_end_the_data(tmp_path):
     evil = "</script><script>alert(1)</script><!-- <b> & \u2028"
     helpers_site.write_entry(tmp_path, "one", [helpers_site.make_record()], caption=evil)
     page = page_of(read_entries(tmp_path))
-    assert embedded(page)["boards"][0]["rows"][0]["entries"][0]["caption"] == evil
+    assert embedded(page)["boards"][0]["rows"][0]["entry"]["caption"] == evil
     assert "alert(1)" not in re.sub(r'<script type="application/json".*?</script>', "", page,
                                     flags=re.DOTALL)  # fmt: skip
     # As many elements as parts: data and script; this entry has no curves.
@@ -174,7 +174,7 @@ def test_a_row_says_what_it_is(page):
     found = row(embedded(page), "riqn[h=10]")
     assert (found["horizon"], found["inputs"], found["trivial"]) == (10, "observations+actions", 0)
     assert found["cost"] == {"fit": 2.5, "step": 50, "peak": 150}
-    assert found["entries"][0]["caption"] == "Three members instead of five."
+    assert found["entry"]["caption"] == "Three members instead of five."
     assert row(embedded(page), "clock")["trivial"] is True
     assert row(embedded(page), "rf")["seeds"] == [0, 1]
 
@@ -328,20 +328,21 @@ def test_a_board_on_which_everything_failed_has_its_metrics(tmp_path):
     assert set(METRICS) == set(data["metrics"])
 
 
-def test_an_entry_says_who_ran_it_again_and_on_which_source(tmp_path):
+def test_an_entry_says_who_granted_its_trust_and_its_source(tmp_path):
     record = helpers_site.make_record()
     named = {"distribution": "oodd-eval", "plugin": "riqn", "version": "1"}
     plugins = [
         {"distribution": "oodd-x", "plugin": "x", "version": "2", "source_digest": "ef" * 32},
         named | {"source_digest": "12" * 32},
     ]
-    again = {"by": "C. Hecker", "how": "fresh seeds"}
-    helpers_site.write_entry(
-        tmp_path, "one", [record], trust="re-run", rerun=again, plugins=plugins
-    )
-    (entry,) = row(site_data(sections(read_entries(tmp_path)))[0], "riqn")["entries"]
-    assert entry["rerun"] == again
-    assert entry["source_digest"] == "12" * 32
+    root = tmp_path / "results"
+    helpers_site.write_entry(root, "one", [record], trust="re-run", plugins=plugins)
+    found = row(site_data(sections(read_entries(root)))[0], "riqn")
+    assert found["trust"] == "re-run"
+    assert found["entry"]["grant"] == {
+        "by": "C. Hecker", "day": "2026-11-22", "how": "fresh seeds",
+    }  # fmt: skip
+    assert found["entry"]["source_digest"] == "12" * 32
 
 
 # -- curves as the page keeps them ----------------------------------------------------------------

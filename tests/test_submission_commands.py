@@ -86,7 +86,7 @@ def test_a_cell_that_another_entry_has_is_refused(submissions, tmp_path, capsys)
     assert submit(submissions, tmp_path, "--detector", "random") == 0
     assert submit(submissions, tmp_path, "--id", "both") == 1
     out = capsys.readouterr().out
-    assert "cell: is in entry random-small too" in out
+    assert "cell: is of a row of entry random-small too" in out
     assert "nothing was written" in out
     assert [p.name for p in tmp_path.iterdir()] == ["random-small"]
 
@@ -109,19 +109,14 @@ def test_an_id_is_a_plain_name(submissions, tmp_path, name, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_re_scored_is_claimed_with_scores_alone(submissions, tmp_path, capsys):
-    claim = ("--detector", "random", "--trust")
-    assert submit(submissions, tmp_path, *claim, "re-scored") == 1
-    assert "trust: is 're-scored', but scores are not there" in capsys.readouterr().out
-    assert submit(submissions, tmp_path, *claim, "re-scored", "--scores", "--id", "a") == 0
-    (entry,) = read_entries(tmp_path)
-    assert entry.meta.trust == "re-scored"
+def test_nobody_claims_a_level_of_trust(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--trust", "re-scored") == 4
+    assert "--trust" in capsys.readouterr().err
+
+
+def test_scores_are_recomputed_when_they_are_submitted(submissions, tmp_path, capsys):
+    assert submit(submissions, tmp_path, "--detector", "random", "--scores") == 0
     assert "trust level established here: re-scored" in capsys.readouterr().out
-
-
-def test_nobody_grants_their_own_submission_a_run_again(submissions, tmp_path, capsys):
-    assert submit(submissions, tmp_path, "--trust", "re-run") == 4
-    assert "invalid choice: 're-run'" in capsys.readouterr().err
 
 
 def test_limited_results_are_no_entry(submissions, tmp_path, capsys):
@@ -268,5 +263,5 @@ print("LOADED", sorted(loaded & known), code)
         env=os.environ | {"PYTHONPATH": path},
     )  # fmt: skip
     assert done.stdout.splitlines()[-1] == "LOADED [] 0", done.stdout + done.stderr
-    assert "every metric was recomputed" in done.stdout
+    assert "established here: re-scored" in done.stdout
     assert not marker.exists()

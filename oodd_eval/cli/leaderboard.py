@@ -13,7 +13,8 @@ from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.entry import ENTRY, read_entries
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.grants import GRANTS
 from oodd_eval.leaderboard.sections import graded_sections
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
@@ -45,7 +46,7 @@ def define(parser: Parser) -> None:
     add("--split", metavar="PATH", help=SPLIT)
     add("--rerun", metavar="DIR", help="results of a run of your own to compare one entry with")
     add("--grant", default="", metavar="NAME",
-        help="write the trust level that was reached into the entry, in this name")
+        help=f"write the trust level that was reached into {GRANTS}, in this name")
     add = action("submit", "write an entry from a results directory").options(
         submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
     )
@@ -71,8 +72,6 @@ def define(parser: Parser) -> None:
     add("--scores", action="store_true",
         help="include every score, so that others can recompute the metrics")
     add("--split", metavar="PATH", help=SPLIT)
-    add("--trust", default="reported", choices=("reported", "re-scored"),
-        help="trust level to claim; re-scored needs --scores (default: reported)")
     add("--curves", default="rows", choices=("rows", "detectors", "none"),
         help="curves for the site: of every row, of each detector's plainest row, or none "
              "(default: rows)")
@@ -106,7 +105,7 @@ def build(options: argparse.Namespace) -> int:
 def submit(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard submit``; 1 when what was written did not pass."""
     options.citation = " ".join(options.citation.split())
-    texts = ("id", "title", "submitter", "citation", "url", "caption", "trust", "primary")
+    texts = ("id", "title", "submitter", "citation", "url", "caption", "primary")
     statement = submission.Statement(**{name: getattr(options, name) for name in texts})
     chosen = ("detectors", "cells", "complete", "scores", "curves", "split")
     how = {name: getattr(options, name) for name in chosen}
@@ -151,7 +150,8 @@ def verify(options: argparse.Namespace) -> int:
         if len(verdicts) > 1:
             raise UsageError("--grant is for one entry: name it, not the directory of entries")
         granted = grant(Path(options.paths[0]), verdicts[0], options.grant)
-        console.print(f"{granted.id}: trust {granted.trust} is written to its {ENTRY}")
+        place = Path(options.paths[0]).absolute().parents[1] / GRANTS
+        console.print(f"{verdicts[0].name}: trust {granted.trust} is written to {place}")
         return 0
     refused = sum(not verdict.ok for verdict in verdicts)
     if len(verdicts) > 1:
@@ -164,7 +164,7 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
         cells = f"{len(verdict.records)} cells of {', '.join(entry.detectors)}"
-        console.print(f"{verdict.name}: valid, {cells} on {entry.split}, trust {entry.trust}")
+        console.print(f"{verdict.name}: valid, {cells} on {entry.split}, trust {verdict.trust}")
         if verdict.rerun is not None or verdict.rescored:
             console.print(f"  trust level established here: {verdict.reached}")
     else:

@@ -194,7 +194,8 @@ def _as_in_the_paper(board: Board) -> list[Table]:
 def _entry(entry: SubmittedEntry) -> str:
     """Return who submitted an entry, and all that is known of how it was made."""
     meta = entry.meta
-    rerun = f", by {meta.rerun.get('by', '')}: {meta.rerun.get('how', '')}" if meta.rerun else ""
+    grant = entry.grant
+    granted = f", by {grant.by} on {grant.day}: {grant.how}" if grant else ""
     shown = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
     plugins = [shown.format(**plugin) for plugin in meta.plugins]
     packages = meta.environment.get("packages", {})
@@ -204,7 +205,7 @@ def _entry(entry: SubmittedEntry) -> str:
         ("Detectors", ", ".join(sorted(meta.detectors))),
         ("Split", f"{meta.split}, digest {meta.split_digest[:12]}, protocol {meta.protocol}"),
         ("Submitted by", f"{meta.submitter or 'nobody named'}, {meta.created}"),
-        ("Trust level", f"{meta.trust}{rerun}"),
+        ("Trust level", f"{entry.trust}{granted}"),
         ("Citation", meta.citation),
         ("Plug-ins", "; ".join(plugins)),
         ("Platform", f"{python}, {meta.environment.get('platform', '')}"),

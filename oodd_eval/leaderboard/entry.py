@@ -17,24 +17,22 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Final
 
 from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
+from oodd_eval.leaderboard.grants import Grant, Trust, digest_of, read_grants
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.identity import Cell
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
-SCHEMA: Final = 1  # version of the layout of an entry; a reader refuses others
+SCHEMA: Final = 2  # version of the layout of an entry; a reader refuses others
 
 ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
 SCORES: Final = "scores"
-
-Trust = Literal["reported", "re-scored", "re-run"]
-TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest first
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +43,8 @@ class EntryInfo:
     all but the title may be empty, like the command that made the records. Detectors, sorted, split
     and protocol are those of the records. `plugins` have ``distribution``, ``plugin``, ``version``
     and ``source_digest``, the `environment` ``python``, ``platform`` and ``packages``; `primary`
-    are the rows that are ranked for their detectors, as `Setting` writes them; `rerun` has ``by``
-    and ``how`` where the trust is ``"re-run"``. `files` has ``sha256`` and ``bytes`` of all other
-    files by relative name.
+    are the rows that are ranked for their detectors, as `Setting` writes them. `files` has
+    ``sha256`` and ``bytes`` of all other files by relative name.
     """
 
     id: str
@@ -56,7 +53,6 @@ class EntryInfo:
     submitter: str
     citation: str
     url: str
-    trust: Trust
     split: str
     split_digest: str
     protocol: int
@@ -66,7 +62,6 @@ class EntryInfo:
     command: str
     caption: str
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
-    rerun: dict[str, str] | None = None
     primary: list[str] = field(default_factory=list)
     schema: int = SCHEMA
 
@@ -79,11 +74,17 @@ class EntryInfo:
 
 @dataclass(frozen=True, slots=True)
 class SubmittedEntry:
-    """An entry that was read: `meta` is ``entry.json``, `path` its directory."""
+    """An entry that was read: `meta` is ``entry.json``, `path` its directory, `grant` its trust."""
 
     path: Path
     meta: EntryInfo
     records: list[Record]
+    grant: Grant | None = None
+
+    @property
+    def trust(self) -> Trust:
+        """The level of trust that was granted."""
+        return self.grant.trust if self.grant else "reported"
 
     @property
     def curves(self) -> Path | None:
@@ -95,7 +96,8 @@ def read_entry(path: Path | str) -> SubmittedEntry:
     """Read the entry in a directory; ResultsError when it cannot be read."""
     file = Path(path) / ENTRY
     try:
-        meta = TypeAdapter(EntryInfo).validate_json(file.read_bytes())
+        content = file.read_bytes()
+        meta = TypeAdapter(EntryInfo).validate_json(content)
     except OSError as error:
         raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
     except ValidationError as error:
@@ -107,7 +109,9 @@ def read_entry(path: Path | str) -> SubmittedEntry:
             f"{str(file)!r}: schema is {meta.schema}, expected {SCHEMA}: it was written by another "
             "version of oodd-eval"
         )
-    return SubmittedEntry(file.parent, meta, ResultsDirectory(path).records())
+    grant = read_grants(file.absolute().parents[1]).get(meta.id)
+    granted = grant if grant and grant.entry == digest_of(content) else None
+    return SubmittedEntry(file.parent, meta, ResultsDirectory(path).records(), granted)
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
@@ -122,9 +126,9 @@ def read_entries(root: Path | str) -> list[SubmittedEntry]:
     return [read_entry(path) for path in found]
 
 
-def place_of(record: Record) -> tuple[Cell, str, int, int | None]:
-    """Return the place on the leaderboard that only one record may have."""
-    return record.cell, record.split_digest, record.protocol, record.limit
+def row_of(record: Record) -> tuple[Setting, str, int, int | None]:
+    """Return the row of the leaderboard that a record is of, which only one entry may have."""
+    return record.setting, record.split_digest, record.protocol, record.limit
 
 
 def recorded_versions(records: Iterable[Record]) -> dict[str, str]:

@@ -1,14 +1,14 @@
 """Entries sorted into the boards of the leaderboard."""
 
-import itertools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard.entry import TRUST, SubmittedEntry, Trust, place_of
+from oodd_eval.leaderboard.entry import SubmittedEntry, row_of
+from oodd_eval.leaderboard.grants import Trust
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -17,7 +17,6 @@ from oodd_eval.results.tables.board import (
     Board,
     RankedBoard,
     boards,
-    grouped,
     primary_settings,
     ranked,
 )
@@ -32,17 +31,16 @@ _SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
 
 @dataclass(frozen=True, slots=True)
 class LeaderboardSection:
-    """One board with its ranking, its entries by id, and by row the entries it is from."""
+    """One board with its ranking, its entries by id, and by row the entry it is from."""
 
     ranks: RankedBoard
     entries: list[SubmittedEntry]
-    sources: dict[Setting, list[SubmittedEntry]]
+    sources: dict[Setting, SubmittedEntry]
 
     @property
     def trust(self) -> dict[Setting, Trust]:
-        """Trust level by row: the lowest of its entries."""
-        levels = {row: {e.meta.trust for e in own} for row, own in self.sources.items()}
-        return {row: min(own, key=TRUST.index) for row, own in levels.items()}
+        """Trust level by row: that of its entry."""
+        return {row: entry.trust for row, entry in self.sources.items()}
 
     @property
     def name(self) -> str:
@@ -88,38 +86,30 @@ def graded_sections(place: Path) -> list[GradedSection]:
 def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     """Sort entries, in any order, into boards of one split digest, protocol and limit each.
 
-    Several entries may have records in one row (further seeds or environments of a detector) as
-    long as they are results of the same thing: the same plug-in, version, source and parameters.
+    A row is of one entry: further seeds or environments of it from another one are refused, as
+    nobody could tell whose numbers its means are.
     """
     owners: dict[object, SubmittedEntry] = {}
     records: list[Record] = []
     for entry in sorted(entries, key=lambda entry: entry.meta.id):
         for record in entry.records:
-            if (other := owners.setdefault(place_of(record), entry)) is not entry:
+            if (other := owners.setdefault(row_of(record), entry)) is not entry:
                 raise ResultsError(
-                    f"entries {other.meta.id!r} and {entry.meta.id!r} both hold {record.cell} of "
-                    f"split digest {record.split_digest[:12]}, expected one: remove the entry that "
-                    "is replaced, or give the detector another name"
+                    f"entries {other.meta.id!r} and {entry.meta.id!r} both hold row "
+                    f"{str(record.setting)!r} of split digest {record.split_digest[:12]}, expected "
+                    "one: remove the entry that is replaced, or give the detector another name"
                 )
             records.append(record)
-
-    def entries_of(own: Iterable[Record]) -> list[SubmittedEntry]:
-        found = {entry.meta.id: entry for entry in (owners[place_of(r)] for r in own)}
-        return [found[name] for name in sorted(found)]
-
     found = []
     for board in boards(records):
-        rows = grouped(board.records, lambda r: r.setting)
-        _refuse_mixtures(rows, owners)
-        sources = {row: entries_of(own) for row, own in rows.items()}
+        sources = {r.setting: owners[row_of(r)] for r in board.records}
         ranks = ranked(board.records, _primary(board.records, sources))
-        found.append(LeaderboardSection(ranks, entries_of(board.records), sources))
+        own = {entry.meta.id: entry for entry in sources.values()}
+        found.append(LeaderboardSection(ranks, [own[name] for name in sorted(own)], sources))
     return sorted(found, key=lambda section: section.place)
 
 
-def _primary(
-    records: Sequence[Record], sources: Mapping[Setting, Sequence[SubmittedEntry]]
-) -> set[Setting]:
+def _primary(records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry]) -> set[Setting]:
     """Return the primary row of each detector: what its entry declares, else the usual one.
 
     A declared row takes the place of another. So the entry has to be the only one with rows of the
@@ -130,11 +120,11 @@ def _primary(
     for r in records:
         cells.setdefault(r.setting, set()).add(r.place)
     declared: dict[str, Setting] = {}
-    for row, entry in ((row, entry) for row, own in sources.items() for entry in own):
+    for row, entry in sources.items():
         if str(row) not in entry.meta.primary:
             continue
         name = f"entry {entry.meta.id!r} declares {str(row)!r} as the primary row of {row.detector}"
-        for other in (e for r in sources if r.detector == row.detector for e in sources[r]):
+        for other in (sources[r] for r in sources if r.detector == row.detector):
             if other is not entry:
                 raise ResultsError(
                     f"{name}, but entry {other.meta.id!r} has rows of it, too: only an entry with "
@@ -149,20 +139,3 @@ def _primary(
             )
         found[row.detector] = row
     return set(found.values())
-
-
-def _refuse_mixtures(
-    rows: Mapping[Setting, Sequence[Record]], owners: Mapping[object, SubmittedEntry]
-) -> None:
-    """Refuse rows whose records are not of one plug-in, version, source and parameters."""
-    fields = ("plugin", "detector_version", "plugin_source", "parameters")
-    for row, (first, *others) in rows.items():
-        for record, field in itertools.product(others, fields):
-            its, other = getattr(first, field), getattr(record, field)
-            if its != other:
-                one, two = (owners[place_of(r)].meta.id for r in (first, record))
-                raise ResultsError(
-                    f"row {str(row)!r} of split digest {record.split_digest[:12]} has {field} "
-                    f"{its!r} in entry {one!r} and {other!r} in entry {two!r}, expected one thing "
-                    "per row: remove the entry that is replaced, or give the detector another name"
-                )

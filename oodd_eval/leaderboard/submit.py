@@ -14,7 +14,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.data.files import compress_large, digests
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
-from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo, Trust
+from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
 from oodd_eval.leaderboard.verify import Seen, check_clashes, find_split, formats, verify_entry
 from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.leaderboard.verify.scores import first_seeds
@@ -41,7 +41,6 @@ class Statement:
     citation: str = ""
     url: str = ""
     caption: str = ""
-    trust: Trust = "reported"
     primary: tuple[str, ...] = ()
 
 

@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
-from oodd_eval.leaderboard.entry import EntryInfo
+from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
 from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell
@@ -41,8 +41,7 @@ WITH_INTERVALS: Final = (
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
 ENTRY_FIELDS: Final = (
-    "id", "title", "submitter", "trust", "rerun", "created", "citation", "url", "caption",
-    "command",
+    "id", "title", "submitter", "created", "citation", "url", "caption", "command",
 )  # fmt: skip
 """Fields of an entry that the site shows."""
 
@@ -145,8 +144,8 @@ def _row(
     chosen: Mapping[str, Sequence[SelectedCell]], units: Units, curves: list[Json],
 ) -> Json:  # fmt: skip
     row, records = standing.entry, standing.records
-    sources = [source.meta for source in section.sources[row]]
-    own = _curves([u for meta in sources for u in units.get(meta.id, [])], records)
+    source = section.sources[row]
+    own = _curves(units.get(source.meta.id, []), records)
     if own:
         curves.append(own)
     in_order = sorted(records, key=lambda r: (_ORDER[r.environment, r.anomaly], r.seed))
@@ -160,16 +159,20 @@ def _row(
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
         "trust": section.trust[row],
-        "entries": [_entry(meta, records[0].plugin) for meta in sources],
+        "entry": _entry(source, records[0].plugin),
         "cells": [_cell(r, names) for r in in_order],
         "intervals": _intervals(records, names, chosen), "curves": len(curves) - 1 if own else None,
     }  # fmt: skip
 
 
-def _entry(meta: EntryInfo, plugin: str) -> Json:
+def _entry(entry: SubmittedEntry, plugin: str) -> Json:
     """Return who an entry is from, and the digest of the plug-in's source that it names."""
+    meta, grant = entry.meta, entry.grant
     digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in meta.plugins[::-1]}
-    return _fields(meta, *ENTRY_FIELDS) | {"source_digest": digests.get(plugin, "")}
+    return _fields(meta, *ENTRY_FIELDS) | {
+        "source_digest": digests.get(plugin, ""),
+        "grant": grant and _fields(grant, "by", "day", "how"),
+    }  # fmt: skip
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:

@@ -7,8 +7,8 @@ records among each other, scores, and last the trajectories of the split, where 
 
 import os
 import stat
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +16,8 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import GZIP
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, place_of, recorded_versions
+from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, recorded_versions, row_of
+from oodd_eval.leaderboard.grants import GRANTS, TRUST, digest_of, read_grants
 from oodd_eval.leaderboard.verify import scores
 from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, shown
 from oodd_eval.leaderboard.verify.formats import read_info, read_records
@@ -27,11 +28,13 @@ from oodd_eval.leaderboard.verify.records import (
     check_together,
 )
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
+from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
-Seen = dict[object, tuple[str, str]]  # by cell or detector: its entry, a detector's distribution
+Seen = dict[object, tuple[str, str]]  # by row or detector: its entry, a detector's distribution
+_Numbers = dict[object, tuple[str, str]]  # by place and numbers of a cell: its entry and row
 
 
 def verify_entry(
@@ -76,25 +79,22 @@ def verify_entry(
         if scored and curves is not None and sound:
             scores.check_recomputed_curves(curves, scored, directory, opened, findings)
     again = compare_rerun(records, rerun, findings) if rerun else None
-    if entry.trust == "re-scored" and not complete:
-        message = "is 're-scored', but scores are not there, or not sound, for every record"
-        findings.refuse(ENTRY, "trust", message)
     rescored = rescored and not findings.count
-    verdict = EntryVerdict(name, findings, records, entry, rescored, again)
-    findings.notes.extend(_notes_on_trust(entry, verdict))
+    digest = digest_of(contents[ENTRY])
+    grant = read_grants(directory.absolute().parent).get(name)
+    held = grant if grant and grant.entry == digest else None
+    verdict = EntryVerdict(name, findings, records, entry, rescored, again, digest, held)
+    findings.notes.extend(_notes_on_trust(verdict))
     return verdict
 
 
 def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
-    """Check ``entry.json`` by itself: its name, its claim, and the split it names.
+    """Check ``entry.json`` by itself: its name, and the split it names.
 
     A split's name that is the benchmark's own stands for one digest only; any other split of that
     name carries the start of its digest.
     """
     findings.expect(ENTRY, "id", name, entry.id, "the name of its directory")
-    if (entry.trust == "re-run") != (entry.rerun is not None):
-        expected = "who ran it again and how" if entry.trust == "re-run" else "null"
-        findings.refuse(ENTRY, "rerun", f"must be {expected} where trust is {entry.trust!r}")
     published, split, digest = published_digests(), entry.split, entry.split_digest
     names = [known for known, its in published.items() if its == digest]
     if not digest.startswith(split.partition("@")[2]):
@@ -147,18 +147,12 @@ def find_split(name: str, digest: str, place: str | Path | None) -> tuple[Split 
     return None, f"split {split.name} here has {digests}"
 
 
-def _notes_on_trust(entry: EntryInfo, verdict: EntryVerdict) -> Iterator[str]:
-    """Compare the level of trust that an entry claims with what could be established."""
-    if entry.trust == "re-scored" and not verdict.rescored and verdict.ok:
-        yield "trust 're-scored' could not be confirmed here"
-    if entry.rerun is not None and verdict.rerun is None:
-        claim = f"by {entry.rerun['by']}: {entry.rerun['how']}"
-        said = f"trust 're-run' is what the entry says ({claim})"
-        yield f"{said}; nothing here confirms it without a run of yours (--rerun)"
-    if entry.trust == "reported" and verdict.rescored:
-        yield "every metric was recomputed from the scores: qualifies for 're-scored'"
-    if entry.trust != "re-run" and verdict.reached == "re-run":
-        yield "the run again agrees: qualifies for 're-run'"
+def _notes_on_trust(verdict: EntryVerdict) -> Iterator[str]:
+    """Say who granted the level of trust that an entry has, and which one was established here."""
+    if (held := verdict.grant) is not None:
+        yield f"{held.trust} was granted by {held.by} on {held.day}: {held.how}"
+    if verdict.reached is not None and TRUST.index(verdict.reached) > TRUST.index(verdict.trust):
+        yield f"qualifies for {verdict.reached!r} (--grant)"
 
 
 def verify(
@@ -177,27 +171,53 @@ def verify(
         return
     if rerun:
         raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")
-    stray, seen = Findings(), Seen()
+    stray, seen, numbers, digests = Findings(), Seen(), _Numbers(), {}
     for child in sorted(path.iterdir()):
         if child.is_symlink() or child.is_dir():
             verdict = verify_entry(child, split=split)
             check_clashes(verdict.name, verdict.records, seen, verdict.findings)
+            check_copies(verdict.name, verdict.records, numbers, verdict.findings)
+            digests[child.name] = verdict.digest
             yield verdict
         elif child.name not in ROOT_FILES:
             stray.refuse(plain(child.name), "", "is no entry: expected directories alone")
+    for name, grant in read_grants(path).items():
+        if digests.get(name) != grant.entry:
+            message = "is of an entry.json that is not here: verify the entry and grant it again"
+            stray.refuse(GRANTS, name, message)
     if stray.count:
         yield EntryVerdict(str(path), stray, {})
 
 
 def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -> None:
-    """Refuse what an entry in `seen` has too: a cell, or a detector's name from another place."""
+    """Refuse what an entry in `seen` has too: a row, or a detector's name from another place."""
     for where, record in records.items():
-        cell, *conditions = place_of(record)
-        other, _ = seen.setdefault((replace(cell, split=""), *conditions), (name, ""))
+        other, _ = seen.setdefault(row_of(record), (name, ""))
         if other != name:
-            message = f"is in entry {other} too: replace that one, or leave it out"
+            message = f"is of a row of entry {other} too: replace that one, or leave it out"
             findings.refuse(where, "cell", message)
         distribution = record.plugin.partition(":")[0]
         owner, known = seen.setdefault(record.detector, (name, distribution))
         why = f"as in entry {owner}: a name stands for one detector"
         findings.expect(where, "detector", f"from {known}", f"from {distribution}", why)
+
+
+def check_copies(name: str, records: Records, seen: _Numbers, findings: Findings) -> None:
+    """Refuse rows that have the numbers of another entry's row in more than half of their cells.
+
+    Cells in which all trajectories have one number say nothing, as whatever finds all has them.
+    Numbers are compared by three digits, so that changing all of them a little does not help.
+    """
+    cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
+    for record in records.values():
+        terms, row = record.per_trajectory.get(RANKING, ((), ()))[0], str(record.setting)
+        told = tuple(round(term, 3) for term in terms)
+        if len(set(told)) > 1:
+            cells[row] += 1
+            place = record.split_digest, record.environment, record.condition, told
+            entry, other = seen.setdefault(place, (name, row))
+            copied[row, entry, other] += entry != name
+    for (row, entry, other), count in copied.items():
+        if 2 * count > cells[row]:
+            message = f"has in {count} of {cells[row]} cells the numbers of {other} in {entry}"
+            findings.refuse(RECORDS, row, f"{message}: expected a detector's own")

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, Typ
 from pydantic_core import ValidationError
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
-from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo, Trust
+from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
 from oodd_eval.results import record as record_format
 from oodd_eval.results.curve_file import strict_model
@@ -134,7 +134,7 @@ Url = Annotated[str, _matching(
 FileName = Annotated[str, _matching(
     r"(?!.*\.\.)(scores/)?[a-z0-9][a-z0-9._-]{0,170}",
     "a plain name of a file, in scores/ or in the entry itself")]
-RerunBy = Annotated[str, _text(200, least=1)]
+GrantedBy = Annotated[str, _text(200, least=1)]
 Command = Annotated[str, _text(LONGEST_COMMAND), _rule(
     _is_command, "'oodd-eval run' or 'oodd-eval reproduce' with plainly quoted words, or several "
     "of these joined by ' && '")]
@@ -175,8 +175,7 @@ _PROTOCOL: Final = Annotated[int, _one_of([PROTOCOL])]
 _ENTRY: Final = strict_model(
     layout=_schema(SCHEMA), id=EntryId, title=Annotated[str, _text(120, least=1)],
     detectors=DetectorNames, submitter=Annotated[str, _text(120)],
-    citation=Annotated[str, _text(2000)], url=Url, trust=Trust,
-    rerun=strict_model(by=RerunBy, how=Annotated[str, _text(1000, least=1)]) | None,
+    citation=Annotated[str, _text(2000)], url=Url,
     split=SplitName, split_digest=Digest, protocol=_PROTOCOL,
     plugins=Annotated[list[strict_model(  # type: ignore[misc]
         distribution=Name, plugin=Name, version=Version, source_digest=Digest,

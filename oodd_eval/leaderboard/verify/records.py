@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData, TrajectorySet
 from oodd_eval.data.split import Split
-from oodd_eval.leaderboard.entry import EntryInfo, place_of
+from oodd_eval.leaderboard.entry import EntryInfo
 from oodd_eval.leaderboard.verify.files import Findings, plain, shown
 from oodd_eval.leaderboard.verify.terms import Sums, Wrong, delays_of, wrong_terms
 from oodd_eval.metrics import catalogue
@@ -203,7 +203,7 @@ def _check_rows(records: Records, findings: Findings) -> None:
     seen: dict[Any, str] = {}
     cells: dict[tuple[Setting, int], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for where, record in records.items():
-        if (other := seen.setdefault(place_of(record), where)) != where:
+        if (other := seen.setdefault(record.cell, where)) != where:
             findings.refuse(where, "cell", f"is there twice: it is that of {other} too")
         cells[record.setting, record.seed][record.environment].add(record.anomaly)
     if (rows := len({setting for setting, _ in cells})) > MOST_ROWS:

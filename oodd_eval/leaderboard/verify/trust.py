@@ -1,13 +1,13 @@
 """The verdict on an entry, and its level of trust: compared with a run again, and granted.
 
-On the entry's own split a run again gives the same numbers, or nearly so where training depends on
-the processor. On a split of fresh seeds it gives other numbers of the same kind: there two means
-may differ by what their intervals allow. Either way the code must be the same, by its digest.
+A run again is on a split of seeds that the submitter could not know. Its numbers are others of the
+same kind: differences are judged by how much they vary from environment to environment, since in
+each of them fit, calibration and episodes are drawn apart. The code must be the same, by digest.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -15,44 +15,42 @@ from typing import Final
 import numpy as np
 
 from oodd_eval.data.facts import TABLE1
-from oodd_eval.data.files import write_text
+from oodd_eval.data.split import published_digests
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import ENTRY, TRUST, EntryInfo, Trust
+from oodd_eval.leaderboard.entry import EntryInfo
+from oodd_eval.leaderboard.grants import TRUST, Grant, Trust, read_grants, write_grants
 from oodd_eval.leaderboard.verify.files import Findings
-from oodd_eval.leaderboard.verify.formats import RerunBy, complaint
-from oodd_eval.leaderboard.verify.records import Records, same
-from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, nan_mean
-from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.results.identity import Cell, Setting
+from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
+from oodd_eval.leaderboard.verify.records import Records
+from oodd_eval.metrics.auc import Floats
+from oodd_eval.metrics.binomial import t_quantile
+from oodd_eval.metrics.bootstrap import nan_mean
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import contribution
+from oodd_eval.results.tables.board import contribution, grouped
 
-TOLERANCES: Final[Mapping[str, tuple[float, float]]] = {
-    "auc_matched": (0.02, 0.0),
-    "auc": (0.02, 0.0),
-    "far_twin": (0.02, 0.0),
-    "missed": (0.05, 0.0),
-    "delay_censored": (1.0, 0.1),
-    "false_episodes_at_5pct": (0.05, 0.0),
-    "delay_censored_at_5pct": (1.0, 0.1),
-}
-"""Allowed difference of a mean over a row's cells: a number, and a share of the entry's value.
+COMPARED: Final = (
+    "auc_matched", "auc", "far_twin", "missed", "delay_censored", "false_episodes_at_5pct",
+    "delay_censored_at_5pct",
+)  # fmt: skip
+"""Metrics whose means over a row's cells have to agree with those of a run again."""
 
-Training on another processor goes another way from some rounding on, and ends like training with
-another seed does."""
+LEVEL: Final = 0.05
+"""Chance that an honest row is refused: of all `COMPARED` together (Bonferroni)."""
+
+LEAST: Final = 3
+"""Environments in which a row has to be run again, so that a difference has an interval."""
 
 _FIELDS: Final = ("detector_version", "plugin", "plugin_source", "status", "deterministic", "alarm",
                   "inputs")  # fmt: skip
 """Fields of a record that a run again has, too, on whatever seeds."""
-
-SAME_SPLIT: Final = "the same split"
 
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
     """The result of a comparison with a run again, in one line and in a line for every row.
 
-    It is confirmed when every row was run again in some environment, and all agrees.
+    It is confirmed when every row was run again in `LEAST` environments, and all agrees.
     """
 
     how: str
@@ -64,8 +62,9 @@ class Rerun:
 class EntryVerdict:
     """The result of verifying one entry.
 
-    `entry` is None when ``entry.json`` is not sound; `records` are the sound ones, by where they
-    stand; `rescored` says that every metric was recomputed from the scores and agrees.
+    `entry` is None when ``entry.json`` is not sound, `digest` is that of its bytes; `records` are
+    the sound ones, by where they stand; `rescored` says that every metric was recomputed from the
+    scores and agrees; `grant` is what maintainers have granted to just this entry.
     """
 
     name: str
@@ -74,11 +73,18 @@ class EntryVerdict:
     entry: EntryInfo | None = None
     rescored: bool = False
     rerun: Rerun | None = None
+    digest: str = ""
+    grant: Grant | None = None
 
     @property
     def ok(self) -> bool:
         """True if no problem was found."""
         return not self.findings.count
+
+    @property
+    def trust(self) -> Trust:
+        """The level of trust that was granted."""
+        return self.grant.trust if self.grant else "reported"
 
     @property
     def reached(self) -> Trust | None:
@@ -90,117 +96,122 @@ class EntryVerdict:
         return "re-scored" if self.rescored else "reported"
 
 
-_Pair = tuple[str, Record, Record]  # place of an entry's record, the record, and the new one
+_Place = tuple[Setting, str, str]  # row, environment, condition
 
 
 def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings) -> Rerun:
-    """Compare an entry's records with those of the verifier's own run, on its split or another.
+    """Compare an entry's records with those of the verifier's own run on a split of fresh seeds.
 
-    The run may be of fewer environments, and have more than the entry's cells.
+    The run may be of fewer environments and detector seeds, and have more than the entry's rows.
     """
     before = findings.count
-    pairs, place = _pairs(records, fresh, findings)
-    cells = Counter(record.setting for record in records.values())
-    rows: dict[Setting, list[_Pair]] = {setting: [] for setting in cells}
-    for pair in pairs:
-        rows[pair[1].setting].append(pair)
+    again, place = _usable(records, fresh, findings)
+    ours = grouped(records.values(), _place)
+    both = {key: (own, again[key]) for key, own in ours.items() if key in again}
     lines = []
-    for setting, own in rows.items():
-        present = {(record.environment, record.anomaly) for _, record, _ in own}
-        if not any(all((e, a) in present for a in TABLE1) for e, _ in present):
-            why = "all anomalies of an environment: run it again in one at least"
-            findings.refuse("re-run", str(setting), f"is not there with {why}")
+    for row in dict.fromkeys(row for row, _, _ in ours):
+        own = {(env, condition): pair for (r, env, condition), pair in both.items() if r == row}
+        whole = {env for env, _ in own if all((env, a) in own for a in TABLE1)}
+        if len(whole) < LEAST:
+            why = f"was run again with all anomalies in {len(whole)} environments, expected {LEAST}"
+            findings.refuse("re-run", str(row), why)
             continue
-        done = f"{setting}: {len(own)} of {cells[setting]} cells run again, {_equal(own)}"
-        differences = _differences(str(setting), own, place != SAME_SPLIT, findings)
-        lines.append("; ".join([done, *differences]))
-    for where, record, again in pairs:
-        for field in _FIELDS:
-            other = getattr(again, field)
-            findings.expect(where, field, other, getattr(record, field), "as in the run again")
-    how = f"{place}, {len(pairs)} of {len(records)} cells, {_equal(pairs)}"
+        cells = sum(key[0] == row for key in ours)
+        told = _differences(str(row), own, findings)
+        lines.append("; ".join([f"{row}: {len(own)} of {cells} cells run again", *told]))
+    for where, record in records.items():
+        for other in again.get(_place(record), ())[:1]:
+            for field in _FIELDS:
+                new, old = getattr(other, field), getattr(record, field)
+                findings.expect(where, field, new, old, "as in the run again")
+    how = f"{place}, {len(both)} of {len(ours)} cells"
     return Rerun(how, lines, confirmed=findings.count == before)
 
 
-def _equal(pairs: Iterable[_Pair]) -> str:
-    """Say how many pairs have the same values."""
-    values = [[{n: m.value for n, m in r.metrics.items()} for r in pair[1:]] for pair in pairs]
-    equal = sum(a.keys() == b.keys() and all(same(a[n], b[n]) for n in a) for a, b in values)
-    return f"{equal} with the same numbers"
+def _place(record: Record) -> _Place:
+    return record.setting, record.environment, record.condition
 
 
-def _pairs(
+def _usable(
     records: Records, fresh: Sequence[Record], findings: Findings
-) -> tuple[list[_Pair], str]:
-    """Return the cells that both have, and on what; of fresh seeds, whatever the detector's seed.
-
-    Results on the entry's own split count alone where there are any.
-    """
+) -> tuple[Mapping[_Place, list[Record]], str]:
+    """Return records of a run again by their place, and on what; none where they do not compare."""
     first = next(iter(records.values()))
+    known = {first.split_digest, *published_digests().values()}
     usable = [r for r in fresh if r.protocol == first.protocol and r.limit is None]
-    own = [r for r in usable if r.split_digest == first.split_digest]
-    splits = {r.split_digest: r.split for r in own or usable}
-    if len(splits) != 1:
+    splits = {r.split_digest: r.split for r in usable}
+    if len(splits) != 1 or known & splits.keys():
         found = ", ".join(sorted(splits.values())) or "none without --limit"
-        findings.refuse("re-run", "split", f"is {found}, expected results on one whole split")
-        return [], "nothing"
+        expected = "results on one whole split of seeds that nobody could know before"
+        findings.refuse("re-run", "split", f"is {found}, expected {expected} (data build)")
+        return {}, "nothing"
     ((digest, name),) = splits.items()
-
-    def key(record: Record) -> Cell:
-        return replace(record.cell, split="", seed=record.seed if own else 0)
-
-    again = {key(r): r for r in own or usable}
-    pairs = [(w, r, again[key(r)]) for w, r in records.items() if key(r) in again]
-    place = SAME_SPLIT if own else f"fresh seeds (split {name}, digest {digest[:12]})"
-    for _, record, other in pairs:
-        counts = record.counts
-        if any(other.counts.get(p) != counts[p] for p in counts if own or p != "test"):
-            message = f"are {other.counts} in {other.cell}, expected those of the entry, {counts}"
-            findings.refuse("re-run", "counts", message)
-            return [], place
-    return pairs, place
+    again = grouped(usable, _place)
+    for record in records.values():
+        for other in again.get(_place(record), ()):
+            for part in ("train", "calibration"):
+                if other.counts.get(part) != record.counts.get(part):
+                    message = f"are {other.counts} in {other.cell}, expected {record.counts}"
+                    findings.refuse("re-run", "counts", f"{message} but for test seeds")
+                    return {}, "nothing"
+    return again, f"fresh seeds (split {name}, digest {digest[:12]})"
 
 
 def _differences(
-    label: str, pairs: Sequence[_Pair], other_seeds: bool, findings: Findings
+    label: str,
+    cells: Mapping[tuple[str, str], tuple[list[Record], list[Record]]],
+    findings: Findings,
 ) -> Iterator[str]:
-    """Compare means over the cells of a row; yield each as text where it is not the same."""
-    both = [records for _, *records in pairs if all(record.ok for record in records)]
-    for metric, (least, share) in TOLERANCES.items():
-        if not both or any(metric not in r.per_trajectory for side in both for r in side):
+    """Compare means over paired cells of a row, as text; refuse what chance does not explain."""
+    for metric in COMPARED:
+        pairs: dict[str, list[tuple[float, float]]] = {}
+        for (environment, _), sides in cells.items():
+            pair = tuple(
+                nan_mean(contribution(r, metric).value for r in side
+                         if r.ok and metric in r.per_trajectory)
+                for side in sides
+            )  # fmt: skip
+            if not any(map(math.isnan, pair)):
+                pairs.setdefault(environment, []).append((pair[0], pair[1]))
+        means = np.array([np.mean(own, axis=0) for own in pairs.values()]).reshape(-1, 2)
+        change = means[:, 1] - means[:, 0]
+        if len(change) < 2 or not change.any():
             continue
-        sides = [
-            [drawn_cell(record.environment, 0, contribution(record, metric)) for record in side]
-            for side in zip(*both, strict=True)
-        ]
-        mine, other = (nan_mean(cell.contribution.value for cell in side) for side in sides)
-        if same(mine, other):
-            continue
-        yield f"{metric} {other:.4g} for {mine:.4g}"
-        allowed = least + share * abs(mine)
-        for side in sides if other_seeds else ():
-            low, high = mean_interval(side, kind=metric_info(metric).interval)
-            allowed += float(np.nan_to_num(high - low)) / 2
-        if not abs(other - mine) <= allowed:
-            message = f"is {other:.4g}, but {mine:.4g} in the entry: expected at most {allowed:.2g}"
-            findings.refuse("re-run", f"{label} {metric}", f"{message} between them")
+        wide, (mine, other) = by_chance(change), means.mean(axis=0)
+        environment = list(pairs)[int(np.argmax(np.abs(change)))]
+        most = f"most in {environment}, by {np.max(np.abs(change)):.2g}"
+        yield f"{metric} {other:.4g} for {mine:.4g} ({most})"
+        if abs(other - mine) > wide:
+            message = f"is {other:.4g}, but {mine:.4g} in the entry: chance explains {wide:.2g}"
+            findings.refuse("re-run", f"{label} {metric}", f"{message}, not the whole difference")
 
 
-def grant(directory: Path, verdict: EntryVerdict, by: str) -> EntryInfo:
-    """Raise an entry's level of trust to the one that its verification by somebody established."""
-    if message := complaint(RerunBy, by):
+def by_chance(change: Floats) -> float:
+    """Return by how much a mean over environments may change without a reason.
+
+    Half of Student's interval of the mean of paired differences, one an environment, at the level
+    that keeps all of `COMPARED` together to `LEVEL`.
+    """
+    n = len(change)
+    spread = float(change.std(ddof=1)) / math.sqrt(n)
+    return t_quantile(1 - LEVEL / 2 / len(COMPARED), n - 1) * spread
+
+
+def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
+    """Grant an entry the level of trust that its verification by somebody established."""
+    if message := complaint(GrantedBy, by):
         raise UsageError(f"--grant {message}")
-    entry, level = verdict.entry, verdict.reached
-    if entry is None or level is None:
+    level = verdict.reached
+    if level is None:
         raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
-    if TRUST.index(level) <= TRUST.index(entry.trust):
+    if level == "reported" or TRUST.index(level) <= TRUST.index(verdict.trust):
         raise UsageError(
-            f"--grant: {verdict.name} has trust {entry.trust!r}, and what was established here is "
-            f"{level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
+            f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
+            f"is {level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
         )
-    rerun = None
-    if level == "re-run" and verdict.rerun is not None:
-        rerun = {"by": by, "how": f"{verdict.rerun.how}, {datetime.now(UTC).date().isoformat()}"}
-    granted = replace(entry, trust=level, rerun=rerun)
-    write_text(directory / ENTRY, granted.to_json())
+    how = verdict.rerun.how if verdict.rerun else "every metric recomputed from its scores"
+    day = datetime.now(UTC).date().isoformat()
+    granted = Grant(verdict.digest, level, by, day, how)
+    results = directory.absolute().parent
+    write_grants(results, read_grants(results) | {verdict.name: granted})
     return granted

@@ -202,32 +202,31 @@ function metricsTable(board, row) {
     }))));
 }
 
-/** What the entries say of themselves. Only http addresses become links. */
+/** What the entry says of itself. Only http addresses become links. */
 function facts(row) {
   const list = (known) => element("dl", { class: "facts" }, known.filter(([, value]) => value).map(([name, value]) =>
     [element("dt", {}, name), element("dd", {}, value)]));
   const text = (value) => typeof value === "string" ? value : JSON.stringify(value);
+  const { entry } = row;
   return [
     list([
       ["Plug-in", `${row.plugin} ${row.version}`],
       ["Parameters", Object.entries(row.parameters).map(([name, value]) => `${name} = ${text(value)}`).join(", ")],
       ["Seeds", row.seeds.join(", ")],
     ]),
-    row.entries.map((entry) => [
-      element("h3", {}, entry.title || entry.id),
-      list([
-        ["Entry", entry.id],
-        ["Submitted by", entry.submitter],
-        ["Trust", `${entry.trust}: ${(TRUST[entry.trust] ?? "").toLowerCase()}`],
-        ["Run again by", entry.rerun && `${entry.rerun.by}, ${entry.rerun.how}`],
-        ["Date", entry.created],
-        ["Made by", element("code", {}, entry.command)],
-        ["Citation", entry.citation],
-        ["Address", /^https?:\/\//.test(entry.url)
-          ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],
-        ["Source digest", entry.source_digest],
-        ["Note", entry.caption],
-      ]),
+    element("h3", {}, entry.title || entry.id),
+    list([
+      ["Entry", entry.id],
+      ["Submitted by", entry.submitter],
+      ["Trust", `${row.trust}: ${(TRUST[row.trust] ?? "").toLowerCase()}`],
+      ["Granted by", entry.grant && `${entry.grant.by} on ${entry.grant.day}: ${entry.grant.how}`],
+      ["Date", entry.created],
+      ["Made by", element("code", {}, entry.command)],
+      ["Citation", entry.citation],
+      ["Address", /^https?:\/\//.test(entry.url)
+        ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],
+      ["Source digest", entry.source_digest],
+      ["Note", entry.caption],
     ]),
   ];
 }

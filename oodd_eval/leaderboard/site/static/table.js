@@ -189,9 +189,8 @@ function notesOf(board, rows) {
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
   const captions = new Map();
   for (const row of rows) {
-    for (const { caption } of row.entries) {
-      if (caption) captions.set(caption, [...(captions.get(caption) ?? []), row.label]);
-    }
+    const { caption } = row.entry;
+    if (caption) captions.set(caption, [...(captions.get(caption) ?? []), row.label]);
   }
   for (const [caption, labels] of captions) lines.push(`${labels.join(", ")}: ${caption}`);
   if (rows.some((row) => mean(board, row, "auc_matched", state).partial)) {

@@ -1,0 +1,212 @@
+"""Entries that claim trust, take another's row, or copy another's numbers."""
+
+import shutil
+
+import pytest
+from helpers_split import make_split
+from helpers_submission import Draft
+
+from oodd_eval import evaluate
+from oodd_eval.errors import ResultsError
+from oodd_eval.leaderboard.entry import read_entries, read_entry
+from oodd_eval.leaderboard.grants import GRANTS, Grant, digest_of, read_grants, write_grants
+from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.submit import Statement, submit
+from oodd_eval.leaderboard.verify import verify
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    """Entries of one honest row each, by detector."""
+    home = tmp_path_factory.mktemp("rows")
+    split = make_split(home / "split", calibration=20)
+    for detector in ("persistence", "random"):
+        evaluate(detector, split, output=home / "out")
+    return {
+        name: submit(home / "out", home / "results", Statement(), detectors=name).place
+        for name in ("persistence", "random")
+    }
+
+
+@pytest.fixture
+def board(rows, tmp_path):
+    """A directory of entries with the row ``persistence``, and room for an attacker's."""
+    results = tmp_path / "leaderboard" / "results"
+    shutil.copytree(rows["persistence"], results / rows["persistence"].name)
+    return results
+
+
+def another(rows, board, name, of="persistence", **changes):
+    """Return an attacker's entry: a copy of an honest one under another name, and changed."""
+    draft = Draft(rows[of], board.parent / "drafts")
+    draft.entry |= {"id": name} | changes
+    shutil.move(draft.path, board / name)
+    draft.path = board / name
+    return draft
+
+
+def problems(board):
+    return {v.name: [p.text for p in v.findings.problems] for v in verify(board) if not v.ok}
+
+
+def test_honest_entries_are_valid(rows, board):
+    another(rows, board, "other", of="random").write()
+    assert problems(board) == {}
+
+
+# A level of trust that an entry says of itself
+
+CLAIMS = [
+    {"trust": "re-run"}, {"trust": "re-scored"}, {"trust": "reported"}, {"rerun": None},
+    {"rerun": {"by": "us", "how": "fresh seeds"}}, {"grant": {"trust": "re-run"}},
+    {"verified": True}, {"schema": 1, "trust": "re-run", "rerun": {"by": "us", "how": "it was"}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda c: "-".join(c) + str(len(str(c))))
+def test_an_entry_cannot_claim_trust(rows, board, claim):
+    another(rows, board, "mine", of="random", **claim).write()
+    assert "mine" in problems(board)
+    with pytest.raises(ResultsError):
+        read_entries(board)
+
+
+@pytest.mark.parametrize("name", [GRANTS, "results/trust.json", "scores/trust.json"])
+def test_grants_inside_an_entry_count_nothing(rows, board, name):
+    draft = another(rows, board, "mine", of="random")
+    draft.write()
+    digest = digest_of(draft.file("entry.json").read_bytes())
+    grants = {"mine": Grant(digest, "re-run", "me", "2026-11-23", "fresh seeds")}
+    file = draft.file(name)
+    file.parent.mkdir(exist_ok=True)
+    write_grants(board, grants)
+    (board.parent / GRANTS).rename(file)
+    assert "mine" in problems(board)
+    assert read_entry(draft.path).trust == "reported"
+
+
+# A grant of other numbers
+
+CHANGES = {
+    "caption": lambda draft: draft.entry.update(caption="better now"),
+    "submitter": lambda draft: draft.entry.update(submitter="Somebody else"),
+    "record": lambda draft: draft.records[0].update(peak_rss_mb=1.0),
+    "primary": lambda draft: draft.entry.update(primary=["random"]),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_changed_entry_has_lost_its_grant(rows, board, change):
+    draft = another(rows, board, "mine", of="random")
+    draft.write()
+    digest = digest_of(draft.file("entry.json").read_bytes())
+    write_grants(board, {"mine": Grant(digest, "re-run", "us", "2026-11-23", "fresh seeds")})
+    assert read_entry(draft.path).trust == "re-run"
+    assert problems(board) == {}
+    CHANGES[change](draft)
+    draft.write()
+    assert read_entry(draft.path).trust == "reported"
+    (found,) = problems(board).values()
+    assert "verify the entry and grant it again" in found[0]
+
+
+def test_a_grant_of_an_entry_that_is_not_there_is_refused(board):
+    write_grants(board, {"gone": Grant("0" * 64, "re-run", "us", "2026-11-23", "fresh seeds")})
+    assert "is of an entry.json that is not here" in str(problems(board))
+
+
+GARBLED = {
+    "no-json": "{", "text": '"re-run"', "list": "[]", "schema": '{"schema": 2, "grants": {}}',
+    "level": '{"schema": 1, "grants": {"a": {"entry": "0", "trust": "gold", "by": "", '
+             '"day": "", "how": ""}}}',
+    "reported": '{"schema": 1, "grants": {"a": {"entry": "0", "trust": "reported", "by": "", '
+                '"day": "", "how": ""}}}',
+    "more": '{"schema": 1, "grants": {}, "all": "re-run"}', "deep": "[" * 100_000,
+    "number": '{"schema": 1, "grants": {"a": 5}}',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", GARBLED)
+def test_grants_of_another_format_are_refused(board, case):
+    (board.parent / GRANTS).write_text(GARBLED[case])
+    with pytest.raises(ResultsError, match="holds no grants"):
+        read_grants(board)
+
+
+# Another's row
+
+
+def seeded(draft):
+    for record in draft.records:
+        record["seed"] = 99
+
+
+def forged(draft):
+    seeded(draft)
+    for record in draft.records:
+        record["seconds_fit"] = 0.001
+
+
+def half(draft):
+    draft.records = draft.records[:8]
+
+
+@pytest.mark.parametrize("change", [lambda draft: None, seeded, forged, half])
+def test_a_row_of_another_entry_is_refused(rows, board, change):
+    draft = another(rows, board, "persistence-again")
+    change(draft)
+    draft.write()
+    assert any("is of a row of entry" in text for texts in problems(board).values()
+               for text in texts)  # fmt: skip
+    with pytest.raises(ResultsError, match="both hold row 'persistence'"):
+        sections(read_entries(board))
+
+
+@pytest.mark.parametrize("distribution", ["oodd-eval-x", "oodd-evil", "other"])
+def test_a_name_of_another_distribution_is_refused(rows, board, distribution):
+    draft = another(rows, board, "mine")
+    for record in draft.records:
+        record["plugin"] = f"{distribution}:trivial"
+        record["horizon"] = 3
+    draft.entry["plugins"][0]["distribution"] = distribution
+    draft.write()
+    assert "a name stands for one detector" in str(problems(board))
+
+
+# Another's numbers
+
+
+def renamed(draft):
+    draft.entry["detectors"] = ["mine"]
+    for record in draft.records:
+        record["detector"] = "mine"
+
+
+def nudged(draft):
+    """As `renamed`, with every number changed a little."""
+    renamed(draft)
+    for record in draft.records:
+        terms = record["per_trajectory"]["auc_matched"][0]
+        record["per_trajectory"]["auc_matched"][0] = [t * (1 - 1e-7) for t in terms]
+
+
+def mostly(draft):
+    """As `renamed`, with a third of the cells made different."""
+    renamed(draft)
+    for record in draft.records[::3]:
+        record["per_trajectory"]["auc_matched"][0].reverse()
+
+
+def variant(draft):
+    """As `renamed`, as a row with another horizon."""
+    renamed(draft)
+    for record in draft.records:
+        record["horizon"] = 7
+
+
+@pytest.mark.parametrize("copy", [renamed, nudged, mostly, variant])
+def test_numbers_of_another_detector_are_found(rows, board, copy):
+    draft = another(rows, board, "mine")
+    copy(draft)
+    draft.write()
+    assert "the numbers of" in str(problems(board))
