@@ -1,8 +1,9 @@
 """The verdict on an entry, and its level of trust: compared with a run again, and granted.
 
 A run again is on a split of seeds that the submitter could not know. Its numbers are others of the
-same kind: differences are judged by how much they vary from environment to environment, since in
-each of them fit, calibration and episodes are drawn apart. The code must be the same, by digest.
+same kind. An entry may be better by what chance explains, judged by how much differences vary from
+environment to environment, since in each of them fit, calibration and episodes are drawn apart. The
+code must be the same, by its digest.
 """
 
 import math
@@ -24,7 +25,8 @@ from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
 from oodd_eval.leaderboard.verify.records import Records
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.metrics.binomial import t_quantile
-from oodd_eval.metrics.bootstrap import nan_mean
+from oodd_eval.metrics.bootstrap import DrawnCell, drawn_cell, mean_interval, nan_mean
+from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.board import contribution, grouped
@@ -37,6 +39,8 @@ COMPARED: Final = (
 
 LEVEL: Final = 0.05
 """Chance that an honest row is refused: of all `COMPARED` together (Bonferroni)."""
+
+_NORMAL: Final = 1.96  # half widths of a 95 % interval in standard errors
 
 LEAST: Final = 3
 """Environments in which a row has to be run again, so that a difference has an interval."""
@@ -164,37 +168,48 @@ def _differences(
 ) -> Iterator[str]:
     """Compare means over paired cells of a row, as text; refuse what chance does not explain."""
     for metric in COMPARED:
-        pairs: dict[str, list[tuple[float, float]]] = {}
+        drawn: tuple[list[DrawnCell], list[DrawnCell]] = ([], [])
+        pairs: dict[str, list[list[float]]] = {}
         for (environment, _), sides in cells.items():
-            pair = tuple(
-                nan_mean(contribution(r, metric).value for r in side
-                         if r.ok and metric in r.per_trajectory)
+            own = [
+                [drawn_cell(environment, r.seed, contribution(r, metric))
+                 for r in side if r.ok and metric in r.per_trajectory]
                 for side in sides
-            )  # fmt: skip
+            ]  # fmt: skip
+            pair = [nan_mean(cell.contribution.value for cell in side) for side in own]
             if not any(map(math.isnan, pair)):
-                pairs.setdefault(environment, []).append((pair[0], pair[1]))
+                pairs.setdefault(environment, []).append(pair)
+                for all_of_side, one in zip(drawn, own, strict=True):
+                    all_of_side.extend(one)
         means = np.array([np.mean(own, axis=0) for own in pairs.values()]).reshape(-1, 2)
-        change = means[:, 1] - means[:, 0]
+        change = means[:, 0] - means[:, 1]
         if len(change) < 2 or not change.any():
             continue
-        wide, (mine, other) = by_chance(change), means.mean(axis=0)
+        info, (mine, other) = metric_info(metric), means.mean(axis=0)
+        ends = [mean_interval(side, kind=info.interval) for side in drawn]
+        episodes = math.hypot(
+            *(float(np.nan_to_num(high - low)) / 2 / _NORMAL for low, high in ends)
+        )
+        wide = by_chance(change, episodes)
         environment = list(pairs)[int(np.argmax(np.abs(change)))]
         most = f"most in {environment}, by {np.max(np.abs(change)):.2g}"
         yield f"{metric} {other:.4g} for {mine:.4g} ({most})"
-        if abs(other - mine) > wide:
+        if (mine - other) * (-1 if info.better == "lower" else 1) > wide:
             message = f"is {other:.4g}, but {mine:.4g} in the entry: chance explains {wide:.2g}"
             findings.refuse("re-run", f"{label} {metric}", f"{message}, not the whole difference")
 
 
-def by_chance(change: Floats) -> float:
-    """Return by how much a mean over environments may change without a reason.
+def by_chance(change: Floats, episodes: float = 0.0) -> float:
+    """Return how much better than its run again an honest row's mean may be.
 
-    Half of Student's interval of the mean of paired differences, one an environment, at the level
-    that keeps all of `COMPARED` together to `LEVEL`.
+    Half of Student's interval of the mean of paired differences `change`, one an environment, on
+    one side, at the level that keeps all of `COMPARED` together to `LEVEL`. Few environments may by
+    chance differ by nearly the same: the standard error is at least that which the choice of
+    `episodes` alone gives.
     """
     n = len(change)
-    spread = float(change.std(ddof=1)) / math.sqrt(n)
-    return t_quantile(1 - LEVEL / 2 / len(COMPARED), n - 1) * spread
+    error = max(float(change.std(ddof=1)) / math.sqrt(n), episodes)
+    return t_quantile(1 - LEVEL / len(COMPARED), n - 1) * error
 
 
 def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
