@@ -229,12 +229,16 @@ def make_detector(
 def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
     """Return unchecked scores of some trajectories, scored all at once if the detector can.
 
-    Raises `ContractError` when ``score_many`` returns another number of score arrays.
+    Raises `ContractError` when ``score_many`` returns another number of score arrays, and for
+    masked values.
     """
+    import numpy as np  # noqa: PLC0415  see above
+
     score_many = getattr(detector, "score_many", None)
-    if score_many is None:
-        return [detector.score(trajectory) for trajectory in chunk]
-    scores = list(score_many(chunk))
+    scores = list(score_many(chunk)) if score_many else [detector.score(x) for x in chunk]
+    if any(np.ma.is_masked(one) for one in scores):
+        # Only its data would be sent on, with whatever stands where it is masked.
+        raise ContractError("score returned a masked array, expected NaN where it is undefined")
     if len(scores) != len(chunk):
         expected = f"{len(chunk)}: one for each trajectory"
         raise ContractError(f"score_many returned {len(scores)} score arrays, expected {expected}")

@@ -93,7 +93,7 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
         ("shares", shares, f"float64 of shape {(rows, sensors)}"),
         ("onsets", onsets, f"int64 of shape {(rows,)}"),
     ):
-        is_array = isinstance(array, np.ndarray)
+        is_array = isinstance(array, np.ndarray) and not np.ma.is_masked(array)
         found = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
         if found != form:
             raise ContractError(f"explain returned {name} as {found}, expected {form}")

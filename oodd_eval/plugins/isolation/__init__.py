@@ -7,6 +7,7 @@ with pickling refused. The messages before say which of the two comes next.
 
 import io
 import json
+import math
 import os
 from collections.abc import Callable
 from typing import Any, Final
@@ -27,6 +28,11 @@ class ChannelGarbledError(OoddError, ValueError):
 
 
 LONGEST_FRAME: Final = 2**31  # bytes; a larger length was not written by a channel
+LONGEST_MESSAGE: Final = 2**24  # bytes of JSON
+
+# Of an array that a worker sends for a trajectory, at most so many bytes for each row are read:
+# twice those of float64 scores, so that a wrong type can still be told by its name.
+ROW_BYTES: Final = 16
 
 
 class Channel:
@@ -45,7 +51,7 @@ class Channel:
     def receive(self) -> dict[str, Any]:
         """Receive a JSON object; `ChannelGarbledError` when something else comes."""
         try:
-            message = json.loads(self._receive_frame())
+            message = json.loads(self._receive_frame(LONGEST_MESSAGE))
         except (ValueError, RecursionError) as error:
             raise ChannelGarbledError(f"expected JSON over the pipe: {error}") from None
         if not isinstance(message, dict):
@@ -58,14 +64,13 @@ class Channel:
         np.save(buffer, array, allow_pickle=False)
         self._send_frame(buffer.getbuffer())
 
-    def receive_array(self) -> NDArray[Any]:
-        """Receive an array; raise as `receive` does."""
-        frame = io.BytesIO(self._receive_frame())
+    def receive_array(self, most: int = LONGEST_FRAME) -> NDArray[Any]:
+        """Receive an array of at most so many bytes, header included; raise as `receive` does."""
+        frame = self._receive_frame(most)
         try:
-            array: NDArray[Any] = np.load(frame, allow_pickle=False)
-        except (ValueError, OSError, EOFError, MemoryError) as error:
+            return _read_array(frame)
+        except Exception as error:  # noqa: BLE001  numpy raises many kinds for a strange header
             raise ChannelGarbledError(f"expected an array over the pipe: {error}") from None
-        return array
 
     def send_trajectory(self, trajectory: Trajectory) -> None:
         """Send what a detector may know of an episode."""
@@ -83,9 +88,9 @@ class Channel:
             while rest:
                 rest = rest[os.write(self._writing, rest) :]
 
-    def _receive_frame(self) -> bytes:
+    def _receive_frame(self, most: int) -> bytes:
         length = int.from_bytes(self._receive_bytes(8), "little")
-        if length > LONGEST_FRAME:
+        if length > most:
             raise ChannelGarbledError(f"a message of {length} bytes was announced over the pipe")
         return self._receive_bytes(length)
 
@@ -98,3 +103,16 @@ class Channel:
                 raise ChannelClosedError(f"the other side ended after {len(parts)} of {n} bytes")
             parts += part
         return bytes(parts)
+
+
+def _read_array(content: bytes) -> NDArray[Any]:
+    """Read what `numpy.save` has written; anything else raises, before room is made for it."""
+    file = io.BytesIO(content)
+    version, _ = np.lib.format.read_magic(file)
+    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version}_0")(file)
+    rest = len(content) - file.tell()
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
+        raise ValueError(f"{rest} bytes for {dtype} of shape {shape}")
+    file.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    return array

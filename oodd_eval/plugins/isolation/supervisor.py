@@ -7,6 +7,7 @@ only.
 """
 
 import contextlib
+import math
 import os
 import secrets
 import select
@@ -15,18 +16,24 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
-from oodd_eval.plugins.isolation import Channel, ChannelClosedError, ChannelGarbledError
+from oodd_eval.plugins.isolation import (
+    ROW_BYTES,
+    Channel,
+    ChannelClosedError,
+    ChannelGarbledError,
+)
 
 MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
 LOG_BYTES: Final = 64_000
@@ -38,6 +45,13 @@ _SINGLE_THREAD: Final = (
 )  # fmt: skip
 
 CHUNK: Final = 64  # trajectories that a worker scores at once
+
+_TOLD: Final = frozenset({"error", "oom", "invalid", "incompatible", "unavailable"})
+"""States that a worker tells of itself; `Child` and a record know the others."""
+_FORM: Final = "a numpy array of float64, one score per observation"
+
+_T = TypeVar("_T")
+_Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
 
 POLL_SECONDS: Final = 0.05  # between two looks at a worker that is silent
 _END_POLL_SECONDS: Final = 0.005
@@ -56,8 +70,9 @@ class Outcome:
     """Scores of a fit, or the way in which it failed.
 
     `status` is as in a record, with a reason of one line unless ok. `scores`, `warm_up` and what is
-    kept of explanations, if it has `explained`, are the detector's own, not checked. Costs are None
-    when the worker ended before they were known. `log` is the end of the detector's output.
+    kept of explanations, if it has `explained`, are the detector's own, and checked only for their
+    number and size. Costs are None when the worker ended before they were known; what it told of
+    them is held within what this process knows. `log` is the end of the detector's output.
     """
 
     status: str = "ok"
@@ -108,7 +123,7 @@ class Child:
         self.channel = Channel(self._receiving, self.sending, self._wait)
         self._limits, self._stop, self.forked = limits, stop, True
         self._seen = self._scoring = psutil.Process(self._process.pid)
-        self._printed = b""
+        self._printed, self.peak, self._killed = b"", 0, _killed_for_memory()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self.start_clock()
@@ -117,11 +132,21 @@ class Child:
         """Count the seconds of the limit from now on."""
         self._start = time.monotonic()
 
+    @property
+    def elapsed(self) -> float:
+        """Seconds of the limit that are used up."""
+        return time.monotonic() - self._start
+
     def watch(self, pid: int, *, forked: bool) -> None:
-        """Hold a process that it has started to the limit of memory, too."""
-        self.forked = forked
-        with contextlib.suppress(psutil.Error):
-            self._scoring = psutil.Process(pid)
+        """Hold a process that it has started to the limit of memory, too.
+
+        `ValueError`: it has started no such process.
+        """
+        with contextlib.suppress(psutil.NoSuchProcess):  # It may have ended by now.
+            process = psutil.Process(pid)
+            if process.ppid() != self._process.pid:
+                raise ValueError(f"process {pid} is none of the worker's")
+            self._scoring, self.forked = process, forked
 
     @property
     def exited(self) -> bool:
@@ -178,6 +203,11 @@ class Child:
             return f"was killed by {signal.Signals(-self.returncode).name}"
         return f"ended with exit code {self.returncode}"
 
+    @property
+    def out_of_memory(self) -> bool:
+        """Tell whether it was killed while the system killed processes for want of memory."""
+        return self.returncode == -signal.SIGKILL and _killed_for_memory() > self._killed
+
     def _wait(self) -> None:
         """Wait for the next bytes, and give up when a limit is passed."""
         while not self._ready(POLL_SECONDS):
@@ -196,10 +226,12 @@ class Child:
         if self._stop and self._stop():
             raise GivenUpError("error", "interrupted")
         seconds, memory = self._limits.seconds, self._limits.memory
-        if seconds is not None and time.monotonic() - self._start > seconds:
+        if seconds is not None and self.elapsed > seconds:
             reason = f"not done after {seconds:g} s (--timeout)"
             raise GivenUpError("timeout", reason, f"was {reason}")
-        if memory is not None and (used := self._resident_bytes()) > memory:
+        used = self._resident_bytes()
+        self.peak = max(self.peak, used)
+        if memory is not None and used > memory:
             held, most = f"{used / 1e6:.0f} MB", f"{memory / 1e6:.0f} MB (--memory)"
             reason = f"resident memory {held} is over the limit of {most}"
             raise GivenUpError("oom", reason, f"held {held}, more than {most}")
@@ -237,15 +269,18 @@ def run_isolated(
     killed and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
     child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
+    expected: _Expected = deque()
+    scored = _noted("array", groups, expected)
+    again = _noted("explanation", explained, expected)
     # From another thread, so that neither side can deadlock on a full pipe.
     with ThreadPoolExecutor(1) as pool:
         explains: Future[bool] = Future()
-        sent = pool.submit(_send, child, request, train, groups, explained, explains)
+        sent = pool.submit(_send, child, request, train, scored, again, explains)
         try:
-            _converse(child, outcome, explains)
+            _converse(child, outcome, explains, expected)
         except GivenUpError as error:
             outcome.status, outcome.reason = error.status, error.reason
-        except (ChannelGarbledError, KeyError, TypeError, ValueError):
+        except (ChannelGarbledError, LookupError, TypeError, ValueError, OverflowError):
             outcome.status = "error"
             outcome.reason = "the detector wrote into the pipe between worker and harness"
         except ChannelClosedError:
@@ -260,38 +295,80 @@ def run_isolated(
     sent.result()
     if outcome.status == "error" and not outcome.reason:
         outcome.reason = f"the worker {child.death()} while {doing}"
-        if child.returncode == -signal.SIGKILL:
-            cause = "(most likely out of memory)"
+        if child.out_of_memory:
             outcome.status = "oom"
-            outcome.reason = f"the system killed the worker while {doing} {cause}"
+            outcome.reason = f"the system ran out of memory and killed the worker while {doing}"
+        elif child.returncode == -signal.SIGKILL:
+            outcome.reason += f", not by oodd-eval; it held {child.peak / 1e6:.0f} MB or more"
     return outcome
 
 
-def _converse(child: Child, outcome: Outcome, explains: "Future[bool]") -> None:
-    """Receive the worker's messages into `outcome` until the last one."""
+def _converse(
+    child: Child, outcome: Outcome, explains: "Future[bool]", expected: "_Expected"
+) -> None:
+    """Receive the worker's messages into `outcome` until the last one.
+
+    A detector may write whatever it likes into the pipe. What is no message of a worker raises one
+    of the errors that `run_isolated` takes for that.
+    """
     channel, seconds, peak = child.channel, 0.0, 0.0
     arrays = {"array": outcome.scores, "explanation": outcome.explained}
+    memory = psutil.virtual_memory().total / 1e6
     while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
-            raise GivenUpError(message["status"], message["reason"])
+            if message["status"] not in _TOLD:
+                raise ValueError(f"no status of a worker: {message['status']!r:.80}")
+            raise GivenUpError(message["status"], _typed(message, "reason", str))
         if outcome.seconds_fit is None:
-            outcome.warm_up = message["warm_up"]
-            outcome.seconds_fit = float(message["seconds_fit"])
-            explains.set_result(bool(message["explains"]))
+            outcome.warm_up, told = message["warm_up"], _typed(message, "explains", bool)
+            outcome.seconds_fit = _number(message, "seconds_fit", child.elapsed)
+            explains.set_result(told)
         elif "pid" in message:
-            child.watch(message["pid"], forked=message["forked"])
+            child.watch(_typed(message, "pid", int), forked=_typed(message, "forked", bool))
         elif "peak_rss_mb" in message:
-            held = float(message["peak_rss_mb"])
+            held = _number(message, "peak_rss_mb", memory)
             if "seconds_score" in message:
-                seconds, peak = seconds + float(message["seconds_score"]), max(peak, held)
+                seconds += _number(message, "seconds_score", child.elapsed)
+                peak = max(peak, held)
             else:
-                outcome.seconds_score, outcome.peak_rss_mb = seconds, child.together([peak, held])
-        elif message["type"] in arrays:
-            arrays[message["type"]].append(channel.receive_array())
+                outcome.seconds_score = min(seconds, child.elapsed)
+                outcome.peak_rss_mb = max(child.together([peak, held]), child.peak / 1e6)
+        elif (kind := _typed(message, "type", str)) in arrays:
+            wanted, rows = expected.popleft()
+            if kind != wanted:
+                raise ValueError(f"{kind} came back, expected {wanted}")
+            arrays[kind].append(channel.receive_array(4096 + ROW_BYTES * rows))
         else:
-            wrong = f"score returned {message['type']}, expected a numpy array of float64"
-            raise GivenUpError("invalid", wrong)
+            raise GivenUpError("invalid", f"score returned {kind}, expected {_FORM}")
+
+
+def _typed(message: Mapping[str, Any], name: str, kind: type[_T]) -> _T:
+    """Return a value of a message; `KeyError` without it, `TypeError` if it is of another type."""
+    if type(value := message[name]) is not kind:
+        raise TypeError(f"{name} is {value!r:.80}, expected {kind.__name__}")
+    return value
+
+
+def _number(message: Mapping[str, Any], name: str, most: float) -> float:
+    """Return a number of a message, and at most what is possible; `ValueError` for no amount."""
+    value = message[name]
+    if type(value) not in (int, float) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} is {value!r:.80}, expected a finite number that is not negative")
+    return float(min(value, most))
+
+
+def _noted(
+    kind: str, groups: Iterable[Iterable[Trajectory]], expected: "_Expected"
+) -> Iterator[Iterator[Trajectory]]:
+    """Yield groups; what has to come back of a trajectory is noted when it is read, to be sent."""
+
+    def noted(group: Iterable[Trajectory]) -> Iterator[Trajectory]:
+        for trajectory in group:
+            expected.append((kind, len(trajectory)))
+            yield trajectory
+
+    return map(noted, groups)
 
 
 def _send(
@@ -329,6 +406,14 @@ def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
     rest = iter(trajectories)
     while chunk := list(islice(rest, CHUNK)):
         yield chunk
+
+
+def _killed_for_memory() -> int:
+    """Return how many processes the system has killed for want of memory; 0 if it does not tell."""
+    with contextlib.suppress(OSError, StopIteration, ValueError):
+        told = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
+        return int(next(line.split()[1] for line in told if line.startswith("oom_kill ")))
+    return 0
 
 
 def _environment() -> dict[str, str]:

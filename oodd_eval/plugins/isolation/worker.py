@@ -39,9 +39,9 @@ from oodd_eval.data.files import flush_streams
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, TrajectoryError
 from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
-from oodd_eval.plugins.discovery import describe, offer_of
+from oodd_eval.plugins.discovery import describe, offer_of, printable
 from oodd_eval.plugins.explanations import explain_chunk, explains
-from oodd_eval.plugins.isolation import Channel
+from oodd_eval.plugins.isolation import ROW_BYTES, Channel
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
     MemoryError: "oom", NotImplementedError: "incompatible", ContractError: "invalid",
@@ -195,10 +195,12 @@ def _saved(detector: Detector, place: str) -> str:
     directory = Path(place)
     try:
         detector.save(directory)
-    except Exception:  # noqa: BLE001  a detector may raise anything; a later run fits again
+    except BaseException:  # noqa: BLE001  a detector may raise anything; a later run fits again
         traceback.print_exc()
-        shutil.rmtree(directory)
-        directory.mkdir()
+        # What is left of it is not kept, as nothing is in an empty or missing directory.
+        shutil.rmtree(directory, ignore_errors=True)
+        with suppress(OSError):
+            directory.mkdir(parents=True)
         return ""
     return place
 
@@ -242,9 +244,11 @@ def _score_group(channel: Channel, detector: Detector, *, forked: bool = True) -
         start = time.perf_counter()
         returned = (explain_chunk if order["explain"] else score_chunk)(detector, chunk)
         seconds += 0.0 if order["explain"] else time.perf_counter() - start
-        for one in returned:
+        for place, one in enumerate(returned):
             if not isinstance(one, np.ndarray):
                 channel.send({"type": type(one).__name__})
+            elif one.nbytes > ROW_BYTES * len(chunk[place]):
+                channel.send({"type": f"an array of shape {one.shape}"})
             elif one.dtype.hasobject:
                 channel.send({"type": "ndarray of object"})
             else:
@@ -282,7 +286,7 @@ def _reported(channel: Channel, work: Callable[[], None]) -> int:
         with suppress(ValueError, OSError):  # The detector may have closed the stream.
             traceback.print_exc()
         status = next((s for kind, s in _STATUSES.items() if isinstance(error, kind)), "error")
-        channel.send({"status": status, "reason": reason_of(error)})
+        channel.send({"status": status, "reason": printable(reason_of(error))})
         code = 1
     flush_streams()
     return code
