@@ -4,7 +4,7 @@ import argparse
 import difflib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Final, NoReturn, TypeVar
 
@@ -133,6 +133,12 @@ def add_resources(add: Add, *, timeout: str) -> None:
     add("--device", choices=("auto", "cpu", "cuda"), metavar="auto|cpu|cuda",
         help="where networks compute: the parameter device of detectors that have it")  # fmt: skip
     add_limits(add, "a fit with its scores", timeout)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Say each of some notes once."""
+    for note in dict.fromkeys(notes):
+        say(note)
 
 
 def say(message: str, code: int = 0) -> int:

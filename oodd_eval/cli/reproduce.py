@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from oodd_eval.cli import Parser, add_resources, value
+from oodd_eval.cli import Parser, add_resources, say_notes, value
 from oodd_eval.cli.data import record_split
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
@@ -100,6 +100,7 @@ def _run(options: argparse.Namespace) -> int:
                                deadline=options.budget, command=options.invocation)  # fmt: skip
         plan = Plan(split.name, split.digest, tuple(left), split.groups)
         outcome = carry_out(plan, split, plugins, settings, results, observers=[progress])
+    say_notes(results.notes)
     code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
     if outcome.left:
         why = "interrupted" if outcome.interrupted else "the budget is used up"

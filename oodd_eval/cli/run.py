@@ -88,6 +88,7 @@ def run(options: argparse.Namespace) -> int:
         console, verbosity=options.verbosity, intervals=options.intervals, log=results.log_path
     )
     done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
+    cli.say_notes(results.notes)
     if done.records:
         report = rendering.report(results.records(), intervals=options.intervals)
         path = results.path / REPORT

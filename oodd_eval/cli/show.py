@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from oodd_eval.cli import EXPRESSION, Parser, say
+from oodd_eval.cli import EXPRESSION, Parser, say, say_notes
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import load_split
@@ -56,6 +56,7 @@ def run(options: argparse.Namespace) -> int:
     records = [r for r in records if r.environment in chosen and wanted(str(r.cell))]
     if not options.stored:
         records = _recomputed(records, results, options.split)
+    say_notes(results.notes)
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))

@@ -4,13 +4,17 @@
 
     records.jsonl      one record a line
     scores/<key>.h5    all scores of one unit; also the cache from which a later run resumes
+    scores/<key>.sha256  SHA-256 and size of that file, and of the one before it
     fitted/<key>/      a fitted detector that could save itself, see `oodd_eval.results.fits`
     logs/<key>.txt     the end of the output of a failing detector, with its traceback
     report.md
 
-Every file is whole or absent, see `oodd_eval.data.files`.
+Every file is whole or absent, see `oodd_eval.data.files`. A score file that is not the one that was
+written is not read; one of an earlier version, without a digest beside it, is.
 """
 
+import hashlib
+import io
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,6 +33,8 @@ from oodd_eval.results.record import Record
 
 RECORDS: Final = "records.jsonl"
 REPORT: Final = "report.md"
+
+MOST_ROWS: Final = 2 * 10**7  # of one part; a file may announce more than it holds
 
 WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next one may take
 
@@ -65,11 +71,16 @@ class _StoredPart(NamedTuple):
 
 
 class ResultsDirectory:
-    """Access to one results directory, which need not exist yet."""
+    """Access to one results directory, which need not exist yet.
+
+    `notes` are sentences for the user on what was damaged and left out.
+    """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.fits = FitStore(self.path / "fitted")
+        self.notes: list[str] = []
+        self._inode: int | None = None
 
     def prepare(self) -> None:
         """Make the directory, and find out before any work is done whether it can be used.
@@ -82,6 +93,7 @@ class ResultsDirectory:
                 (self.path / part).mkdir(parents=True, exist_ok=True)
                 with tempfile.TemporaryFile(dir=self.path / part):
                     pass
+            self._inode = self.path.stat().st_ino
         except OSError as error:
             raise OutputError(
                 f"results directory {str(self.path)!r} cannot be written to: {error.strerror}; "
@@ -95,14 +107,17 @@ class ResultsDirectory:
             files.remove_abandoned(directory)
 
     def records(self) -> list[Record]:
-        """Read all records, also compressed ones; `ResultsError` without any, or a damaged one."""
+        """Read all records, also compressed ones; `ResultsError` without any, or a damaged one.
+
+        A last line that was cut short is left out: kept scores can give its record again.
+        """
         file = files.find_file(self.path / RECORDS) or self.path / RECORDS
         if not file.exists():
             raise ResultsError(
                 f"no results in {str(self.path)!r}: expected a file {RECORDS}, written by "
                 "oodd-eval run"
             )
-        return read_records(file)
+        return read_records(file, self.notes)
 
     def merge_records(self, records: Iterable[Record]) -> list[Record]:
         """Write records into the directory, and return all that it has then.
@@ -110,13 +125,24 @@ class ResultsDirectory:
         Newer records replace those of the same cell. A failed one is also replaced by one of the
         same cell with other parameters. Earlier records keep their places and new cells follow.
         Places of replaced cells are filled in the order of `records`, so that the end is the same
-        whether records come at once or one by one.
+        whether records come at once or one by one. `OutputError`: they cannot be written, or the
+        directory was removed since `prepare`; then they are in a new one.
         """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
         with files.lock(self.path):
             earlier = self.records() if (self.path / RECORDS).exists() else []
             merged = _merged(earlier, records)
             text = "".join(record.to_json() + "\n" for record in merged)
             files.write_text(self.path / RECORDS, text)
+        known, self._inode = self._inode, self._inode and self.path.stat().st_ino
+        if known != self._inode:
+            raise OutputError(
+                f"results directory {str(self.path)!r} was removed while the run went on: this "
+                "run's records are in a new one, scores from before are gone; run again"
+            )
         return merged
 
     def forget(self, records: Iterable[Record]) -> None:
@@ -127,7 +153,7 @@ class ResultsDirectory:
             text = "".join(record.to_json() + "\n" for record in kept)
             files.write_text(self.path / RECORDS, text)
             for key in {r.scores for r in gone.values()} - {r.scores for r in kept} - {""}:
-                for file in (self.path / "scores" / f"{key}.h5", self.log_path(key)):
+                for file in (*self._places(key), self.log_path(key)):
                     file.unlink(missing_ok=True)
 
     def log_path(self, key: str) -> Path:
@@ -139,8 +165,10 @@ class ResultsDirectory:
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
             parts[part] = _StoredPart(sequences, scores.order, scores.explained.get(part))
-        place = self.path / "scores" / f"{key}.h5"
-        with files.replacing(place) as path, h5py.File(path, "w") as file:
+        place, digests = self._places(key)
+        # In memory: HDF5 crashes where it cannot write, as on a full disk.
+        image = io.BytesIO()
+        with h5py.File(image, "w") as file:
             file.attrs.update(scores.cost)
             for part in sorted(parts):
                 group, (sequences, order, explained) = file.create_group(part), parts[part]
@@ -152,6 +180,30 @@ class ResultsDirectory:
                     columns |= zip(EXPLAINED, np.concatenate(explained, axis=1), strict=True)
                 for name, data in columns.items():
                     group.create_dataset(name, data=data, compression="gzip", shuffle=True)
+        content = image.getvalue()
+        # First the digest, beside that of the file before: a kill between the two loses neither.
+        sealed = f"{hashlib.sha256(content).hexdigest()} {len(content)}"
+        files.write_text(digests, "\n".join([sealed, *_lines(digests)[:1]]) + "\n")
+        files.write_bytes(place, content)
+
+    def _places(self, key: str) -> tuple[Path, Path]:
+        """Return the places of a score file and of its digests."""
+        return self.path / "scores" / f"{key}.h5", self.path / "scores" / f"{key}.sha256"
+
+    def _opened(self, key: str) -> h5py.File:
+        """Open a score file; `ValueError` when it is not the one that was written."""
+        place, digests = self._places(key)
+        if digests.exists():
+            sealed, size = _lines(digests), f" {place.stat().st_size}"
+            with place.open("rb") as file:
+                same = any(line.endswith(size) for line in sealed) and (
+                    hashlib.file_digest(file, "sha256").hexdigest() + size in sealed
+                )
+            if not same:
+                note = f"{str(place)!r} was changed since it was written and is not used"
+                self.notes += [] if note in self.notes else [note]
+                raise ValueError(note)
+        return h5py.File(place, "r")
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
         """Read a unit's scores; None when the file is absent, damaged, lacks a part or misfits.
@@ -159,18 +211,21 @@ class ResultsDirectory:
         `lengths` names the parts to read, with the observations of each of their trajectories.
         """
         try:
-            with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:
+            with self._opened(key) as file:
                 parts, explained = {}, {}
                 for part, expected in lengths.items():
-                    flat, offsets = file[part]["scores"][:], file[part]["offsets"][:]
+                    if file[part]["offsets"].shape != (len(expected) + 1,):
+                        return None
+                    flat, offsets = _rows(file[part]), file[part]["offsets"][:]
                     if np.diff(offsets).tolist() != list(expected) or len(flat) != offsets[-1]:
                         return None
                     parts[part] = np.split(flat.astype(np.float64, copy=False), offsets[1:-1])
                     if own := _explained(file[part]):
                         explained[part] = own
                 cost = {name: float(value) for name, value in file.attrs.items()}
-        except (OSError, KeyError, ValueError):
+        except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
+        cost = {name: value for name, value in cost.items() if 0 <= value < np.inf}
         return ScoreFile(parts, cost, explained=explained)
 
     def _all_parts(self, key: str) -> dict[str, _StoredPart]:
@@ -179,26 +234,42 @@ class ResultsDirectory:
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
-                sequences = np.split(item["scores"][:], item["offsets"][1:-1])
+                sequences = np.split(_rows(item), item["offsets"][1:-1])
                 # Files of earlier versions have one order for all parts.
                 order = item.attrs.get("order", item.file.attrs.get("order"))
                 parts[name] = _StoredPart(sequences, order, _explained(item))
 
         try:
-            with h5py.File(self.path / "scores" / f"{key}.h5", "r") as file:
+            with self._opened(key) as file:
                 file.visititems(collect)
-        except (OSError, KeyError, ValueError):
+        except Exception:  # noqa: BLE001  as above
             return {}
         return parts
+
+
+def _rows(part: h5py.Group) -> NDArray[np.float64]:
+    """Return all scores of a part; `ValueError` when there can be no such number of them."""
+    stored = part["scores"]
+    if stored.ndim != 1 or stored.size > MOST_ROWS or stored.dtype.kind != "f":
+        raise ValueError(f"scores of shape {stored.shape} and type {stored.dtype}")
+    return np.asarray(stored[:], np.float64)
+
+
+def _lines(digests: Path) -> list[str]:
+    """Return the lines of a file of digests, none where there is none."""
+    if not digests.is_file():
+        return []
+    with digests.open("rb") as file:
+        return file.read(1000).decode(errors="replace").splitlines()
 
 
 def _explained(part: h5py.Group) -> list[NDArray[np.int32]] | None:
     """Return the explanations of a part, which detectors without ``explain`` do not have."""
     if not all(name in part for name in EXPLAINED):
         return None
-    columns = np.array([part[name][:] for name in EXPLAINED], dtype=np.int32)
-    if columns.shape[1] != part["offsets"][-1]:
+    if any(part[name].shape != part["scores"].shape for name in EXPLAINED):
         raise ValueError("explanations of another number of rows than scores")
+    columns = np.array([part[name][:] for name in EXPLAINED], dtype=np.int32)
     return np.split(columns, part["offsets"][1:-1], axis=1)
 
 
@@ -239,13 +310,15 @@ class RecordWriter:
         return [record for index in sorted(self._finished) for record in self._finished[index]]
 
 
-def read_records(file: Path) -> list[Record]:
+def read_records(file: Path, notes: list[str] | None = None) -> list[Record]:
     """Read a file of records.
 
     Parameters
     ----------
     file
         Lines of JSON, compressed or not.
+    notes
+        Where given, a last line that was cut short is left out, which is told there.
 
     Raises
     ------
@@ -253,9 +326,15 @@ def read_records(file: Path) -> list[Record]:
         When it cannot be read, naming the line.
     """
     try:
-        lines = files.read_text(file).splitlines()
+        lines = (text := files.read_text(file)).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
+    if notes is not None and len(lines) > 1 and not text.endswith("\n"):
+        try:
+            Record.from_json(lines[-1])
+        except ResultsError:
+            del lines[-1]
+            notes.append(f"{str(file)!r} was cut short: its last line is left out")
     return [
         Record.from_json(line, f"{file}:{number}")
         for number, line in enumerate(lines, start=1)

@@ -11,6 +11,7 @@ files are compared with their digests before a detector is asked to load them.
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -19,10 +20,12 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from oodd_eval.data.files import digests
+from oodd_eval.errors import OutputError
 
 INDEX: Final = "fitted.json"
 
 MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
+_MAX_INDEX: Final = 10**7
 
 
 class KeptFit(NamedTuple):
@@ -49,36 +52,53 @@ class FitStore:
             return None
         place = self.path / key
         try:
-            index = json.loads((place / INDEX).read_text(encoding="utf-8"))
-            if digests(place, without=INDEX) != index["files"]:
+            if _size(place) > MAX_BYTES or (place / INDEX).stat().st_size > _MAX_INDEX:
                 return None
-            return KeptFit(place, float(index["seconds_fit"]))
-        except (OSError, ValueError, KeyError, TypeError):
+            index = json.loads((place / INDEX).read_text(encoding="utf-8"))
+            seconds = float(index["seconds_fit"])
+            if digests(place, without=INDEX) != index["files"] or not 0 <= seconds < math.inf:
+                return None
+            return KeptFit(place, seconds)
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[Path]:
-        """Give an empty directory for a detector to save itself in; remove it afterwards."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(
-            prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
-        ) as made:
-            yield Path(made)
+        """Give an empty directory for a detector to save itself in; remove it afterwards.
+
+        `OutputError`: it cannot be made.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            made = tempfile.TemporaryDirectory(
+                prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
+            )
+        except OSError as error:
+            raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
+        with made as place:
+            yield Path(place)
 
     def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
-        """Move a filled directory to its key; do nothing when it is empty or too large."""
-        files = digests(directory, without=INDEX)
-        size = sum((directory / name).stat().st_size for name in files)
-        if not files or size > MAX_BYTES:
-            return
-        index = {"files": files, "seconds_fit": seconds_fit}
-        (directory / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")
-        shutil.rmtree(self.path / key, ignore_errors=True)
+        """Move a filled directory to its key; do nothing when it is empty or too large.
+
+        Nor where it cannot be written: without it, another run fits again.
+        """
         # Another process may have been quicker; then its result, the same, stays.
         with contextlib.suppress(OSError):
+            # Sizes first: a file may be said to hold more than there is room for.
+            if _size(directory) > MAX_BYTES or not (files := digests(directory, without=INDEX)):
+                return
+            index = {"files": files, "seconds_fit": seconds_fit}
+            (directory / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")
+            shutil.rmtree(self.path / key, ignore_errors=True)
             directory.rename(self.path / key)
             self._made.add(key)
 
     def distrust(self, key: str) -> None:
         """Treat the fit under a key as an earlier run's: it could not be loaded."""
         self._made.discard(key)
+
+
+def _size(directory: Path) -> int:
+    """Return the bytes of all files below a directory."""
+    return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
