@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import os
 import shlex
+import signal
 import sys
 import traceback
 from collections.abc import Container, Sequence
@@ -17,7 +18,7 @@ from oodd_eval.errors import OoddError
 EXIT_CODES: Final = """exit codes:
   0  ok
   1  a cell, check or comparison failed, or a plug-in is broken
-  2  interrupted (Ctrl-C), or output pipe closed
+  2  interrupted (Ctrl-C, TERM, HUP), or output pipe closed
   3  internal error
   4  the request cannot be carried out: unknown name, missing data, no place to write
   5  nothing was selected or compared"""
@@ -66,8 +67,22 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Carry out a command line, by default this process's, and return its exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    """Carry out a command line and return its exit code; by default end this process with it."""
+    if arguments is not None:
+        return _carried_out(list(arguments))
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
+            signal.signal(number, signal.default_int_handler)
+    code = _carried_out(sys.argv[1:])
+    # Threads and exit handlers of plug-ins, which might never end, have no say.
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    os._exit(code)
+
+
+def _carried_out(given: list[str]) -> int:
+    options = None
     try:
         if not given:
             build_parser(given).print_help()
@@ -75,8 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parse(given)
         code: int = options.handler(options)
         sys.stdout.flush()
-    except SystemExit as error:  # argparse's --help and --version
-        return error.code if isinstance(error.code, int) else 0
+    except SystemExit as error:
+        if options is None:  # argparse's --help and --version
+            return error.code if isinstance(error.code, int) else 0
+        return say(f"something called sys.exit({error.code!r}), so that not all was done", 3)
     except KeyboardInterrupt:
         return say("interrupted", 2)
     except BrokenPipeError:

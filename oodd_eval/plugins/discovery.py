@@ -11,7 +11,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
@@ -207,9 +207,13 @@ class Plugins:
 
     @contextmanager
     def blaming(self, point: EntryPoint, doing: str = "") -> Iterator[None]:
-        """Note the plug-in as broken when the block raises anything, and go on after the block."""
+        """Note the plug-in as broken when the block raises anything, and go on after the block.
+
+        The working directory, to which results may be relative, is then what it was.
+        """
         try:
-            yield
+            with chdir("."):
+                yield
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything
@@ -249,7 +253,8 @@ class Plugins:
         asked = []
         for maker in self._makers():
             try:
-                spec = maker.hook.oodd_detector_from_spec(spec=text)
+                with chdir("."):
+                    spec = maker.hook.oodd_detector_from_spec(spec=text)
             except OoddError:
                 raise
             except (Exception, SystemExit) as error:

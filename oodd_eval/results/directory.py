@@ -348,7 +348,7 @@ def _merged(earlier: Sequence[Record], records: Iterable[Record]) -> list[Record
     rest = iter(newer.values())
     merged = {
         r.identity: next(rest) if r.identity in newer else r
-        for r in earlier
+        for r in {r.identity: r for r in earlier}.values()  # somebody may have copied lines
         if r.ok or r.identity in newer or _attempt(r) not in tried
     }
     return [*merged.values(), *rest]

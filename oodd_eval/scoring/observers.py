@@ -1,9 +1,10 @@
 """Observers of a run: the hooks that plug-ins and the program's own reporters implement.
 
 A plug-in is asked to observe when it has an entry point in the group ``oodd_eval.observers``, or
-when it was loaded for its detectors. No observer may change a result.
+when it was loaded for its detectors. No observer may change a result: each gets copies.
 """
 
+import copy
 import sys
 from collections.abc import Iterable
 from importlib.metadata import EntryPoint
@@ -95,7 +96,9 @@ class Observers:
             point, hooks = entry
             failures = len(self._plugins.broken)
             with self._plugins.blaming(point, f"hook {hook} failed: "):
-                getattr(hooks, hook)(**arguments)
+                call = getattr(hooks, hook)
+                if call.get_hookimpls():
+                    call(**copy.deepcopy(arguments))
             if len(self._plugins.broken) > failures:
                 self._foreign.remove(entry)
         for hooks in self._own:

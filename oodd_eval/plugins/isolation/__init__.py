@@ -9,10 +9,14 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, Final
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
@@ -26,6 +30,10 @@ class ChannelClosedError(OoddError, EOFError):
 class ChannelGarbledError(OoddError, ValueError):
     """Bytes that are no message: the detector wrote into the pipe."""
 
+
+MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
+_PATIENCE: Final = 5.0  # seconds for which marked processes are hunted, should they multiply
+END_POLL_SECONDS: Final = 0.005
 
 LONGEST_FRAME: Final = 2**31  # bytes; a larger length was not written by a channel
 LONGEST_MESSAGE: Final = 2**24  # bytes of JSON
@@ -116,3 +124,32 @@ def _read_array(content: bytes) -> NDArray[Any]:
     file.seek(0)
     array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     return array
+
+
+def end_all(pid: int, mark: str) -> None:
+    """Kill a process with its group, its descendants, and what has its mark in the environment."""
+    strays: list[psutil.Process] = []
+    with suppress(psutil.Error):
+        strays = psutil.Process(pid).children(recursive=True)
+    for kill in (os.killpg, os.kill):
+        with suppress(ProcessLookupError, PermissionError):
+            kill(pid, signal.SIGKILL)
+    deadline = time.monotonic() + _PATIENCE
+    strays, clean = [*strays, *_marked(mark)], 1
+    # A process whose parent ended during one search is found by the next one.
+    while (strays or clean < 2) and time.monotonic() < deadline:
+        for stray in strays:
+            with suppress(psutil.Error):
+                stray.kill()
+        time.sleep(END_POLL_SECONDS)
+        clean = 1 if strays else clean + 1
+        strays = list(_marked(mark))
+
+
+def _marked(mark: str) -> Iterator[psutil.Process]:
+    """Yield the other running processes whose environment holds a mark."""
+    for pid in psutil.pids():
+        with suppress(psutil.Error, OSError):
+            process = psutil.Process(pid)
+            if pid != os.getpid() and process.environ().get(MARK) == mark:
+                yield process

@@ -29,15 +29,16 @@ import psutil
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
 from oodd_eval.plugins.isolation import (
+    END_POLL_SECONDS,
+    MARK,
     ROW_BYTES,
     Channel,
     ChannelClosedError,
     ChannelGarbledError,
+    end_all,
 )
 
-MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
 LOG_BYTES: Final = 64_000
-_PATIENCE: Final = 5.0  # seconds for which marked processes are hunted, should they multiply
 
 _SINGLE_THREAD: Final = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
@@ -46,15 +47,12 @@ _SINGLE_THREAD: Final = (
 
 CHUNK: Final = 64  # trajectories that a worker scores at once
 
-_TOLD: Final = frozenset({"error", "oom", "invalid", "incompatible", "unavailable"})
-"""States that a worker tells of itself; `Child` and a record know the others."""
-_FORM: Final = "a numpy array of float64, one score per observation"
+_TOLD: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}  # by a worker, of itself
 
 _T = TypeVar("_T")
 _Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
 
 POLL_SECONDS: Final = 0.05  # between two looks at a worker that is silent
-_END_POLL_SECONDS: Final = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,14 +136,11 @@ class Child:
         return time.monotonic() - self._start
 
     def watch(self, pid: int, *, forked: bool) -> None:
-        """Hold a process that it has started to the limit of memory, too.
-
-        `ValueError`: it has started no such process.
-        """
+        """Hold a process of it to the limit of memory, too; `ValueError` when it is none of its."""
         with contextlib.suppress(psutil.NoSuchProcess):  # It may have ended by now.
             process = psutil.Process(pid)
             if process.ppid() != self._process.pid:
-                raise ValueError(f"process {pid} is none of the worker's")
+                raise ValueError(pid)
             self._scoring, self.forked = process, forked
 
     @property
@@ -162,28 +157,13 @@ class Child:
         while not self.exited:
             if time.monotonic() > deadline:
                 return False
-            time.sleep(_END_POLL_SECONDS)
+            time.sleep(END_POLL_SECONDS)
         return True
 
     def end(self) -> str:
         """Kill it with all that it has started, and return the end of what was printed."""
-        strays: list[psutil.Process] = []
-        with contextlib.suppress(psutil.Error):
-            strays = self._seen.children(recursive=True)
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.kill()
+        end_all(self._process.pid, self._mark)
         self.returncode = self._process.wait()
-        deadline = time.monotonic() + _PATIENCE
-        strays, clean = [*strays, *_marked(self._mark)], 1
-        # A process whose parent ended during one search is found by the next one.
-        while (strays or clean < 2) and time.monotonic() < deadline:
-            for stray in strays:
-                with contextlib.suppress(psutil.Error):
-                    stray.kill()
-            time.sleep(_END_POLL_SECONDS)
-            clean = 1 if strays else clean + 1
-            strays = list(_marked(self._mark))
         # A process that escaped could hold the pipe open for ever: do not wait for it.
         self._reader.join(timeout=1.0)
         os.close(self._receiving)
@@ -270,12 +250,11 @@ def run_isolated(
     """
     child, outcome = Child("oodd_eval.plugins.isolation.worker", limits, stop), Outcome()
     expected: _Expected = deque()
-    scored = _noted("array", groups, expected)
-    again = _noted("explanation", explained, expected)
     # From another thread, so that neither side can deadlock on a full pipe.
     with ThreadPoolExecutor(1) as pool:
         explains: Future[bool] = Future()
-        sent = pool.submit(_send, child, request, train, scored, again, explains)
+        parts = _noted("array", groups, expected), _noted("explanation", explained, expected)
+        sent = pool.submit(_send, child, request, train, *parts, explains)
         try:
             _converse(child, outcome, explains, expected)
         except GivenUpError as error:
@@ -306,11 +285,7 @@ def run_isolated(
 def _converse(
     child: Child, outcome: Outcome, explains: "Future[bool]", expected: "_Expected"
 ) -> None:
-    """Receive the worker's messages into `outcome` until the last one.
-
-    A detector may write whatever it likes into the pipe. What is no message of a worker raises one
-    of the errors that `run_isolated` takes for that.
-    """
+    """Receive the worker's messages into `outcome` until the last one; raise for any other."""
     channel, seconds, peak = child.channel, 0.0, 0.0
     arrays = {"array": outcome.scores, "explanation": outcome.explained}
     memory = psutil.virtual_memory().total / 1e6
@@ -318,7 +293,7 @@ def _converse(
         message = channel.receive()
         if "status" in message:
             if message["status"] not in _TOLD:
-                raise ValueError(f"no status of a worker: {message['status']!r:.80}")
+                raise ValueError(message["status"])
             raise GivenUpError(message["status"], _typed(message, "reason", str))
         if outcome.seconds_fit is None:
             outcome.warm_up, told = message["warm_up"], _typed(message, "explains", bool)
@@ -337,16 +312,17 @@ def _converse(
         elif (kind := _typed(message, "type", str)) in arrays:
             wanted, rows = expected.popleft()
             if kind != wanted:
-                raise ValueError(f"{kind} came back, expected {wanted}")
+                raise ValueError(kind)
             arrays[kind].append(channel.receive_array(4096 + ROW_BYTES * rows))
         else:
-            raise GivenUpError("invalid", f"score returned {kind}, expected {_FORM}")
+            wrong = f"score returned {kind}, expected a numpy array of float64"
+            raise GivenUpError("invalid", wrong)
 
 
 def _typed(message: Mapping[str, Any], name: str, kind: type[_T]) -> _T:
-    """Return a value of a message; `KeyError` without it, `TypeError` if it is of another type."""
+    """Return a value of a message; raise for one of another type."""
     if type(value := message[name]) is not kind:
-        raise TypeError(f"{name} is {value!r:.80}, expected {kind.__name__}")
+        raise TypeError(name)
     return value
 
 
@@ -354,7 +330,7 @@ def _number(message: Mapping[str, Any], name: str, most: float) -> float:
     """Return a number of a message, and at most what is possible; `ValueError` for no amount."""
     value = message[name]
     if type(value) not in (int, float) or not 0 <= value < math.inf:
-        raise ValueError(f"{name} is {value!r:.80}, expected a finite number that is not negative")
+        raise ValueError(name)
     return float(min(value, most))
 
 
@@ -363,12 +339,11 @@ def _noted(
 ) -> Iterator[Iterator[Trajectory]]:
     """Yield groups; what has to come back of a trajectory is noted when it is read, to be sent."""
 
-    def noted(group: Iterable[Trajectory]) -> Iterator[Trajectory]:
-        for trajectory in group:
-            expected.append((kind, len(trajectory)))
-            yield trajectory
+    def noted(trajectory: Trajectory) -> Trajectory:
+        expected.append((kind, len(trajectory)))
+        return trajectory
 
-    return map(noted, groups)
+    return (map(noted, group) for group in groups)
 
 
 def _send(
@@ -423,12 +398,3 @@ def _environment() -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(steering)}
     single = dict.fromkeys(_SINGLE_THREAD, "1")
     return {**kept, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
-
-
-def _marked(mark: str) -> Iterator[psutil.Process]:
-    """Yield the running processes whose environment holds a mark."""
-    for pid in psutil.pids():
-        with contextlib.suppress(psutil.Error, OSError):
-            process = psutil.Process(pid)
-            if process.environ().get(MARK) == mark:
-                yield process

@@ -23,7 +23,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -41,7 +40,7 @@ from oodd_eval.errors import ContractError, TrajectoryError
 from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
 from oodd_eval.plugins.discovery import describe, offer_of, printable
 from oodd_eval.plugins.explanations import explain_chunk, explains
-from oodd_eval.plugins.isolation import ROW_BYTES, Channel
+from oodd_eval.plugins.isolation import MARK, ROW_BYTES, Channel, end_all
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
     MemoryError: "oom", NotImplementedError: "incompatible", ContractError: "invalid",
@@ -258,23 +257,39 @@ def _score_group(channel: Channel, detector: Detector, *, forked: bool = True) -
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
 
 
-def connect(arguments: Sequence[str]) -> Channel:
+def connect(arguments: Sequence[str], *, guarded: bool = True) -> Channel:
     """Return the channel to the harness, from the command line of a process that it has started.
 
-    The harness never writes to the lifeline: reading it ends when the harness is no more, which
-    ends this process and whatever it has started, too.
+    The harness never writes to the lifeline: reading it ends when the harness is no more. Where
+    this process is `guarded`, that ends it and whatever it has started, too.
     """
     reading, writing, lifeline = descriptors = [int(a) for a in arguments]
     for descriptor in descriptors:
         os.set_inheritable(descriptor, False)
-
-    def wait() -> None:
-        os.read(lifeline, 1)
-        os.killpg(os.getpgid(0), signal.SIGKILL)
-
-    threading.Thread(target=wait, daemon=True).start()
+    if guarded:
+        _guard(lifeline)
     faulthandler.enable()
     return Channel(reading, writing)
+
+
+def _guard(lifeline: int) -> None:
+    """Start a process that waits for the end of the harness, and then ends all that is marked.
+
+    No thread could, as a detector may hold the interpreter's lock. It is nobody's child, so that it
+    is not taken for one of the detector's.
+    """
+    worker, mark = os.getpid(), os.environ[MARK]
+    if (between := os.fork()) == 0:
+        try:
+            os.setsid()
+            if os.fork() == 0:
+                os.dup2(lifeline, 0)
+                os.closerange(1, 1024)  # The worker's pipes have to end with the worker.
+                os.read(0, 1)
+                end_all(worker, mark)
+        finally:
+            os._exit(0)
+    os.waitpid(between, 0)
 
 
 def _reported(channel: Channel, work: Callable[[], None]) -> int:
@@ -298,7 +313,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     Threads and exit handlers of the detector have no say any more: the scores are sent.
     """
     descriptors, order = arguments[:3], arguments[3:]
-    channel = connect(descriptors)
+    channel = connect(descriptors, guarded=not order)  # A group's process has its worker's mark.
 
     def group() -> None:
         request = json.loads(order[0])

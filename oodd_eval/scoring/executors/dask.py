@@ -41,6 +41,7 @@ except ImportError as error:
     ) from error
 
 CONNECT_SECONDS: Final = 10.0
+WORKERLESS_SECONDS: Final = 60.0  # for which units wait while there is no worker
 _FILE: Final = ("parts", "cost", "order", "explained")  # what comes back of a unit's score file
 
 Message = dict[str, Any]
@@ -85,7 +86,9 @@ class DaskExecutor(Executor):
             self._running.add(future)
             if self._stopping.is_set():
                 future.cancel()
-            outcome = future.result()
+            outcome = self._awaited(future)
+        except ExecutorError:
+            raise
         except KilledWorker as error:
             return Scored("error", f"the cluster lost every worker that ran it: {error}")
         except Exception as error:
@@ -103,6 +106,22 @@ class DaskExecutor(Executor):
             raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
         file = ScoreFile(**{name: outcome[name] for name in _FILE})
         return Scored(outcome["status"], outcome["reason"], file, outcome["log"])
+
+    def _awaited(self, future: Any) -> Message:
+        """Return what comes back; `ExecutorError` when the cluster has had no worker for long."""
+        lonely = 0
+        while True:
+            try:
+                outcome: Message = future.result(timeout=WORKERLESS_SECONDS / 4)
+            except (TimeoutError, distributed.TimeoutError):
+                lonely = 0 if self._client.nthreads() else lonely + 1
+                if lonely > 4:
+                    raise ExecutorError(
+                        f"the Dask scheduler at {self._address} has lost all its workers: start "
+                        f"some with `dask worker {self._address}` and run again"
+                    ) from None
+            else:
+                return outcome
 
     def stop(self) -> None:
         """Tell the workers that nobody waits any more."""

@@ -1,0 +1,204 @@
+"""How a command ends: killed, told to go, or held up by what a plug-in has left in it."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+from helpers_plugins import install
+from helpers_processes import environment, oodd_eval, wait_until
+
+from oodd_eval.errors import ExecutorError, PluginError
+from oodd_eval.plugins.discovery import discover
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+HOLDS = """
+def held():
+    \"\"\"Hold the interpreter's lock: no other thread of this process runs.\"\"\"
+    import ctypes
+    ctypes.PyDLL(None).sleep(600)
+
+def begun():
+    Path(os.environ["FITS"]).write_text(str(os.getpid()))
+
+class Holds(Good):
+    def fit(self, nominal): begun(); held()
+
+class Scores(Good):
+    def score(self, x): begun(); held()
+
+class Own(Good):
+    def fit(self, nominal):
+        subprocess.Popen(["sleep", "600"], start_new_session=True)
+        begun(); held()
+
+class Bare(Good):
+    def fit(self, nominal):
+        subprocess.Popen(["sleep", "600"], start_new_session=True, env={})
+        begun(); held()
+
+class Twice(Good):
+    def fit(self, nominal):
+        if os.fork() == 0:
+            os.setsid()
+            if os.fork() == 0: time.sleep(600)
+            os._exit(0)
+        begun(); held()
+
+class Deaf(Good):
+    def fit(self, nominal):
+        for number in set(signal.Signals) - {signal.SIGKILL, signal.SIGSTOP}:
+            signal.signal(number, signal.SIG_IGN)
+        os.closerange(3, 64); begun(); held()
+
+class Stops(Good):
+    def fit(self, nominal): begun(); os.kill(os.getpid(), signal.SIGSTOP)
+
+class Quick(Good): pass
+
+@hookimpl
+def oodd_detectors():
+    return offer(holds=Holds, scores=Scores, own=Own, bare=Bare, twice=Twice, deaf=Deaf,
+                 stops=Stops, quick=Quick)
+"""
+
+
+def of_run(marker):
+    """Processes whose environment has a mark, or whose parent or session is that of one."""
+    name, _, value = marker.partition("=")
+    found = []
+    for process in psutil.process_iter(["pid", "environ", "status", "cmdline"]):
+        info = process.info
+        bare = info["cmdline"] == ["sleep", "600"]
+        if info["status"] != psutil.STATUS_ZOMBIE and (
+            (info["environ"] or {}).get(name) == value or (bare and not info["environ"])
+        ):
+            found.append(info["pid"])
+    return found
+
+
+def begin(monkeypatch, tmp_path, tiny_split, detector, code=HOLDS, *more, name="holder"):
+    install(monkeypatch, tmp_path / "plugin", name, code)
+    variables = environment(tmp_path / "plugin", tmp_path / "begun", RUN=str(tmp_path))
+    return oodd_eval(
+        "run", "--detector", detector, "--env", "cartpole", "--anomaly", "iid", "--split",
+        tiny_split, "--output", tmp_path / "out", "--jobs", "1", *more, env=variables,
+        cwd=tmp_path,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("detector", ["holds", "scores", "own", "bare", "twice", "deaf", "stops"])
+def test_nothing_runs_on_when_the_command_is_ended(
+    monkeypatch, tmp_path, tiny_split, number, detector
+):
+    process = begin(monkeypatch, tmp_path, tiny_split, detector)
+    assert wait_until((tmp_path / "begun").exists)
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == (-number if number == signal.SIGKILL else 2), said
+    assert "Traceback" not in said
+    assert wait_until(lambda: not of_run(f"RUN={tmp_path}"), seconds=10)
+
+
+def test_what_was_finished_is_kept_when_the_command_is_told_to_go(
+    monkeypatch, tmp_path, tiny_split
+):
+    process = begin(monkeypatch, tmp_path, tiny_split, "quick,holds")
+    assert wait_until((tmp_path / "begun").exists)
+    process.terminate()
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "interrupted" in said
+    assert len((tmp_path / "out" / "records.jsonl").read_text().splitlines()) == 1
+
+
+def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
+    code = (
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "import oodd_eval.cli.main as m, os\n"
+        "m._carried_out = lambda _: os.kill(os.getpid(), signal.SIGHUP) or 5\n"
+        "m.main()"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 5
+
+
+LEFT = {
+    "a thread": "threading.Thread(target=time.sleep, args=(600,)).start()",
+    "an exit handler": "import atexit; atexit.register(time.sleep, 600)",
+    "an exit handler that leaves": "import atexit; atexit.register(os._exit, 0)",
+    "an exit handler of threads": "threading._register_atexit(time.sleep, 600)",
+    "a stream that is closed": "import io; sys.stdout = io.StringIO(); sys.stdout.close()",
+    "no stream": "sys.stdout = None",
+}
+
+
+@pytest.mark.parametrize("code", LEFT.values(), ids=LEFT)
+def test_what_a_plugin_leaves_at_import_holds_nothing_up(monkeypatch, tmp_path, tiny_split, code):
+    guarded = f"if 'OODD_EVAL_PROCESS' not in os.environ: {code.replace('; ', chr(10) + '    ')}"
+    guarded = guarded.replace(": import", ":\n    import")
+    plugin = f"{guarded}\n@hookimpl\ndef oodd_detectors(): return offer(fails=lambda **_: None)"
+    process = begin(monkeypatch, tmp_path, tiny_split, "fails", plugin)
+    start = time.monotonic()
+    process.communicate(timeout=60)
+    # A cell has failed, or nothing could be printed: not 0.
+    assert process.returncode in (1, 3)
+    assert time.monotonic() - start < 60
+
+
+MOVES = {
+    "at import": "os.chdir('/')\n@hookimpl\ndef oodd_detectors(): return offer(moves=Good)",
+    "when asked": "@hookimpl\ndef oodd_detectors(): os.chdir('/'); return offer(moves=Good)",
+    "and fails": "@hookimpl\ndef oodd_detectors(): os.chdir('/'); raise ValueError",
+}
+
+
+@pytest.mark.parametrize("code", MOVES.values(), ids=MOVES)
+def test_a_plugin_that_leaves_the_directory_moves_nothing(monkeypatch, tmp_path, code):
+    install(monkeypatch, tmp_path, "moves", code)
+    monkeypatch.chdir(tmp_path)
+    assert discover(only=["moves"]).offers
+    assert Path.cwd() == tmp_path
+
+
+@pytest.mark.parametrize("made", ["None", "1 / 0"])
+def test_a_maker_of_detectors_that_leaves_the_directory(monkeypatch, tmp_path, made):
+    code = f"@hookimpl\ndef oodd_detector_from_spec(spec): os.chdir('/'); return {made}"
+    install(monkeypatch, tmp_path, "moves", code)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((PluginError, ValueError)):
+        discover(only=["moves"]).offer("moves:1")
+    assert Path.cwd() == tmp_path
+
+
+class Future:
+    """Never done until so many looks at it."""
+
+    def __init__(self, looks):
+        self.looks = looks
+
+    def result(self, timeout):
+        self.looks -= 1
+        if self.looks < 0:
+            return {"status": "ok"}
+        raise TimeoutError
+
+
+@pytest.mark.parametrize(
+    ("looks", "workers", "ends"), [(3, [0] * 9, True), (9, [0] * 9, False), (9, [0, 1] * 9, True)]
+)
+def test_a_cluster_without_workers_is_waited_for_and_then_named(looks, workers, ends):
+    remote = pytest.importorskip("oodd_eval.scoring.executors.dask", reason="needs the extra dask")
+    counts = iter(workers)
+    client = SimpleNamespace(nthreads=lambda: {"w": 1} if next(counts) else {})
+    executor = SimpleNamespace(_client=client, _address="tcp://h:1")
+    if ends:
+        assert remote.DaskExecutor._awaited(executor, Future(looks)) == {"status": "ok"}
+    else:
+        with pytest.raises(ExecutorError, match="has lost all its workers"):
+            remote.DaskExecutor._awaited(executor, Future(looks))

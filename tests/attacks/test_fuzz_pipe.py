@@ -1,0 +1,246 @@
+"""Random bytes where the harness reads what others wrote: a known state, or an error that says why.
+
+With ``--long``, thousands of each. Never a traceback, much memory, or many seconds.
+"""
+
+import io
+import json
+import os
+import resource
+import tempfile
+import time
+from collections import deque
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from oodd_eval.errors import OoddError
+from oodd_eval.plugins.isolation import Channel, supervisor
+from oodd_eval.results.directory import RECORDS, ResultsDirectory, ScoreFile
+from oodd_eval.results.fits import INDEX, FitStore
+from oodd_eval.results.record import STATUSES, Record
+from oodd_eval.scoring.unit import Scored
+
+MOST_SECONDS, MOST_BYTES = 20, 500 * 10**6
+
+LENGTHS = {"calibration": [5, 6], "test/nominal": [7]}
+RECORD = Record(
+    detector="a", detector_version="1", plugin="p:a", parameters={"x": 1}, environment="ant",
+    anomaly="iid", group="sensor", horizon=1, seed=0, split="s", split_digest="0" * 64,
+    status="ok", protocol=2, metrics={}, scores="a-ant-0",
+).to_json()  # fmt: skip
+
+
+@pytest.fixture
+def fuzzed(request):
+    """Run a function on examples: a few, or thousands with --long."""
+    count = 3000 if request.config.getoption("--long") else 60
+
+    def run(strategy, tried):
+        settled = settings(
+            max_examples=count, deadline=None, database=None, derandomize=count == 60,
+            suppress_health_check=list(HealthCheck),
+        )  # fmt: skip
+        settled(given(strategy)(bounded(tried)))()
+
+    return run
+
+
+def bounded(tried):
+    def one(case):
+        start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        tried(case)
+        assert time.monotonic() - start < MOST_SECONDS
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        assert grown * 1024 < MOST_BYTES
+
+    return one
+
+
+ANY = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner),
+    max_leaves=6,
+)
+FIT = st.fixed_dictionaries(
+    {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": st.booleans() | ANY}
+)
+NAMES = st.sampled_from(["status", "reason", "type", "pid", "forked", "seconds_score",
+                         "peak_rss_mb", "seconds_fit", "warm_up", "explains"])  # fmt: skip
+KNOWN = st.sampled_from(["array", "explanation", "error", "ok", "oom", "timeout", 0, 1.5, True])
+MESSAGE = FIT | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
+JSON = MESSAGE.map(lambda message: json.dumps(message).encode())
+
+
+@st.composite
+def saved(draw):
+    """An array as a worker sends it, with some bytes of it changed."""
+    kind = draw(st.sampled_from(["f8", "f4", "i4", "c16", "S3", "?", "M8[s]", "V0", "i4,f8"]))
+    shape = draw(st.sampled_from([(30,), (2, 30), (0,), (), (30, 1), (29,), (10**4,)]))
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(shape, kind), allow_pickle=False)
+    return draw(damaged(st.just(buffer.getvalue())))
+
+
+@st.composite
+def damaged(draw, contents):
+    content = bytearray(draw(contents))
+    for _ in range(draw(st.integers(0, 3))):
+        place = draw(st.integers(0, max(0, len(content) - 1)))
+        part = draw(st.binary(max_size=4))
+        if draw(st.booleans()):
+            content[place : place + len(part)] = part
+        elif draw(st.booleans()):
+            content[place:place] = part
+        else:
+            del content[place : place + draw(st.integers(1, 40))]
+    return bytes(content)
+
+
+def framed(content):
+    return len(content).to_bytes(8, "little") + content
+
+
+FRAME = (JSON | saved() | st.binary(max_size=50) | damaged(JSON)).map(framed)
+GOOD = [{"seconds_fit": 0.1, "warm_up": 0, "explains": False}, {"type": "array"}]
+PREFIX = b"".join(framed(json.dumps(message).encode()) for message in GOOD)
+TALK = st.lists(FRAME, max_size=6).map(b"".join)
+TALKS = TALK | damaged(TALK) | TALK.map(PREFIX.__add__) | saved().map(lambda a: PREFIX + framed(a))
+
+
+def child_of(descriptor):
+    """What the supervisor knows of a worker, without one."""
+    return SimpleNamespace(
+        channel=Channel(descriptor, -1), elapsed=1.0, peak=10**6, together=max,
+        watch=lambda pid, forked: None,
+    )  # fmt: skip
+
+
+def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
+    seen = set()
+
+    def tried(talk):
+        reading, writing = os.pipe()
+        with suppress(BlockingIOError):
+            os.set_blocking(writing, False)
+            os.write(writing, talk)
+        os.close(writing)
+        child, outcome = child_of(reading), supervisor.Outcome()
+        child.end = lambda: ""
+        child.wait_for_exit = lambda seconds: False
+        expected = deque([("array", 30), ("array", 30)])
+        try:
+            supervisor._converse(child, outcome, Future(), expected)
+        except supervisor.GivenUpError as error:
+            outcome.status, outcome.reason = error.status, error.reason
+        except (OoddError, LookupError, TypeError, ValueError, OverflowError):
+            outcome.status, outcome.reason = "error", "garbled"
+        finally:
+            os.close(reading)
+        scored = Scored(outcome.status, outcome.reason)
+        assert scored.status in STATUSES
+        assert scored.reason or scored.status == "ok" or outcome.reason == ""
+        line = json.loads(RECORD) | {"status": scored.status, "reason": scored.reason}
+        Record.from_json(json.dumps(line))
+        seen.add(scored.status)
+
+    fuzzed(TALKS, tried)
+    assert "error" in seen
+
+
+def test_the_errors_of_a_conversation_are_those_that_a_run_expects():
+    """The test above takes the errors for garbled that `run_isolated` takes for it."""
+    source = Path(supervisor.__file__).read_text()
+    assert "except (ChannelGarbledError, LookupError, TypeError, ValueError, OverflowError)" in (
+        source
+    )
+
+
+@contextmanager
+def directory():
+    with tempfile.TemporaryDirectory() as path:
+        results = ResultsDirectory(path)
+        results.prepare()
+        yield results
+
+
+LINES = st.lists(damaged(st.just(RECORD.encode())) | st.just(RECORD.encode()), max_size=3)
+RECORDS_FILES = damaged(LINES.map(b"\n".join)) | st.binary(max_size=99)
+VALUES = st.tuples(st.sampled_from(sorted(json.loads(RECORD))), ANY).map(
+    lambda pair: json.dumps(json.loads(RECORD) | {pair[0]: pair[1]}).encode() + b"\n"
+)
+
+
+def test_whatever_stands_in_the_records_is_read_or_refused(fuzzed):
+    def tried(content):
+        with directory() as results:
+            (results.path / RECORDS).write_bytes(content)
+            with suppress(OoddError):
+                records = results.records()
+                assert len(results.merge_records(records)) <= len(records)
+                assert results.merge_records([]) == results.records()
+
+    fuzzed(RECORDS_FILES | VALUES, tried)
+
+
+def test_a_line_that_somebody_copied_is_one_record():
+    """The test above found it: further runs ended with an internal error."""
+    with directory() as results:
+        (results.path / RECORDS).write_text(f"{RECORD}\n{RECORD}\n")
+        assert len(results.merge_records(results.records())) == 1
+
+
+def score_file():
+    parts = {p: [np.arange(float(n)) for n in sizes] for p, sizes in LENGTHS.items()}
+    return ScoreFile(parts, {"seconds_fit": 1.0, "steps_scored": 18.0}, order=3)
+
+
+@pytest.fixture(scope="module")
+def scores():
+    """The bytes of a score file."""
+    with directory() as results:
+        results.write_scores("a", score_file())
+        return (results.path / "scores" / "a.h5").read_bytes()
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_whatever_stands_in_a_score_file_is_read_or_not_used(fuzzed, scores, sealed):
+    """Without a digest, HDF5 itself gets to see the bytes."""
+
+    def tried(content):
+        with directory() as results:
+            results.write_scores("a", score_file())
+            file, digest = (results.path / "scores" / f"a.{end}" for end in ("h5", "sha256"))
+            if sealed:
+                assert content == scores or results.scores("a", LENGTHS)
+            else:
+                digest.unlink()
+            file.write_bytes(content)
+            found = results.scores("a", LENGTHS)
+            assert found is None or {p: [*map(len, s)] for p, s in found.parts.items()} == LENGTHS
+            assert found is None or not sealed or content == file.read_bytes()
+            results.write_scores("a", score_file())
+            assert results.scores("a", LENGTHS)
+
+    fuzzed(damaged(st.just(scores)), tried)
+
+
+def test_whatever_stands_in_the_index_of_a_fit_is_a_fit_or_none(fuzzed):
+    def tried(content):
+        with tempfile.TemporaryDirectory() as path:
+            store = FitStore(Path(path))
+            with store.filling() as place:
+                (place / "weights").write_text("1")
+                store.keep("key", place, 2.0)
+            (Path(path) / "key" / INDEX).write_bytes(content)
+            found = store.find("key")
+            assert found is None or 0 <= found.seconds_fit < np.inf
+
+    whole = b'{"files": {"weights": "%s"}, "seconds_fit": 2.0}'
+    fuzzed(damaged(st.just(whole)) | JSON | st.binary(max_size=50), tried)

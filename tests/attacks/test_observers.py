@@ -1,0 +1,147 @@
+"""Observers that want to change a result, or to end the run: nothing of either happens."""
+
+import json
+import sys
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import load_split
+from oodd_eval.cli.main import main
+from oodd_eval.plugins import hookimpl
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import run
+
+VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
+
+
+def outcome(tiny_split, output, **settings):
+    """Records of a run of two detectors, as bytes, those that were written among them."""
+    split, plugins = load_split(tiny_split), discover()
+    plan = make_plan(
+        plugins, split=split, detectors=["clock", "persistence"], environments=["cartpole"],
+        anomalies=["iid", "gravity"],
+    )  # fmt: skip
+    results = ResultsDirectory(output)
+    done = run(plan, split, plugins, RunSettings(jobs=1, **settings), results)
+    records = [*done.records, *results.records()]
+    plain = [json.loads(record.to_json()) for record in records]
+    return [{k: v for k, v in p.items() if k not in VOLATILE} for p in plain], plugins.broken
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tiny_split, tmp_path_factory):
+    return outcome(tiny_split, tmp_path_factory.mktemp("undisturbed"))[0]
+
+
+SET = "object.__setattr__"
+CHANGES = {
+    "a metric": ("oodd_cell_finished(record)", "record.metrics['auc_matched'] = None"),
+    "all metrics": ("oodd_cell_finished(record)", "record.metrics.clear()"),
+    "a value": ("oodd_cell_finished(record)",
+                f"[{SET}(m, 'value', 1.0) for m in record.metrics.values()]"),
+    "terms": ("oodd_cell_finished(record)",
+              "[t.append(9.0) for pair in record.per_trajectory.values() for t in pair]"),
+    "parameters of a record": ("oodd_cell_finished(record)", "record.parameters['x'] = 1"),
+    "counts": ("oodd_cell_finished(record)", "record.counts['test'] = 10**6"),
+    "a status": ("oodd_cell_finished(record)", f"{SET}(record, 'status', 'error')"),
+    "a name": ("oodd_cell_finished(record)", f"{SET}(record, 'detector', 'best')"),
+    "provenance": ("oodd_cell_finished(record)", f"{SET}(record, 'provenance', None)"),
+    "the units of a plan": ("oodd_run_started(plan)", f"{SET}(plan, 'units', plan.units[:1])"),
+    "the limit of a plan": ("oodd_run_started(plan)", f"{SET}(plan, 'limit', 1)"),
+    "the split of a plan": ("oodd_run_started(plan)", f"{SET}(plan, 'split', 'other')"),
+    "groups of anomalies": ("oodd_run_started(plan)",
+                            "[plan.groups.update({k: 'sensor'}) for k in plan.groups]"),
+    "parameters of a plan": ("oodd_run_started(plan)",
+                             "[u.parameters.update(x=1) for u in plan.units]"),
+    "what is shown of a plan": ("oodd_run_started(plan)",
+                                "[u.shown.update(x=1) for u in plan.units]"),
+    "a seed": ("oodd_run_started(plan)", f"[{SET}(u, 'seed', 7) for u in plan.units]"),
+    "a key": ("oodd_run_started(plan)", f"[{SET}(u, 'scores_key', '../x') for u in plan.units]"),
+    "the plug-in of a unit": ("oodd_unit_started(unit)", f"{SET}(unit, 'plugin', 'riqn')"),
+    "anomalies of a unit": ("oodd_unit_started(unit)", f"{SET}(unit, 'anomalies', ())"),
+    "parameters of a unit": ("oodd_unit_started(unit)", "unit.parameters.update(x=1)"),
+    "the list of records": ("oodd_run_finished(records)", "records.clear()"),
+    "records at the end": ("oodd_run_finished(records)", "[r.metrics.clear() for r in records]"),
+    "the directory": ("oodd_cell_finished(record)", "os.chdir('/')"),
+}  # fmt: skip
+
+
+def install_observer(monkeypatch, path, hook, change):
+    code = f"import os\n@hookimpl\ndef {hook}: {change}"
+    install(monkeypatch, path / "plugin", "meddler", code, group="oodd_eval.observers")
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_an_observer_that_changes_what_it_gets_changes_nothing(
+    tiny_split, undisturbed, monkeypatch, tmp_path, name
+):
+    install_observer(monkeypatch, tmp_path, *CHANGES[name])
+    monkeypatch.chdir(tmp_path)
+    found, broken = outcome(tiny_split, "out")
+    assert found == undisturbed
+    assert [b.reason for b in broken] == []
+    assert (tmp_path / "out" / "records.jsonl").exists()
+
+
+def test_each_observer_gets_a_copy_of_its_own(tiny_split, monkeypatch, tmp_path):
+    code = "@hookimpl\ndef oodd_cell_finished(record): record.metrics.clear()"
+    install(monkeypatch, tmp_path / "a", "early", code, group="oodd_eval.observers")
+    code = """
+    SEEN = []
+    @hookimpl
+    def oodd_cell_finished(record): SEEN.append(len(record.metrics))
+    """
+    install(monkeypatch, tmp_path / "b", "late", code, group="oodd_eval.observers")
+    outcome(tiny_split, tmp_path / "out")
+    assert all(sys.modules["oodd_late"].SEEN)
+
+
+HOOKS = ("oodd_run_started", "oodd_unit_started", "oodd_cell_finished", "oodd_run_finished")
+ENDS = ("sys.exit(0)", "sys.exit()", "raise GeneratorExit", "raise BaseException('x')")
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+@pytest.mark.parametrize("end", ENDS)
+def test_an_observer_that_leaves_is_noted_and_all_cells_are_done(
+    tiny_split, undisturbed, monkeypatch, tmp_path, hook, end
+):
+    install_observer(monkeypatch, tmp_path, f"{hook}()", f"import sys; {end}")
+    found, broken = outcome(tiny_split, tmp_path / "out")
+    assert found == undisturbed
+    assert [b.plugin for b in broken] == ["meddler"]
+
+
+WRAPPERS = {
+    "old": "@hookimpl(hookwrapper=True)\ndef oodd_cell_finished():\n    yield\n    sys.exit(0)",
+    "new": "@hookimpl(wrapper=True)\ndef oodd_cell_finished():\n    yield\n    sys.exit(0)",
+    "before": "@hookimpl(wrapper=True)\ndef oodd_cell_finished():\n    sys.exit(0)\n    yield",
+    "never yields": "@hookimpl(wrapper=True)\ndef oodd_cell_finished():\n    return\n    yield",
+}
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_a_wrapper_of_a_hook_that_leaves(tiny_split, undisturbed, monkeypatch, tmp_path, name):
+    install(monkeypatch, tmp_path / "plugin", "meddler", WRAPPERS[name],
+            group="oodd_eval.observers")  # fmt: skip
+    found, broken = outcome(tiny_split, tmp_path / "out")
+    assert found == undisturbed
+    assert [b.plugin for b in broken] == ["meddler"]
+
+
+def test_a_command_in_which_something_leaves_does_not_end_with_0(tiny_split, monkeypatch, capsys,
+                                                                 tmp_path):  # fmt: skip
+    class Leaver:
+        @hookimpl
+        def oodd_cell_finished(self):
+            sys.exit(0)
+
+    monkeypatch.setattr("oodd_eval.cli.run.TerminalReporter", lambda *_, **__: Leaver())
+    command = ["run", "--detector", "clock", "--env", "cartpole", "--split", str(tiny_split),
+               "--output", str(tmp_path / "out")]  # fmt: skip
+    assert main(command) == 3
+    assert "called sys.exit(0)" in capsys.readouterr().err
+    assert main(["--version"]) == main(["run", "--help"]) == 0
