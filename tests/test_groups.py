@@ -182,7 +182,7 @@ def test_a_fit_with_running_threads_is_loaded_anew_for_every_group(plugin, tiny_
     for _ in range(2):  # fitted and saved, then loaded
         kept = first("threads-saved", tiny_split, output=tmp_path / "out")
         assert repr(kept.metrics) == repr(plain.metrics)
-        for file in (tmp_path / "out" / "scores").iterdir():
+        for file in (tmp_path / "out" / "scores").glob("*.h5"):
             file.unlink()
 
 
@@ -282,7 +282,7 @@ def test_actions_are_withheld_from_whoever_does_not_declare_them(plugin, tiny_sp
     for name in ("acts", "acts-both"):
         results = tiny_split.parent / f"out-{name}"
         evaluate(name, split, environments="hopper", anomalies="iid", output=results)
-        (file,) = (results / "scores").iterdir()
+        (file,) = (results / "scores").glob("*.h5")
         with h5py.File(file) as scores:
             shown[name] = float(np.max(scores["test/iid/scores"][:]))
     width = split.environment("hopper").train[0].action_dim
@@ -324,7 +324,7 @@ def test_the_order_is_drawn_anew_and_stored(plugin, tiny_split, tmp_path, monkey
     for name in ("one", "two"):
         monkeypatch.setenv("ARRIVALS", str(tmp_path / f"{name}.txt"))
         first("notes", tiny_split, output=tmp_path / name)
-        (file,) = (tmp_path / name / "scores").iterdir()
+        (file,) = (tmp_path / name / "scores").glob("*.h5")
         with h5py.File(file) as scores:
             (order,) = {scores[part].attrs["order"] for part in PARTS_SCORED}
         orders.append(int(order))
@@ -345,7 +345,7 @@ def test_parts_of_several_runs_keep_their_orders(plugin, tiny_split, tmp_path):
     for anomaly in ("iid", "drift"):
         evaluate("plain", tiny_split, environments="hopper", anomalies=anomaly,
                  output=tmp_path / "out")  # fmt: skip
-        (file,) = (tmp_path / "out" / "scores").iterdir()
+        (file,) = (tmp_path / "out" / "scores").glob("*.h5")
         with h5py.File(file, "r+") as scores:
             if anomaly == "iid":
                 for part in ("calibration", "test/nominal", "test/iid"):

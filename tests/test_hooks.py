@@ -148,7 +148,7 @@ def test_a_detector_from_a_spec_runs_in_a_worker(watched, monkeypatch, tmp_path,
     done = run(plan, split, plugins, RunSettings(jobs=1), results)
     assert [(r.status, r.detector) for r in done.records] == [("ok", "mine:7")]
     assert str(done.records[0].cell) == f"{split.name}/cartpole/iid::mine:7[h=1,seed=0]"
-    (kept,) = (tmp_path / "out" / "scores").iterdir()
+    (kept,) = (tmp_path / "out" / "scores").glob("*.h5")
     assert kept.name.startswith("mine-7-cartpole-")
     again = run(plan, split, discover(), RunSettings(jobs=1), results)
     assert [r.status for r in again.records] == ["ok"]

@@ -186,7 +186,7 @@ def test_results_are_loaded_again(tiny_split, tmp_path):
     found = load_results(tmp_path / "out", tiny_split)
     assert found.rows == ("range",)
     assert found.scores("hopper", "iid").scores.shape
-    for file in (tmp_path / "out" / "scores").iterdir():
+    for file in (tmp_path / "out" / "scores").glob("*.h5"):
         file.unlink()
     with pytest.raises(ResultsError, match="no scores that fit the split"):
         found.scores("hopper", "iid")
