@@ -351,6 +351,7 @@ def test_parts_of_several_runs_keep_their_orders(plugin, tiny_split, tmp_path):
                 for part in ("calibration", "test/nominal", "test/iid"):
                     del scores[part].attrs["order"]
                 scores.attrs["order"] = 7.0
+                file.with_suffix(".sha256").unlink()  # old versions wrote none
                 continue
             orders = {part: scores[part].attrs["order"] for part in PARTS_SCORED}
     assert orders.pop("test/iid") == 7.0
