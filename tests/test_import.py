@@ -349,7 +349,7 @@ def test_a_file_that_points_into_another_is_refused(tmp_path):
     as_hdf5(tmp_path)
     with h5py.File(tmp_path / "train.h5", "a") as file:
         file["leak"] = h5py.ExternalLink("calibration.h5", "run-0")
-    with pytest.raises(TrajectoryError, match="holds leak, which points elsewhere: refused"):
+    with pytest.raises(TrajectoryError, match="holds 'leak', which points elsewhere: refused"):
         imported(tmp_path, "hdf5")
 
 

@@ -35,7 +35,7 @@ TRAJECTORIES, LENGTH = 110, 10_000
 
 
 def write_large_split(directory):
-    """Write a split whose training part is all zeros, which take no room in the file."""
+    """Write a split whose training part is all zeros, larger than what reading may cost."""
     make_split(directory, ("hopper",))
     steps = TRAJECTORIES * LENGTH
     with h5py.File(directory / "hopper.h5", "r+") as file:
@@ -46,7 +46,7 @@ def write_large_split(directory):
             columns = train[name].shape[1:]
             del train[name]
             size += train.create_dataset(
-                name, (rows, *columns), "<f4", chunks=(5000, *columns)
+                name, data=np.zeros((rows, *columns), "<f4"), chunks=(5000, *columns)
             ).nbytes
         for name, array in (
             ("offsets", np.arange(TRAJECTORIES + 1) * LENGTH),

@@ -625,7 +625,7 @@ def test_an_ended_episode_is_terminated_and_a_capped_one_truncated(tmp_path):
         terminated = property(lambda self: np.arange(len(self)) % 2 == 0)
 
     data = load_split(split).environment("cartpole")
-    part = Ended(data._file, "train")
+    part = Ended(data._parts, "train")
     minari._write(tmp_path / "d", "x-v0", data, part, load_split(split))
     with h5py.File(tmp_path / "d" / "x-v0" / "data" / "main_data.hdf5") as file:
         for i in range(len(part)):

@@ -184,6 +184,9 @@ OWN_SEED_BASES: Final = range(10, 900)
 NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
 """Names of environments and anomalies: they become names of files and groups."""
 
+FIRST_ONSET: Final = 30
+"""First row at which a recorded anomaly may begin."""
+
 BRIEF_TAIL: Final = 20
 """A part whose episodes last fewer transitions beyond their onsets, in the median, is *brief*."""
 

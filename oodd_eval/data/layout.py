@@ -38,12 +38,12 @@ from oodd_eval.data.parts import (
     TRAIN,
     TWINS,
     anomalies_in,
-    groups_in,
 )
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
+MOST_MANIFEST: Final = 10**7  # bytes
 
 NOMINAL_DTYPES: Final = {
     **dict.fromkeys(("observations", "actions", "rewards"), "<f4"),
@@ -57,6 +57,7 @@ ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
 _BLOCK: Final = 1 << 21  # bytes that are held at once while content is digested or written
+_LONGEST: Final = 1 << 26  # bytes of one block where chunks are longer
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -102,21 +103,27 @@ def dtypes_of(group: str) -> dict[str, str]:
     return dict(NOMINAL_DTYPES if group in NOMINAL else ANOMALOUS_DTYPES)
 
 
-def check_layout(file: str, name: str, group: h5py.Group) -> None:
+def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
     """Raise `SplitError` unless a group has the datasets, dtypes and lengths it must have."""
-    where = f"{file}, group {name}"
-    for dataset, dtype in dtypes_of(name).items():
+    where, dtypes = f"{file}, group {name}", dtypes_of(name)
+    if more := sorted({*group} - {*dtypes}):
+        raise SplitError(f"{where} holds {more[0]!r}, expected {', '.join(dtypes)} alone")
+    for dataset, dtype in dtypes.items():
         if dataset not in group:
             raise SplitError(f"{where} lacks the dataset {dataset!r}: build or fetch it again")
-        found = group[dataset].dtype
+        found, shape = group[dataset].dtype, group[dataset].shape
         if found.hasobject or not found.str.startswith(dtype):
             raise SplitError(f"{where}, {dataset} has dtype {found.str}, expected {dtype}")
+        dimensions = 2 if dataset in {"observations", "actions"} else 1
+        if len(shape) != dimensions:
+            raise SplitError(f"{where}, {dataset} has shape {shape}, expected {dimensions} of them")
     offsets = group["offsets"][:]
     n = len(offsets) - 1
-    if n < 0 or offsets[0] != 0 or (np.diff(offsets) < 1).any():
+    # Differences of numbers from 0 on do not overflow.
+    if n < 0 or offsets[0] != 0 or (offsets < 0).any() or (np.diff(offsets) < 1).any():
         raise SplitError(f"{where}: offsets must start at 0 and rise by at least 1 per trajectory")
     total = int(offsets[-1])
-    lengths = dict.fromkeys(dtypes_of(name), n)
+    lengths = dict.fromkeys(dtypes, n)
     lengths |= {"observations": total + n, "actions": total, "rewards": total, "offsets": n + 1}
     for dataset, expected in lengths.items():
         if len(group[dataset]) != expected:
@@ -136,37 +143,44 @@ def check_layout(file: str, name: str, group: h5py.Group) -> None:
             )
 
 
-def check_names(file: str, stored: h5py.File) -> None:
+def check_names(file: str, parts: Mapping[str, Mapping[str, Any]]) -> None:
     """Raise `SplitError` unless a file names each column of its observations and actions."""
     for kind, columns in (("sensors", "observations"), ("actions", "actions")):
-        if f"{NAMES}/{kind}" not in stored:
+        if kind not in parts[NAMES]:
             raise SplitError(f"{file} lacks the names of its {kind}: build or fetch it again")
-        names = stored[f"{NAMES}/{kind}"]
+        names = parts[NAMES][kind]
         if names.dtype.kind != "S":
             raise SplitError(f"{file}, {NAMES}/{kind} has dtype {names.dtype.str}, expected |S")
-        for part in groups_in(stored):
-            shape = stored[f"{part}/{columns}"].shape
-            if (*shape[1:], len(shape)) != (len(names), 2):
+        for part in (part for part in parts if part != NAMES):
+            shape = parts[part][columns].shape
+            if shape[1:] != names.shape:
                 raise SplitError(
                     f"{file}, group {part}: {columns} have shape {shape}, expected "
                     f"{len(names)} columns, since {NAMES} has as many {kind}"
                 )
 
 
-def content_digest(group: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size."""
+def content_digest(
+    group: Mapping[str, Any], seen: Callable[[str, int, NDArray[Any]], None] | None = None
+) -> str:
+    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size.
+
+    `seen`, if given, is called with each block: name, number of its first row, rows.
+    """
     sha = hashlib.sha256()
     for name in sorted(group):
         data = group[name]
         little = data.dtype.newbyteorder("<")
         sha.update(f"{name}|{little.str}|{data.shape}|".encode())
-        # In whole chunks, so that each is decompressed once.
+        # In whole chunks, so that each is decompressed once, unless they are very long.
         row = max(1, int(np.prod(data.shape[1:], dtype=np.int64)) * data.dtype.itemsize)
         chunk = (getattr(data, "chunks", None) or (1,))[0]
-        step = chunk * max(1, _BLOCK // (row * chunk))
+        step = min(chunk * max(1, _BLOCK // (row * chunk)), max(1, _LONGEST // row))
         for start in range(0, len(data), step):
             block = np.asarray(data[start : start + step]).astype(little, copy=False)
             sha.update(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
+            if seen:
+                seen(name, start, block)
     return sha.hexdigest()
 
 
@@ -240,17 +254,19 @@ def write_environment(
     entries: dict[str, dict[str, Any]] = {}
     with replacing(path) as partial, h5py.File(partial, "w", libver="v110") as file:
         file.attrs["schema"] = SCHEMA
+        written = {NAMES: file.create_group(NAMES)}
         for kind, quantities in names.items():
-            _write(file.require_group(NAMES), kind, pack_parameters(quantities), "|S")
+            _write(written[NAMES], kind, pack_parameters(quantities), "|S")
         for name, arrays in groups:
             group = file.create_group(name)
             for dataset, dtype in dtypes_of(name).items():
                 _write(group, dataset, arrays[dataset], dtype)
+            written[name] = group
             check_layout(path.name, name, group)
             n, total = len(group["seeds"]), int(group["offsets"][-1])
             digest = content_digest(group)
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
-        check_names(path.name, file)
+        check_names(path.name, written)
     entry = {"groups": entries, **names, **(own or {})}
     return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
 
@@ -280,7 +296,9 @@ def _manifest_schema() -> Any:
         typed = {name: core_schema.typed_dict_field(field) for name, field in fields.items()}
         return core_schema.typed_dict_schema(typed, extra_behavior="allow")
 
-    text, by_name = core_schema.str_schema(), core_schema.dict_schema
+    # What is printed may not steer a terminal.
+    text = core_schema.str_schema(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$")
+    by_name = core_schema.dict_schema
     name = core_schema.str_schema(pattern=f"^{NAME_PATTERN}$")
     parts = core_schema.str_schema(
         pattern=f"^(train|calibration|test/{NAME_PATTERN}(@[a-z0-9.-]{{1,32}})?)$"
@@ -333,7 +351,11 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 
     file = directory / MANIFEST
     try:
-        manifest: dict[str, Any] = _manifest_schema().validate_json(file.read_bytes())
+        with file.open("rb") as content:
+            read = content.read(MOST_MANIFEST + 1)
+        if len(read) > MOST_MANIFEST:
+            raise SplitError(f"{file} has more than the {MOST_MANIFEST} bytes that it may have")
+        manifest: dict[str, Any] = _manifest_schema().validate_json(read)
     except ValidationError as error:
         problems = error.errors(include_url=False)
         other = next((p["input"] for p in problems if p["loc"] == ("schema",)), None)
@@ -356,10 +378,17 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         if environment not in ENVIRONMENTS and "own" not in entry:
             raise SplitError(f"{file} has an unknown environment {environment!r}, of which it says "
                              "nothing: build or import it again")  # fmt: skip
+        if lacking := [part for part in NOMINAL if part not in entry["groups"]]:
+            raise SplitError(f"{file} has no group {lacking[0]!r} of {environment}, expected "
+                             f"{', '.join(NOMINAL)}: build or fetch it again")  # fmt: skip
         if unknown := sorted(kinds - {*ANOMALIES, *said}):
             raise SplitError(f"{file} has an unknown anomaly {unknown[0]!r} in {environment}, of "
                              "which it says nothing: build or import it again")  # fmt: skip
-    expected = split_digest(manifest["environments"], manifest["definition"])
+    try:
+        expected = split_digest(manifest["environments"], manifest["definition"])
+    except (ValueError, RecursionError) as error:
+        raise SplitError(f"{file} has no digest, as its entries are no plain JSON ({error}): "
+                         "build or fetch it again") from None  # fmt: skip
     if manifest["digest"] != expected:
         raise SplitError(
             f"{file} names the digest {manifest['digest']}, but its entries make {expected}: "

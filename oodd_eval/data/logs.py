@@ -21,16 +21,15 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import Quantity
-from oodd_eval.data.fetch import pointing_elsewhere
-from oodd_eval.errors import TrajectoryError, UsageError
+from oodd_eval.data.stored import BROKEN, child
+from oodd_eval.errors import SplitError, TrajectoryError, UsageError
 from oodd_eval.names import check_known
 
 MOST_BYTES: Final = 2**28  # of one array, and of one text file
 ONSETS: Final = "onsets.csv"
 ARRAYS: Final = ("observations", "actions", "rewards", "onset")
 _NUMBERS: Final = "fiub"  # kinds of dtypes
-_BROKEN: Final = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError,
-                  NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+_BROKEN: Final = (*BROKEN, EOFError, zipfile.BadZipFile, zlib.error)
 
 Array = NDArray[Any]
 
@@ -262,12 +261,12 @@ def _groups(path: Path) -> Iterator[Log]:
     """Read the groups of an HDF5 file, each an episode; nothing may lie in another file."""
     try:
         with h5py.File(path, "r") as file:
-            if elsewhere := pointing_elsewhere(file):
-                raise TrajectoryError(f"{path} {elsewhere}: refused")  # noqa: TRY301
             for name in sorted(file, key=_natural):
-                yield _group(f"{path}, group {name}", name, file[name])
+                yield _group(f"{path}, group {name}", name, child(file, name))
     except TrajectoryError:
         raise
+    except SplitError as error:
+        raise TrajectoryError(str(error)) from None
     except _BROKEN as error:
         raise _broken(str(path), error) from error
 
@@ -278,13 +277,15 @@ def _group(where: str, name: str, group: Any) -> Log:
     found: dict[str, Array] = {}
     for array in (*ARRAYS, "terminations"):
         if array in group:
-            if not isinstance(group[array], h5py.Dataset):
+            dataset = child(group, array)
+            if not isinstance(dataset, h5py.Dataset):
                 raise TrajectoryError(f"{where}, {array} is a group, expected an array of numbers")
-            _must_be_numbers(f"{where}, {array}", group[array].dtype, group[array].size)
-            found[array] = group[array][()]
+            _must_be_numbers(f"{where}, {array}", dataset.dtype, dataset.size)
+            found[array] = dataset[()]
     if "observations" not in found:
         raise TrajectoryError(f"{where} lacks the dataset observations")
-    said = dict(group.attrs) | {k: v for k, v in found.items() if k == "onset"}
+    said = {k: group.attrs[k] for k in ("onset", "seed", "parameters") if k in group.attrs}
+    said |= {k: v for k, v in found.items() if k == "onset"}
     number = {k: int(np.asarray(said[k]).item()) for k in ("onset", "seed") if k in said}
     drawn = json.loads(said["parameters"]) if "parameters" in said else {}
     ended = bool(np.any(found["terminations"])) if "terminations" in found else False

@@ -3,19 +3,27 @@
 Names, onsets and parameters stay with the harness; a detector is handed `Trajectory` objects only.
 """
 
+import contextlib
 import functools
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, Final
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, BRIEF_TAIL, Quantity, in_order, join_condition
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    BRIEF_TAIL,
+    FIRST_ONSET,
+    Quantity,
+    in_order,
+    join_condition,
+)
 from oodd_eval.data.ladder import RUNGS
+from oodd_eval.data.stored import StoredFile
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
+from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
 TRAIN: Final = "train"
@@ -41,13 +49,6 @@ def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
     return tuple(in_order(sorted(tests), CONDITIONS))
 
 
-def groups_in(file: h5py.File) -> list[str]:
-    """Return the parts that an environment's file has."""
-    tests = file.get("test")
-    inner = [f"test/{name}" for name in tests] if isinstance(tests, h5py.Group) else []
-    return [*(part for part in (TRAIN, CALIBRATION) if part in file), *inner]
-
-
 class TrajectorySet(TrajectorySequence):
     """The trajectories of one part, decompressed once, or a few at a time beyond 16 MiB.
 
@@ -55,8 +56,8 @@ class TrajectorySet(TrajectorySequence):
     (n,)) are the transitions of each trajectory and the environment's seeds.
     """
 
-    def __init__(self, file: h5py.File, group: str) -> None:
-        self._data = file[group]
+    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
+        self._data = parts[group]
         self.group = group
         self._offsets: NDArray[np.int64] = self._data["offsets"][:]
         self.lengths: NDArray[np.int64] = np.diff(self._offsets)
@@ -120,16 +121,27 @@ class AnomalousSet(TrajectorySet):
     draws that were rejected.
     """
 
-    def __init__(self, file: h5py.File, group: str) -> None:
-        super().__init__(file, group)
+    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
+        super().__init__(parts, group)
         self.onsets: NDArray[np.int64] = self._data["onsets"][:]
         self.effects: NDArray[np.int64] = self._data["effects"][:]
         self.redraws: NDArray[np.int64] = self._data["redraws"][:]
 
     @functools.cached_property
     def parameters(self) -> list[dict[str, Any]]:
-        """Values that the anomaly drew for each trajectory."""
-        return [json.loads(text) for text in self._data["parameters"][:]]
+        """Values that the anomaly drew for each trajectory; `SplitError` when they are no JSON."""
+        found: list[dict[str, Any]] = []
+        for text in self._data["parameters"][:]:
+            drawn: Any = None
+            with contextlib.suppress(ValueError, RecursionError):
+                drawn = json.loads(text)
+            if not isinstance(drawn, dict):
+                raise SplitError(
+                    f"{self.group}, parameters of trajectory {len(found)} are {text!r:.80}, "
+                    "expected a JSON object: build or fetch the split again"
+                )
+            found.append(drawn)
+        return found
 
     @property
     def tails(self) -> NDArray[np.int64]:
@@ -140,6 +152,76 @@ class AnomalousSet(TrajectorySet):
     def brief(self) -> bool:
         """True when the median tail is under 20: the anomaly ends most episodes at once."""
         return bool(np.median(self.tails) < BRIEF_TAIL)
+
+
+class TwinCheck:
+    """Compares an anomalous part with its twins, in the blocks in which it is read.
+
+    A `recorded` episode is its twin's, bit for bit, up to its onset; before it, imported ones may
+    differ. Of both the effect is the first row from the onset on that differs, or the onset where
+    none does. Nothing is raised before `finish`.
+    """
+
+    def __init__(
+        self, part: Mapping[str, Any], twins: Mapping[str, Any], *, recorded: bool
+    ) -> None:  # fmt: skip
+        self._part, self._twins, self._recorded = part, twins, recorded
+        self._pairs = min(len(part["seeds"]), len(twins["seeds"]))
+        self._first = np.full(len(part["seeds"]), -1)  # rows that differ first
+        self._early = ""
+
+    def __call__(self, name: str, start: int, block: NDArray[Any]) -> None:
+        """Compare rows of a dataset from number `start` on."""
+        if name not in {"observations", "actions"}:
+            return
+        seen = name == "observations"
+        mine, others = (p["offsets"] + seen * np.arange(len(p["offsets"]))
+                        for p in (self._part, self._twins))  # fmt: skip
+        i = int(np.searchsorted(mine, start, side="right")) - 1
+        while i < self._pairs and mine[i] < start + len(block):
+            begin = int(mine[i]) - start
+            common = min(int(mine[i + 1] - mine[i]), int(others[i + 1] - others[i]))
+            onset, effect = (min(int(self._part[k][i]), common) for k in ("onsets", "effects"))
+            spans = [(0, onset)] * self._recorded
+            spans += [(onset, effect + 1), (effect + 1, common)] * seen
+            for low, high in spans:
+                a, b = max(low, -begin), min(high, common, len(block) - begin)
+                if a < b and self._first[i] < 0:
+                    twin = self._twins[name][int(others[i]) + a : int(others[i]) + b]
+                    self._compare(name, i, a, block[begin + a : begin + b], twin, early=b <= onset)
+            i += 1
+
+    def _compare(
+        self, name: str, i: int, row: int, mine: NDArray[Any], twin: NDArray[Any], *, early: bool
+    ) -> None:
+        differs = (mine.view("<u4") != twin.view("<u4")) if early else mine != twin
+        if differs.any() and early:
+            self._early = self._early or f"{name} of trajectory {i} differ from its twin's"
+        elif differs.any():
+            self._first[i] = row + int(differs.any(axis=1).argmax())
+
+    def finish(self, where: str) -> None:
+        """Raise `SplitError` unless all episodes are as they must be."""
+        part, twins = self._part, self._twins
+        if len(part["seeds"]) != len(twins["seeds"]):
+            raise SplitError(f"{where} has {len(part['seeds'])} trajectories, expected "
+                             f"{len(twins['seeds'])}, one for each twin")  # fmt: skip
+        onsets, effects = part["onsets"], part["effects"]
+        found = np.where(self._first < 0, onsets, self._first)
+        for i in np.flatnonzero(part["seeds"] != twins["seeds"]) if self._recorded else ():
+            raise SplitError(f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
+                             f"{twins['seeds'][i]}, expected the same")  # fmt: skip
+        for i in np.flatnonzero(onsets < FIRST_ONSET) if self._recorded else ():
+            raise SplitError(f"{where}: trajectory {i} has its onset at row {onsets[i]}, expected "
+                             f"{FIRST_ONSET} or a later row")  # fmt: skip
+        for i in np.flatnonzero(effects > np.diff(twins["offsets"])):
+            raise SplitError(f"{where}: trajectory {i} has its effect at row {effects[i]}, behind "
+                             "the end of its twin")  # fmt: skip
+        if self._early:
+            raise SplitError(f"{where}: {self._early} before its onset: build or fetch it again")
+        for i in np.flatnonzero(found != effects):
+            raise SplitError(f"{where}: trajectory {i} first differs from its twin at row "
+                             f"{found[i]}, expected its effect, row {effects[i]}")  # fmt: skip
 
 
 class EnvironmentData:
@@ -153,15 +235,17 @@ class EnvironmentData:
     """
 
     def __init__(
-        self, environment: str, file: h5py.File, digest: str, *, discrete: bool = False
-    ) -> None:
-        self.id, self.digest, self.discrete, self._file = environment, digest, discrete, file
-        nominal = (TrajectorySet(file, part) for part in NOMINAL)
+        self, environment: str, file: StoredFile, parts: Mapping[str, Mapping[str, Any]],
+        digest: str, *, discrete: bool = False,
+    ) -> None:  # fmt: skip
+        self.id, self.digest, self.discrete = environment, digest, discrete
+        self._file, self._parts = file, parts
+        nominal = (TrajectorySet(parts, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
-        self.anomalies = anomalies_in(groups_in(file))
+        self.anomalies = anomalies_in(part for part in parts if part != NAMES)
         self.sensors, self.actions = (
-            tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, file[kind][:]))
-            for kind in (f"{NAMES}/sensors", f"{NAMES}/actions")
+            tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, names[:]))
+            for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
         )
 
     def anomalous(self, anomaly: str) -> AnomalousSet:
@@ -177,8 +261,8 @@ class EnvironmentData:
         UnknownNameError
             When this split has no such anomaly.
         """
-        check_known(f"anomaly of {Path(self._file.filename).name}", self.anomalies, anomaly)
-        return AnomalousSet(self._file, f"test/{anomaly}")
+        check_known(f"anomaly of {self._file.name}", self.anomalies, anomaly)
+        return AnomalousSet(self._parts, f"test/{anomaly}")
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:
         """Return the datasets of a part as they are stored.
@@ -188,7 +272,7 @@ class EnvironmentData:
         part
             Such as ``"train"``.
         """
-        return {name: dataset[:] for name, dataset in self._file[part].items()}
+        return {name: dataset[:] for name, dataset in self._parts[part].items()}
 
     def close(self) -> None:
         """Close the file."""

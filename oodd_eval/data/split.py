@@ -4,17 +4,24 @@ import contextlib
 import functools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import h5py
+from typing import Any, Final
 
 from oodd_eval.data import layout
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order, split_condition
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import CONDITIONS, NAMES, TRAIN, EnvironmentData, anomalies_in, groups_in
+from oodd_eval.data.parts import (
+    CONDITIONS,
+    NAMES,
+    TRAIN,
+    TWINS,
+    EnvironmentData,
+    TwinCheck,
+    anomalies_in,
+)
+from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
     SplitError,
@@ -25,6 +32,7 @@ from oodd_eval.errors import (
 from oodd_eval.names import check_known, select
 
 SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
+_MOST_TWINS: Final = 2**27  # bytes of their rows that are kept while the others are compared
 
 
 def data_home() -> Path:
@@ -191,8 +199,9 @@ class Split:
         """
         check_known(f"environment of split {self.name}", self.environments, name)
         with contextlib.ExitStack() as stack:
-            file = stack.enter_context(self._open(name))
-            bad = next((check for check in self._checks(name, file) if not check.ok), None)
+            file = stack.enter_context(contextlib.closing(self._open(name)))
+            parts = self._parts(name, file)
+            bad = next((check for check in self._checks(name, file, parts) if not check.ok), None)
             if bad is not None:
                 raise DigestError(
                     f"{bad.file}, group {bad.group}: content does not match the manifest: expected "
@@ -203,7 +212,7 @@ class Split:
         entry = self.manifest["environments"][name]
         digest = layout.environment_digest(entry)
         discrete = layout.discrete_actions(name, entry)
-        return EnvironmentData(name, file, digest, discrete=discrete)
+        return EnvironmentData(name, file, parts, digest, discrete=discrete)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
@@ -216,44 +225,58 @@ class Split:
     def verify(self) -> Iterator[GroupCheck]:
         """Compare every group with the manifest; `SplitError` when a file cannot be read."""
         for name in self.environments:
-            with self._open(name) as file:
-                yield from self._checks(name, file)
+            with contextlib.closing(self._open(name)) as file:
+                yield from self._checks(name, file, self._parts(name, file))
 
-    def _open(self, name: str) -> h5py.File:
+    def _open(self, name: str) -> StoredFile:
         path = self.path / str(self.manifest["environments"][name]["file"])
         if path.parent != self.path:
             raise SplitError(f"the manifest names a file outside of the split: {path.name}")
-        if not path.exists():
-            raise SplitNotFoundError(f"{path} is missing: build or fetch the split again")
-        try:
-            return h5py.File(path, "r")
-        except OSError as error:
-            raise SplitError(
-                f"{path.name} cannot be read, it is truncated or no HDF5 file ({error}): "
-                "build or fetch it again"
-            ) from error
+        # Installers may link the files of a package.
+        if path.is_symlink() and self.path.parent != SHIPPED:
+            raise SplitError(f"{path} is a link to another file, expected the file: copy it there")
+        return StoredFile(path)
 
-    def _checks(self, name: str, file: h5py.File) -> Iterator[GroupCheck]:
-        short = Path(file.filename).name
+    def _parts(self, name: str, file: StoredFile) -> dict[str, dict[str, Any]]:
+        """Read what is small, look at the sizes of what is not; `SplitError` for other sizes."""
         entry = self.manifest["environments"][name]
-        expected = {group: str(found["sha256"]) for group, found in entry["groups"].items()}
-        held = groups_in(file)
-        if {*held} - {*expected}:
-            raise SplitError(f"{short} holds the groups {held}, expected {[*expected]}")
-        for group, digest in (expected | {NAMES: layout.names_digest(entry)}).items():
-            if group not in file:
-                raise SplitError(f"{short} lacks the group {group}: build or fetch it again")
-            try:
-                if group == NAMES:
-                    layout.check_names(short, file)
-                else:
-                    layout.check_layout(short, group, file[group])
-                found = layout.content_digest(file[group])
-            except (OSError, KeyError, RuntimeError, AttributeError, TypeError) as error:
+        expected = {*entry["groups"], NAMES}
+        held = {*file.groups()} - {"test"} | {f"test/{test}" for test in file.groups("test")}
+        if more := held - expected:
+            raise SplitError(
+                f"{file.name} holds the groups {sorted(more)}, expected none but {sorted(expected)}"
+            )
+        parts = {}
+        for group in (*entry["groups"], NAMES):
+            parts[group] = part = file.part(group)
+            if group == NAMES:
+                layout.check_names(file.name, parts)
+                break
+            layout.check_layout(file.name, group, part)
+            found, said = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
+            if found != (said["trajectories"], said["transitions"]):
                 raise SplitError(
-                    f"{short}, group {group} cannot be read ({error}): build or fetch it again"
-                ) from error
-            yield GroupCheck(short, group, digest, found)
+                    f"{file.name}, {group} has {found[0]} trajectories with {found[1]} "
+                    f"transitions, expected {said['trajectories']} with {said['transitions']}"
+                )
+        return parts
+
+    def _checks(
+        self, name: str, file: StoredFile, parts: Mapping[str, Mapping[str, Any]]
+    ) -> Iterator[GroupCheck]:
+        entry = self.manifest["environments"][name]
+        recorded = "seed_base" in self.manifest["definition"]
+        # Twins are compared with every other part.
+        twins = {key: rows[:] if rows.nbytes <= _MOST_TWINS else rows
+                 for key, rows in parts[TWINS].items()}  # fmt: skip
+        for group, part in parts.items():
+            names = layout.names_digest(entry) if group == NAMES else ""
+            expected = names or str(entry["groups"][group]["sha256"])
+            pairs = TwinCheck(part, twins, recorded=recorded) if "onsets" in part else None
+            found = layout.content_digest(twins if group == TWINS else part, pairs)
+            yield GroupCheck(file.name, group, expected, found)
+            if pairs and found == expected:
+                pairs.finish(f"{file.name}, group {group}")
 
 
 @functools.lru_cache(maxsize=32)

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import split_condition
+from oodd_eval.data.facts import FIRST_ONSET, split_condition
 from oodd_eval.data.own import MEASURED, Measured, environment_spec, info_of, kinds_of
 from oodd_eval.data.simulate.anomalies import draw
 from oodd_eval.data.simulate.environments import Simulator, make
@@ -30,7 +30,6 @@ _Maker = Callable[[Simulator, np.random.Generator], Fault]
 
 GENERATOR_VERSION: Final = 2  # raised by every change that gives other bytes for the same seed
 
-FIRST_ONSET: Final = 30
 LAST_ONSET_SHARE: Final = 0.6
 SHORTEST_TWIN: Final = 50
 SHORTEST_TAIL: Final = 20
