@@ -1,9 +1,20 @@
 """How many attacks there are, by family, and how many of them broke something.
 
-``pytest tests/attacks`` runs them all; with ``--long``, for hours instead of seconds.
+``pytest -m attacks`` runs them all; with ``--long``, random ones for hours instead of seconds.
 """
 
 from collections import Counter
+
+import pytest
+
+PLACE = "tests/attacks/"
+
+
+def pytest_collection_modifyitems(items):
+    """Mark every test of this directory; the default selection leaves them out."""
+    for item in items:
+        if PLACE in item.nodeid:
+            item.add_marker(pytest.mark.attacks)
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -12,7 +23,7 @@ def pytest_terminal_summary(terminalreporter):
     for outcome, count in (("passed", held), ("failed", broke), ("error", broke)):
         for report in terminalreporter.stats.get(outcome, ()):
             path, _, _ = report.nodeid.partition("::")
-            if "tests/attacks/" in path:
+            if PLACE in path:
                 count[path.rpartition("/test_")[2].removesuffix(".py")] += 1
     if held or broke:
         terminalreporter.section("attacks")
