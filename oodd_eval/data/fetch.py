@@ -9,16 +9,19 @@ import contextlib
 import functools
 import hashlib
 import http.client
+import io
+import lzma
 import shutil
 import stat
 import tarfile
+import time
 import urllib.error
 import urllib.request
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 from urllib.parse import quote, urlsplit
 from urllib.request import url2pathname
 
@@ -30,8 +33,12 @@ from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFound
 
 ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
 MOST_ARCHIVE: Final = 10**12
+PATIENCE: Final = 60.0
+SLOWEST: Final = 4096
+"""Seconds in which a download may be slow, and the bytes a second that it must have later."""
 _MIB: Final = 2**20
-_DAMAGED: Final = (EOFError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
+_DAMAGED: Final = (EOFError, ValueError, OverflowError, RuntimeError, NotImplementedError,
+                   zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)  # fmt: skip
 
 Progress = Callable[[str], None]
 Source = Callable[[str, Path, int], None]
@@ -67,6 +74,7 @@ def fetch(
                     found = _bring(source, staging, output, digest, progress)
                 shutil.rmtree(staging, ignore_errors=True)
             finally:
+                shutil.rmtree(staging / "doubtful", ignore_errors=True)
                 # Files beside the manifest are work that a later fetch goes on from.
                 if not any(p.is_file() and p.name != MANIFEST for p in staging.rglob("*")):
                     shutil.rmtree(staging, ignore_errors=True)
@@ -142,10 +150,7 @@ def _bring_file(
     """Fetch and verify one file; one that an earlier attempt has verified stays."""
     file, part = split.path / entry["file"], staging / f"{entry['file']}.part"
     if file.exists():
-        with contextlib.suppress(SplitError):
-            split.environment(environment).close()
-            return
-        file.unlink()
+        return
     # The most bytes that it may have, if nothing in it were compressed, with some to spare.
     sensors, actions = len(entry["sensors"]), len(entry["actions"])
     row = 4 * (sensors + actions + 1)
@@ -153,18 +158,24 @@ def _bring_file(
     sizes = [(g["transitions"], g["trajectories"]) for g in entry["groups"].values()]
     most = 2 * _MIB + sum(_MIB + row * steps + trajectory * n for steps, n in sizes)
     source(file.name, part, most)
-    part.replace(file)
-    try:
-        split.environment(environment).close()
-    except SplitError:
-        file.unlink()
-        raise
+    # What ends the check, or this process, leaves nothing that a later fetch would go on from.
+    doubtful = staging / "doubtful"
+    shutil.rmtree(doubtful, ignore_errors=True)
+    doubtful.mkdir()
+    shutil.copy(split.path / MANIFEST, doubtful)
+    part.replace(doubtful / file.name)
+    Split(doubtful).environment(environment).close()
+    (doubtful / file.name).replace(file)
 
 
 @contextlib.contextmanager
 def _open_source(place: str, archive: Path) -> Iterator[Source]:
     """Give the files at a place; an archive on the web is downloaded to `archive` first."""
-    parts = urlsplit(place)
+    try:
+        parts = urlsplit(place)
+    except ValueError as error:
+        raise UsageError(f"{_plain(place)} is no address ({error}): expected such as "
+                         "https://example.org/split.tar") from None  # fmt: skip
     path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(place)
     if parts.scheme in {"http", "https"}:
         address = place.rstrip("/")
@@ -202,8 +213,10 @@ def _open_archive(path: Path) -> Iterator[Source]:
     """Open a tar or zip archive that holds the files of one split, in its root or one folder."""
     with contextlib.ExitStack() as stack:
         try:
-            kind: Any = zipfile.ZipFile if zipfile.is_zipfile(path) else tarfile.open
+            kind: Any = zipfile.ZipFile if zipfile.is_zipfile(path) else _open_tar
             members = _members(path.name, stack.enter_context(kind(path)))
+        except SplitError:
+            raise
         except (OSError, *_DAMAGED) as error:
             # tarfile's longest message has a line for every kind that it has tried.
             why = (str(error) or type(error).__name__).splitlines()[0].rstrip(":")
@@ -217,10 +230,27 @@ def _open_archive(path: Path) -> Iterator[Source]:
             try:
                 with members[name]() as content:
                     _copy(content, target, most, f"{name} in {path.name}")
+            except SplitError:
+                raise
             except _DAMAGED as error:
                 raise SplitError(f"{path.name} is damaged at {name}: {error}") from error
 
         yield extract
+
+
+class _TarInfo(tarfile.TarInfo):
+    """A member whose extended header, which is read into memory, is no longer than 1 MiB."""
+
+    @classmethod
+    def frombuf(cls, *given: Any) -> Self:
+        found = super().frombuf(*given)
+        if not found.isreg() and found.size > _MIB:
+            raise tarfile.HeaderError(f"a header of {found.size} bytes, expected at most {_MIB}")
+        return found
+
+
+def _open_tar(path: Path) -> tarfile.TarFile:
+    return tarfile.open(path, tarinfo=_TarInfo)
 
 
 def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
@@ -252,6 +282,67 @@ def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
     return members
 
 
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+                         ) -> urllib.request.Request | None:  # fmt: skip
+        old, new = urlsplit(req.full_url).scheme, urlsplit(newurl).scheme
+        if new not in {old, "https"}:
+            raise SplitError(f"{req.full_url} leads to {_plain(newurl)}, expected {old}: refused")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+class _Watched(io.RawIOBase):
+    """What comes from a server, as long as it comes at a speed that ends some time."""
+
+    def __init__(self, raw: Any) -> None:
+        self._raw, self._since, self._bytes = raw, time.monotonic(), 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        got: int | None = self._raw.readinto(buffer)
+        self._bytes += got or 0
+        late = time.monotonic() - self._since - PATIENCE
+        if late > 0 and self._bytes < late * SLOWEST:
+            raise TimeoutError(f"it gives less than {SLOWEST} bytes a second")
+        return got
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _Response(http.client.HTTPResponse):
+    def __init__(self, sock: Any, *arguments: Any, **settings: Any) -> None:
+        super().__init__(sock, *arguments, **settings)
+        self.fp.close()
+        self.fp = io.BufferedReader(_Watched(sock.makefile("rb", buffering=0)))
+
+
+class _Watching(urllib.request.AbstractHTTPHandler):
+    def do_open(self, http_class: Any, req: Any, **settings: Any) -> Any:
+        def connect(*given: Any, **named: Any) -> Any:
+            connection = http_class(*given, **named)
+            connection.response_class = _Response
+            return connection
+
+        return super().do_open(connect, req, **settings)
+
+
+class _Http(_Watching, urllib.request.HTTPHandler):
+    pass
+
+
+class _Https(_Watching, urllib.request.HTTPSHandler):
+    pass
+
+
+def _plain(text: object) -> str:
+    """Return a stranger's text without what steers a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in str(text))[:300]
+
+
 def _download(address: str, target: Path, most: int) -> None:
     """Download a file over http or https, continuing after the bytes that `target` has."""
     have = target.stat().st_size if target.exists() else 0
@@ -260,17 +351,20 @@ def _download(address: str, target: Path, most: int) -> None:
     headers |= {"Range": f"bytes={have}-"} if have else {}
     request = urllib.request.Request(address, headers=headers)  # noqa: S310  http or https
     try:
-        response = urllib.request.urlopen(request, timeout=60)  # noqa: S310
+        # Handlers given here take the place of those that follow a redirect to any scheme.
+        opener = urllib.request.build_opener(_Redirects, _Http, _Https)
+        response = opener.open(request, timeout=60)
     except urllib.error.HTTPError as error:
         error.close()
         if have and error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
             return  # all of it is there
         kind = SplitNotFoundError if error.code in {404, 410} else SplitError
-        raise kind(f"{address} answers {error.code} {error.reason}") from None
-    except (OSError, http.client.HTTPException) as error:
-        raise SplitError(
-            f"{address} cannot be reached: {getattr(error, 'reason', error)}"
-        ) from error
+        raise kind(f"{address} answers {error.code} {_plain(error.reason)}") from None
+    except SplitError:
+        raise
+    except (OSError, http.client.HTTPException, ValueError, OverflowError) as error:
+        reason = _plain(getattr(error, "reason", error))
+        raise SplitError(f"{_plain(address)} cannot be reached: {reason}") from error
     with response:
         if response.status != http.client.PARTIAL_CONTENT:
             have = 0
@@ -279,7 +373,7 @@ def _download(address: str, target: Path, most: int) -> None:
         try:
             _copy(response, target, most, address, have=have)
         except (OSError, http.client.HTTPException) as error:
-            raise SplitError(f"{address} broke off ({error}): {again}") from error
+            raise SplitError(f"{address} broke off ({_plain(error)}): {again}") from error
     got = target.stat().st_size
     if expected is not None and got < expected:
         raise SplitError(f"{address} broke off after {got} of {expected} bytes: {again}")
