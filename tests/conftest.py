@@ -18,8 +18,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from helpers_split import make_split
 
 # Begun in the background of a shell, a process ignores interrupts, and so would those it starts:
-# the tests of interrupted commands would wait in vain.
+# the tests of interrupted commands would wait in vain. So it is with hang-ups under nohup.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # Box2D's extension module warns while it is set up and crashes when a warning is an error there.
 with warnings.catch_warnings(), contextlib.suppress(ImportError):
