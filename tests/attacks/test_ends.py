@@ -69,14 +69,13 @@ def oodd_detectors():
 
 
 def of_run(marker):
-    """Processes whose environment has a mark, or whose parent or session is that of one."""
+    """Processes whose environment has a mark, or that run in the directory which it names."""
     name, _, value = marker.partition("=")
     found = []
-    for process in psutil.process_iter(["pid", "environ", "status", "cmdline"]):
+    for process in psutil.process_iter(["pid", "environ", "status", "cwd"]):
         info = process.info
-        bare = info["cmdline"] == ["sleep", "600"]
         if info["status"] != psutil.STATUS_ZOMBIE and (
-            (info["environ"] or {}).get(name) == value or (bare and not info["environ"])
+            (info["environ"] or {}).get(name) == value or info["cwd"] == value
         ):
             found.append(info["pid"])
     return found
