@@ -63,7 +63,7 @@ def copy(submissions, tmp_path, which="full"):
 
 
 def changed(records, **changes):
-    """Records of a run again in which a metric's terms are others."""
+    """Records of a re-run in which a metric's terms are others."""
     found = []
     for record in records:
         plain = json.loads(record.to_json())
@@ -190,12 +190,12 @@ def test_results_on_seeds_that_were_known_confirm_nothing(entry, tmp_path):
 
 OTHERWISE = {
     "version": ({"detector_version": "9.9"}, "detector_version", "expected '9.9'"),
-    "source": ({"plugin_source": "f" * 64}, "plugin_source", "in the run again"),
+    "source": ({"plugin_source": "f" * 64}, "plugin_source", "in the re-run"),
     "distribution": ({"plugin": "oodd-x:trivial"}, "plugin", "oodd-x:trivial"),
     "failure": ({"status": "timeout", "reason": "slow"}, "status", "timeout"),
-    "random": ({"deterministic": False}, "deterministic", "in the run again"),
-    "alarm": ({"alarm": "score"}, "alarm", "in the run again"),
-    "inputs": ({"inputs": ""}, "inputs", "in the run again"),
+    "random": ({"deterministic": False}, "deterministic", "in the re-run"),
+    "alarm": ({"alarm": "score"}, "alarm", "in the re-run"),
+    "inputs": ({"inputs": ""}, "inputs", "in the re-run"),
     "limited": ({"limit": 3}, "split", "is none without --limit"),
     "protocol": ({"protocol": PROTOCOL + 1}, "split", "is none without --limit"),
     "another-row": ({"horizon": 5}, "persistence", "in 0 environments, expected 3"),

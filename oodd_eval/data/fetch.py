@@ -292,7 +292,7 @@ class _Redirects(urllib.request.HTTPRedirectHandler):
 
 
 class _Watched(io.RawIOBase):
-    """What comes from a server, as long as it comes at a speed that ends some time."""
+    """A server's answer as a raw stream; `TimeoutError` when it stays slower than `SLOWEST`."""
 
     def __init__(self, raw: Any) -> None:
         self._raw, self._since, self._bytes = raw, time.monotonic(), 0

@@ -1,8 +1,8 @@
-"""HDF5 files of strangers: nothing in them is without bound, and none may change under way.
+"""Read HDF5 files of strangers: sizes are bounded, and a change while a file is open is noticed.
 
-HDF5 knows links, content in other files, types of any size and filters that make gigabytes of a few
-bytes. Here a file has groups and plain datasets of its own. Sizes are compared before anything is
-read; what is read later is what was verified, or the change is noticed.
+HDF5 allows links, content in other files, types of any size, and filters that make gigabytes of a
+few bytes. Here a file may hold only groups and plain datasets, and their sizes are checked before
+anything is read.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ ROWS: Final = frozenset({"observations", "actions", "rewards"})
 
 BROKEN: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError,
                  OverflowError, MemoryError)  # fmt: skip
-"""What h5py raises for a damaged file."""
+"""Errors that h5py raises for a damaged file."""
 
 _MOST_LABELS: Final = 2**27  # bytes of all small datasets of a file
 _MOST_CHUNK: Final = 2**26  # bytes that a chunk may have, packed or not

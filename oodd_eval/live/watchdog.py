@@ -170,7 +170,7 @@ class Watchdog:
 
     @property
     def promise(self) -> str:
-        """How rare false alarms are, in words."""
+        """The promise on false alarms as a sentence."""
         if (r := self.run_length) is None:
             alpha, confidence = self.settings.alpha, self.settings.confidence
             sure = f", with {100 * confidence:.3g} % confidence" if confidence else ""

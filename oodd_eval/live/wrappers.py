@@ -17,7 +17,7 @@ except ImportError as error:
     raise MissingExtraError(f"wrappers need {error.name}: pip install 'oodd-eval[sim]'") from error
 
 KEY: Final = "oodd"
-"""Where a reading stands in the info of a step."""
+"""The key of a reading in the info of a step."""
 
 
 class WatchdogWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

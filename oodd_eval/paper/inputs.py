@@ -80,7 +80,7 @@ class Reproduction:
 
 
 class Other(NamedTuple):
-    """What another reproduction has written, to be shown beside one: its tables, as they are.
+    """Tables that another reproduction has written, to be shown beside one.
 
     Lines of CSV by their first columns: of tables by experiment, environment, series, anomalies and
     metric; of claims by claim and kind. Returns are those of the policies.

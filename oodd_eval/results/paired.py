@@ -1,4 +1,4 @@
-"""Whether one row of some results is better than another: the paired bootstrap of a difference."""
+"""Compare two rows of some results by the paired bootstrap of their difference."""
 
 import math
 from collections.abc import Sequence

@@ -1,9 +1,8 @@
-"""The verdict on an entry, and its level of trust: compared with a run again, and granted.
+"""The verdict on an entry, its comparison with a re-run, and the grant of a level of trust.
 
-A run again is on a split of seeds that the submitter could not know. Its numbers are others of the
-same kind. An entry may be better by what chance explains, judged by how much differences vary from
-environment to environment, since in each of them fit, calibration and episodes are drawn apart. The
-code must be the same, by its digest.
+A re-run uses the same code, by its digest, on a split of seeds that the submitter could not know,
+so its numbers differ by chance. How much chance explains is estimated from environments: each has a
+fit, a calibration and episodes of its own. An entry that is better by more than that is refused.
 """
 
 import math
@@ -35,7 +34,7 @@ COMPARED: Final = (
     "auc_matched", "auc", "far_twin", "missed", "delay_censored", "false_episodes_at_5pct",
     "delay_censored_at_5pct",
 )  # fmt: skip
-"""Metrics whose means over a row's cells have to agree with those of a run again."""
+"""Metrics whose means over a row's cells have to agree with those of a re-run."""
 
 LEVEL: Final = 0.05
 """Chance that an honest row is refused: of all `COMPARED` together (Bonferroni)."""
@@ -47,12 +46,12 @@ LEAST: Final = 3
 
 _FIELDS: Final = ("detector_version", "plugin", "plugin_source", "status", "deterministic", "alarm",
                   "inputs")  # fmt: skip
-"""Fields of a record that a run again has, too, on whatever seeds."""
+"""Fields of a record that are the same in a re-run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """The result of a comparison with a run again, in one line and in a line for every row.
+    """The result of a comparison with a re-run, in one line and in a line for every row.
 
     It is confirmed when every row was run again in `LEAST` environments, and all agrees.
     """
@@ -127,7 +126,7 @@ def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings)
         for other in again.get(_place(record), ())[:1]:
             for field in _FIELDS:
                 new, old = getattr(other, field), getattr(record, field)
-                findings.expect(where, field, new, old, "as in the run again")
+                findings.expect(where, field, new, old, "as in the re-run")
     how = f"{place}, {len(both)} of {len(ours)} cells"
     return Rerun(how, lines, confirmed=findings.count == before)
 
@@ -139,7 +138,7 @@ def _place(record: Record) -> _Place:
 def _usable(
     records: Records, fresh: Sequence[Record], findings: Findings
 ) -> tuple[Mapping[_Place, list[Record]], str]:
-    """Return records of a run again by their place, and on what; none where they do not compare."""
+    """Return the records of a re-run by place, and its split in words; none if unusable."""
     first = next(iter(records.values()))
     known = {first.split_digest, *published_digests().values()}
     usable = [r for r in fresh if r.protocol == first.protocol and r.limit is None]
@@ -200,7 +199,7 @@ def _differences(
 
 
 def by_chance(change: Floats, episodes: float = 0.0) -> float:
-    """Return how much better than its run again an honest row's mean may be.
+    """Return by how much the mean of an honest row may be better than that of its re-run.
 
     Half of Student's interval of the mean of paired differences `change`, one an environment, on
     one side, at the level that keeps all of `COMPARED` together to `LEVEL`. Few environments may by
