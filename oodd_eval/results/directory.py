@@ -80,7 +80,7 @@ class ResultsDirectory:
         self.path = Path(path)
         self.fits = FitStore(self.path / "fitted")
         self.notes: list[str] = []
-        self._inode: int | None = None
+        self._has_records = False
 
     def prepare(self) -> None:
         """Make the directory, and find out before any work is done whether it can be used.
@@ -93,13 +93,13 @@ class ResultsDirectory:
                 (self.path / part).mkdir(parents=True, exist_ok=True)
                 with tempfile.TemporaryFile(dir=self.path / part):
                     pass
-            self._inode = self.path.stat().st_ino
         except OSError as error:
             raise OutputError(
                 f"results directory {str(self.path)!r} cannot be written to: {error.strerror}; "
                 "name another with --output"
             ) from None
-        if (self.path / RECORDS).exists():
+        self._has_records = (self.path / RECORDS).exists()
+        if self._has_records:
             self.records()
         for name in (RECORDS, REPORT):  # users may choose a directory that holds files of theirs
             files.remove_abandoned(self.path, name)
@@ -125,23 +125,24 @@ class ResultsDirectory:
         Newer records replace those of the same cell. A failed one is also replaced by one of the
         same cell with other parameters. Earlier records keep their places and new cells follow.
         Places of replaced cells are filled in the order of `records`, so that the end is the same
-        whether records come at once or one by one. `OutputError`: they cannot be written, or the
-        directory was removed since `prepare`; then they are in a new one.
+        whether records come at once or one by one. `OutputError`: they cannot be written, or those
+        that were there were removed meanwhile; then the given ones are in a new file.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
         with files.lock(self.path):
-            earlier = self.records() if (self.path / RECORDS).exists() else []
+            existed = (self.path / RECORDS).exists()
+            earlier = self.records() if existed else []
             merged = _merged(earlier, records)
             text = "".join(record.to_json() + "\n" for record in merged)
             files.write_text(self.path / RECORDS, text)
-        known, self._inode = self._inode, self._inode and self.path.stat().st_ino
-        if known != self._inode:
+        removed, self._has_records = self._has_records and not existed, True
+        if removed:
             raise OutputError(
-                f"results directory {str(self.path)!r} was removed while the run went on: this "
-                "run's records are in a new one, scores from before are gone; run again"
+                f"{RECORDS} of results directory {str(self.path)!r} was removed while the run went "
+                "on: a new one holds what was scored since; run again for the rest"
             )
         return merged
 

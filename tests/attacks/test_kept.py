@@ -387,7 +387,7 @@ def test_a_full_disk_ends_the_command_with_a_message(tiny_split, tmp_path):
 
 @pytest.mark.parametrize("what", ["out", "out/scores", "out/fitted", "out/logs"])
 def test_a_directory_removed_while_running(tiny_split, tmp_path, what):
-    """Of the results directory itself it is told; parts of it are made again."""
+    """If records go with it, the user is told; other parts are made again."""
 
     class Remover:
         done = False

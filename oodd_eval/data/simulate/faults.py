@@ -206,23 +206,35 @@ def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Gener
     sensors = choose_sensors(environment, rng)
     k = len(sensors)
     a = 0.7 * np.eye(k) - (0.2 * np.eye(k, k=1) if k > 1 else 0)
-    root = np.linalg.cholesky(0.5 * np.eye(k) + 0.5)
+    root = _on_a_grid(np.linalg.cholesky(0.5 * np.eye(k) + 0.5))
     # State (x, e): its stationary covariance solves S = F S F' + G G'.
     forward = np.block([[a, 0.4 * np.eye(k)], [np.zeros((k, 2 * k))]])
     driven = np.vstack([root, root])
     covariance = driven @ driven.T
     for __ in range(200):
         covariance = forward @ covariance @ forward.T + driven @ driven.T
-    scale = strength * spread_of(environment)[sensors] / np.sqrt(np.diag(covariance)[:k])
-    state = np.linalg.cholesky(covariance + 1e-12 * np.eye(2 * k)) @ rng.normal(size=2 * k)
+    unit = _on_a_grid(1 / np.sqrt(np.diag(covariance)[:k]))
+    scale = strength * spread_of(environment)[sensors] * unit
+    start = _on_a_grid(np.linalg.cholesky(covariance + 1e-12 * np.eye(2 * k)))
+    state = _product(start, rng.normal(size=2 * k))
 
     def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
         nonlocal state
         found = x + scale * state[:k]
-        state = forward @ state + driven @ rng.normal(size=k)
+        state = _product(forward, state) + _product(driven, rng.normal(size=k))
         return found
 
     return SensorFault(sensors, change)
+
+
+def _on_a_grid(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round to multiples of 2^-20: the last bits that LAPACK gives depend on the processor."""
+    return np.round(x * 2**20) / 2**20
+
+
+def _product(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Multiply without BLAS, which adds in an order that depends on the processor."""
+    return np.add.reduce(matrix.T * vector[:, None])  # one row after the other
 
 
 def _delay(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
