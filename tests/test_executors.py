@@ -16,7 +16,7 @@ from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_
 from oodd_eval import load_split
 from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
 from oodd_eval.scoring.plan import make_plan

@@ -16,7 +16,7 @@ from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.contract import probes
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation import Channel
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.scoring import unit
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan

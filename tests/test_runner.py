@@ -20,7 +20,8 @@ from oodd_eval.names import expression, memory_bytes, seconds, select, whole_num
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation import Channel
-from oodd_eval.plugins.isolation.supervisor import Limits, _send
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.supervisor import _send
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.scoring.executors import RunSettings

@@ -22,7 +22,7 @@ from oodd_eval import evaluate, load_split
 from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.parts import parts_of
 from oodd_eval.plugins.contract import PROBES
-from oodd_eval.plugins.isolation import supervisor as isolation
+from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.scoring.unit import groups
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
@@ -131,7 +131,7 @@ def test_nothing_of_the_harness_or_of_pytest_is_in_the_environment(findings):
 
 def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
     """The same search, where the harness tells too much in every way there is."""
-    send, popen = isolation._send, subprocess.Popen
+    send, popen = supervisor._send, subprocess.Popen
 
     def told(child, request, *trajectories):
         leak = {"environment": ENVIRONMENT, "onsets": secrets.onsets}
@@ -147,8 +147,8 @@ def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
                 settings["cwd"] = secrets.path
             return popen(command, **settings)
 
-        monkeypatch.setattr(isolation, "_send", told)
-        monkeypatch.setattr(isolation.subprocess, "Popen", start)
+        monkeypatch.setattr(supervisor, "_send", told)
+        monkeypatch.setattr(child.subprocess, "Popen", start)
         records = evaluate(
             "spy", split=secrets.path, environments=ENVIRONMENT, anomalies="wind-l2r"
         )

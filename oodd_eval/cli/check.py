@@ -11,7 +11,7 @@ from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import Predicate, assignment, check_known, expression
 from oodd_eval.plugins.conformance import CHECKS, Report, Result, expected
 from oodd_eval.plugins.conformance.supervise import supervise
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
 
 _STYLES: Final = {"passed": "green", "failed": "bold red", "skipped": "dim",

@@ -14,7 +14,7 @@ from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, TIERS
 from oodd_eval.paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
 from oodd_eval.paper.page import publish
 from oodd_eval.paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
 from oodd_eval.scoring.executors import RunSettings, available_cores

@@ -11,13 +11,14 @@ from oodd_eval import cli
 from oodd_eval.cli import Parser
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.files import write_text
-from oodd_eval.data.split import load_split
+from oodd_eval.data.split import load_split, split_places
 from oodd_eval.errors import UsageError
 from oodd_eval.names import expression, whole_numbers
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.tables import rendering
-from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.executors import LOCAL, RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run as carry_out
 
@@ -48,6 +49,8 @@ def define(parser: Parser) -> None:
     cli.add_resources(add, timeout="30m")
     add("--executor", default="local", metavar="local|dask://HOST:PORT",
         help="where fits are carried out: here, or on a Dask cluster (default: local)")
+    add("--sandbox", action="store_true",
+        help="run detectors in bubblewrap: no network, no view of splits, results or the home")
     add("--fresh", action="store_true", help="fit again what the results directory has already")
     add("--intervals", action="store_true", help="print 95 %% intervals in the tables")
     add("--config", metavar="FILE", help="TOML file with these options by their long names")
@@ -79,7 +82,13 @@ def run(options: argparse.Namespace) -> int:
             console.print("\n".join(map(str, plan.cells)))
         console.print(f"{len(plan.cells)} cells in {len(plan.units)} fits")
         return 0
-    limits = Limits(options.timeout, options.memory)
+    hidden = None
+    if options.sandbox:
+        if options.executor != LOCAL:
+            raise UsageError("--sandbox is for workers of this machine, without --executor")
+        require_sandbox()
+        hidden = (*split_places(split), options.output)
+    limits = Limits(options.timeout, options.memory, hidden)
     settings = RunSettings(jobs=options.jobs, limits=limits, fresh=options.fresh,
                            stop_on_failure=options.stop, executor=options.executor,
                            command=options.invocation)  # fmt: skip

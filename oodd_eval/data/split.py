@@ -35,6 +35,12 @@ SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
 _MOST_TWINS: Final = 2**27  # bytes of their rows that are kept while the others are compared
 
 
+def split_places(split: "Split") -> tuple[str, ...]:
+    """Return the directories that hold a split, or others that are at hand."""
+    shipped = [path for path in SHIPPED.iterdir() if path.is_dir()]
+    return tuple(map(str, (*shipped, data_home(), split.path)))
+
+
 def data_home() -> Path:
     """Return ``$OODD_EVAL_DATA``, or ``oodd-eval/splits`` in the user's data directory."""
     if os.environ.get("OODD_EVAL_DATA"):

@@ -24,7 +24,8 @@ from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Probe, Scores
 from oodd_eval.plugins.discovery import Offer, printable
 from oodd_eval.plugins.explanations import Named
-from oodd_eval.plugins.isolation.supervisor import Limits, Outcome, Stop, run_isolated
+from oodd_eval.plugins.isolation.child import Limits, Stop
+from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory, ScoreFile
 from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Status

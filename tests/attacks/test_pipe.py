@@ -20,8 +20,9 @@ from oodd_eval import evaluate
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins.contract import score_chunk
-from oodd_eval.plugins.isolation import LONGEST_MESSAGE, Channel, supervisor
-from oodd_eval.plugins.isolation.supervisor import Limits, run_isolated
+from oodd_eval.plugins.isolation import LONGEST_MESSAGE, Channel, child, supervisor
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.supervisor import run_isolated
 from oodd_eval.results.record import STATUSES
 
 ROWS = 30
@@ -248,7 +249,7 @@ def test_a_worker_killed_by_somebody_is_not_out_of_memory(converse, monkeypatch)
 
 def test_a_worker_that_the_system_killed_for_memory_is_out_of_memory(converse, monkeypatch):
     counts = iter((4, 5))
-    monkeypatch.setattr(supervisor, "_killed_for_memory", lambda: next(counts))
+    monkeypatch.setattr(child, "_killed_for_memory", lambda: next(counts))
     killer = threading.Timer(
         1.0, lambda: [p.kill() for p in psutil.Process().children() if "oodd_script" in p.cmdline()]
     )

@@ -227,14 +227,14 @@ def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Gener
     return SensorFault(sensors, change)
 
 
-def _on_a_grid(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_a_grid(x: NDArray[Any]) -> NDArray[np.float64]:
     """Round to multiples of 2^-20: the last bits that LAPACK gives depend on the processor."""
-    return np.round(x * 2**20) / 2**20
+    return np.asarray(np.round(x * 2**20) / 2**20)
 
 
 def _product(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Multiply without BLAS, which adds in an order that depends on the processor."""
-    return np.add.reduce(matrix.T * vector[:, None])  # one row after the other
+    return np.asarray(np.add.reduce(matrix.T * vector[:, None]))  # one row after the other
 
 
 def _delay(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:

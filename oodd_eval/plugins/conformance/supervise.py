@@ -16,7 +16,7 @@ from oodd_eval.plugins.conformance import Result, carry_out
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Offer, offer_of
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
-from oodd_eval.plugins.isolation.supervisor import Child, GivenUpError, Limits
+from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
 from oodd_eval.plugins.isolation.worker import connect
 
 GATES: Final = frozenset({"factory", "fits"})  # without them no other check is possible

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
-from oodd_eval.plugins.isolation.supervisor import Limits
+from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.unit import Scored, UnitJob
 

@@ -25,7 +25,7 @@ from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import ExecutorError, MissingExtraError, OoddError, PluginError, SplitError
 from oodd_eval.plugins.discovery import offer_of
-from oodd_eval.plugins.isolation.supervisor import Limits, Stop
+from oodd_eval.plugins.isolation.child import Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.scoring.executors import Executor, RunSettings
 from oodd_eval.scoring.keys import source_digest
