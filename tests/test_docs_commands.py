@@ -99,12 +99,6 @@ KNOWN = dict(
             rules=(
                 Rule(r"mine-standard", "an entry is named after its split", "mine-mini"),
                 Rule(r"--env (all|hopper,ant,cartpole)", "three have to agree", QUICKEST),
-                # In another order, so that it is not made quicker still.
-                Rule(
-                    r"--train 500 --calibration 200 --test 50",
-                    "the sizes of mini",
-                    f"--test 10 --calibration 40 --train 40 --cap 300 {QUICKEST}",
-                ),
             ),
         ),
         page(

@@ -1,4 +1,4 @@
-"""``oodd-eval leaderboard``: build the board, verify entries and submit one."""
+"""``oodd-eval leaderboard``: build the board, verify, run again and submit entries."""
 
 import argparse
 import tempfile
@@ -7,7 +7,7 @@ from typing import Final
 
 from rich.console import Console
 
-from oodd_eval.cli import EXPRESSION, NAMES, Parser, say
+from oodd_eval.cli import EXPRESSION, NAMES, Parser, rerun, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
@@ -15,6 +15,7 @@ from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.grants import GRANTS
+from oodd_eval.leaderboard.rerun import read_order
 from oodd_eval.leaderboard.sections import graded_sections
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
@@ -44,9 +45,11 @@ def define(parser: Parser) -> None:
     )
     add("paths", nargs="+", metavar="PATH", help="an entry, or a directory of entries")
     add("--split", metavar="PATH", help=SPLIT)
-    add("--rerun", metavar="DIR", help="results of a run of your own to compare one entry with")
+    add("--rerun", metavar="DIR",
+        help="results of leaderboard rerun, or of a run of your own, to compare one entry with")
     add("--grant", default="", metavar="NAME",
         help=f"write the trust level that was reached into {GRANTS}, in this name")
+    rerun.define(action("rerun", "run an entry's detectors again on seeds drawn now"))
     add = action("submit", "write an entry from a results directory").options(
         submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
     )
@@ -139,9 +142,10 @@ def verify(options: argparse.Namespace) -> int:
         raise UsageError(f"--rerun: {options.rerun!r} has no records")
     if (options.rerun or options.grant) and len(options.paths) > 1:
         raise UsageError("--rerun and --grant are for one entry: name a single PATH")
+    drawn = read_order(Path(options.rerun)) if options.rerun else None
     verdicts = []
     for path in options.paths:
-        for verdict in check(path, split=options.split, rerun=fresh):
+        for verdict in check(path, split=options.split, rerun=fresh, order=drawn):
             verdicts.append(verdict)
             report(console, verdict, options.verbosity)
     if not verdicts:

@@ -18,6 +18,7 @@ from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, recorded_versions, row_of
 from oodd_eval.leaderboard.grants import GRANTS, TRUST, digest_of, read_grants
+from oodd_eval.leaderboard.rerun import RerunOrder
 from oodd_eval.leaderboard.verify import scores
 from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, shown
 from oodd_eval.leaderboard.verify.formats import read_info, read_records
@@ -39,11 +40,12 @@ _Numbers = dict[object, tuple[str, str]]  # by place and numbers of a cell: its 
 
 def verify_entry(
     directory: Path, *, name: str = "", split: str | Path | None = None,
-    rerun: Sequence[Record] = (),
+    rerun: Sequence[Record] = (), order: RerunOrder | None = None,
 ) -> EntryVerdict:  # fmt: skip
     """Check one entry, which is going to have another name if one is given.
 
-    `split` names its split where that is not at its usual place, `rerun` are a verifier's records.
+    `split` names its split where that is not at its usual place, `rerun` are a verifier's records,
+    on seeds of an `order`, if they were drawn by one.
     """
     name = name or Path(os.path.abspath(directory)).name  # noqa: PTH100  a link is not followed
     findings = Findings()
@@ -78,9 +80,12 @@ def verify_entry(
             rescored = scores.check_rescored(scored, directory, opened, findings) and complete
         if scored and curves is not None and sound:
             scores.check_recomputed_curves(curves, scored, directory, opened, findings)
-    again = compare_rerun(records, rerun, findings) if rerun else None
-    rescored = rescored and not findings.count
     digest = digest_of(contents[ENTRY])
+    if order is not None and order.entry != digest:
+        why = "seeds were drawn for another version of the entry"
+        findings.expect("re-run", "entry", order.entry, digest, why)
+    again = compare_rerun(records, rerun, findings, order) if rerun else None
+    rescored = rescored and not findings.count
     grant = read_grants(directory.absolute().parent).get(name)
     held = grant if grant and grant.entry == digest else None
     verdict = EntryVerdict(name, findings, records, entry, rescored, again, digest, held)
@@ -156,18 +161,22 @@ def _notes_on_trust(verdict: EntryVerdict) -> Iterator[str]:
 
 
 def verify(
-    path: Path | str, *, split: str | Path | None = None, rerun: Sequence[Record] = ()
+    path: Path | str,
+    *,
+    split: str | Path | None = None,
+    rerun: Sequence[Record] = (),
+    order: RerunOrder | None = None,
 ) -> Iterator[EntryVerdict]:
     """Check an entry, or all entries of a directory and that no two of them clash.
 
     Yields one verdict an entry, in the order of their names, and one more for the directory itself
-    when something else lies in it; for `split` and `rerun` see `verify_entry`.
+    when something else lies in it; for the other arguments see `verify_entry`.
     """
     path = Path(path)
     if not path.is_dir():
         raise ResultsError(f"{str(path)!r} is no directory: expected an entry, or one of entries")
     if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + GZIP)):
-        yield verify_entry(path, split=split, rerun=rerun)
+        yield verify_entry(path, split=split, rerun=rerun, order=order)
         return
     if rerun:
         raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")

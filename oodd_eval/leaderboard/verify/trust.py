@@ -19,6 +19,7 @@ from oodd_eval.data.split import published_digests
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import EntryInfo
 from oodd_eval.leaderboard.grants import TRUST, Grant, Trust, read_grants, write_grants
+from oodd_eval.leaderboard.rerun import RerunOrder
 from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
 from oodd_eval.leaderboard.verify.records import Records
@@ -102,7 +103,9 @@ class EntryVerdict:
 _Place = tuple[Setting, str, str]  # row, environment, condition
 
 
-def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings) -> Rerun:
+def compare_rerun(
+    records: Records, fresh: Sequence[Record], findings: Findings, order: RerunOrder | None = None
+) -> Rerun:
     """Compare an entry's records with those of the verifier's own run on a split of fresh seeds.
 
     The run may be of fewer environments and detector seeds, and have more than the entry's rows.
@@ -127,7 +130,8 @@ def compare_rerun(records: Records, fresh: Sequence[Record], findings: Findings)
             for field in _FIELDS:
                 new, old = getattr(other, field), getattr(record, field)
                 findings.expect(where, field, new, old, "as in the re-run")
-    how = f"{place}, {len(both)} of {len(ours)} cells"
+    drawn = str(order or "by the verifier's word")
+    how = f"{place}, {drawn}, {len(both)} of {len(ours)} cells"
     return Rerun(how, lines, confirmed=findings.count == before)
 
 
