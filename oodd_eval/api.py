@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import re
 import shutil
 import tempfile
 import weakref
@@ -15,6 +16,7 @@ from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import Offer, Plugins, discover
 from oodd_eval.plugins.parameters import declared_by
+from oodd_eval.plugins.specs import check_detector_spec
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
@@ -163,9 +165,15 @@ def _added(plugins: Plugins, detector: Tried, given: Mapping[str, Any]) -> str:
                 )
             own = detector
             made, shown = lambda **_: copy.deepcopy(own), type(detector).__name__
+        name = re.sub("[^a-z0-9]+", "-", shown.lower())[:64].strip("-")
         detector = DetectorSpec(
-            shown.lower(), made, "", inputs="observations+actions", parameters=declared_by(given)
+            name or "detector",
+            made,
+            "",
+            inputs="observations+actions",
+            parameters=declared_by(given),
         )
+    check_detector_spec(detector)
     plugins.add(Offer(detector, "", "", "local", ""))
     return detector.name
 

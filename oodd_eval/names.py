@@ -11,6 +11,12 @@ from oodd_eval.errors import UnknownNameError, UsageError
 
 Predicate = Callable[[str], bool]
 
+DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
+SPEC_NAME: Final = DETECTOR_NAME + r"(:[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7})?"
+"""A detector's name, perhaps with a class behind a colon: it goes into tables, files and URLs."""
+
+PARAMETER_NAME: Final = r"[A-Za-z_]\w{0,63}"
+
 _TIMES: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 _AMOUNTS: Final = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9,
                    "kib": 2**10, "mib": 2**20, "gib": 2**30}  # fmt: skip

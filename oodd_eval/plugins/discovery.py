@@ -24,6 +24,7 @@ from oodd_eval import plugins as hooks
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
 from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
+from oodd_eval.plugins.specs import check_detector_spec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
@@ -92,6 +93,8 @@ class Plugin:
                 wrong = f"oodd_detectors of {self} returned {found!r:.80}"
                 raise PluginError(f"{wrong}, expected a list of oodd_eval.DetectorSpec")
             specs += found
+        for spec in specs:
+            check_detector_spec(spec)
         return specs
 
     def own_specs(self) -> list[OwnSpec]:
@@ -217,7 +220,8 @@ class Plugins:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything
-            self.broken.append(Broken(point.name, _distribution(point), doing + describe(error)))
+            reason = printable(doing + describe(error))
+            self.broken.append(Broken(point.name, _distribution(point), reason))
             if self._listener:
                 self._listener(self.broken[-1])
 
@@ -258,10 +262,12 @@ class Plugins:
             except OoddError:
                 raise
             except (Exception, SystemExit) as error:
-                reason = f"{maker} failed to make detector {text!r}: {describe(error)}"
+                reason = f"{maker} failed to make detector {text!r}: {printable(describe(error))}"
                 raise PluginError(reason) from error
-            if isinstance(spec, DetectorSpec) and ":" in spec.name:
-                return maker.offer(spec)
+            if isinstance(spec, DetectorSpec):
+                check_detector_spec(spec)
+                if ":" in spec.name:
+                    return maker.offer(spec)
             if spec is not None:
                 expected = "None or a DetectorSpec whose name has a colon"
                 raise PluginError(f"{maker} made {spec!r:.80} of {text!r}, expected {expected}")

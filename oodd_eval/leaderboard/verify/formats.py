@@ -18,6 +18,7 @@ from pydantic_core import ValidationError
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
+from oodd_eval.names import PARAMETER_NAME, SPEC_NAME
 from oodd_eval.results import record as record_format
 from oodd_eval.results.curve_file import strict_model
 from oodd_eval.results.directory import RECORDS
@@ -110,14 +111,14 @@ EntryId = Annotated[str, _matching(
     r"(?!.*\.\.)[a-z0-9][a-z0-9._-]{0,79}",
     "at most 80 lower-case letters, digits, '.', '_', '-', no '..'")]
 DetectorName = Annotated[str, _matching(
-    r"[a-z0-9][a-z0-9-]{0,63}(:[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7})?",
+    SPEC_NAME,
     "a name of lower-case letters, digits and '-', at most 64, perhaps with a class behind a ':', "
     "such as rf or pyod:IForest")]
 DetectorNames = Annotated[list[DetectorName], _rule(
     lambda names: names and names == sorted(set(names)), "names in order, each once")]
 Name = Annotated[str, _matching(
     r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", "a name of letters, digits, '.', '_', '-', at most 100")]
-ParameterName = Annotated[str, _matching(r"[A-Za-z_]\w{0,63}", "a parameter's name, at most 64")]
+ParameterName = Annotated[str, _matching(PARAMETER_NAME, "a parameter's name, at most 64")]
 PluginName = Annotated[str, _matching(
     r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}:[A-Za-z0-9][A-Za-z0-9._-]{0,99}",
     "'distribution:plug-in', both of letters, digits, '.', '_', '-'")]

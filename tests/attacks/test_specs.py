@@ -1,0 +1,100 @@
+"""What a plug-in may say of its detectors: a wrong spec breaks its plug-in, and nothing else."""
+
+import re
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import DetectorSpec, evaluate
+from oodd_eval.cli import main as cli
+from oodd_eval.errors import PluginError, UnknownNameError
+from oodd_eval.plugins.discovery import discover
+
+OFFERS = """
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Known:
+    größe: int = 3
+
+@hookimpl
+def oodd_detectors():
+    return [DetectorSpec("fine", Good, ""), DetectorSpec(**({{"name": "odd", "factory": Good,
+            "summary": ""}} | {{{changed}}}))]
+"""
+
+NAMES = {
+    "number": "5", "none": "None", "bytes": "b'x'", "empty": "''", "path": "'../../etc'",
+    "absolute": "'/etc/x'", "dots": "'..'", "newline": "'a\\nb'", "end": "'a\\n'",
+    "escape": "'\\x1b[31mred'", "null": "'a\\0'", "zero-width": "'r\\u200bf'",
+    "look-alike": "'\\u0440f'", "digits": "'\\u0661'", "capital": "'RF'", "long": "'x' * 300",
+    "space": "'r f'", "comma": "'a,b'", "glob": "'a*'", "slash": "'a/b'", "markup": "'<b>'",
+    "pipe": "'a|b'", "hyphen": "'-a'", "colon": "'a:'", "two-colons": "'a:B:C'",
+    "link": "'a:B](http://x)'", "right-to-left": "'\\u202ea'", "list": "['rf']",
+}  # fmt: skip
+FIELDS = {
+    "factory": "'factory': 3", "factory-none": "'factory': None", "summary": "'summary': 3",
+    "summary-lines": "'summary': 'a\\nb'", "summary-escape": "'summary': '\\x1b]0;x\\x07'",
+    "summary-long": "'summary': 'x' * 10**6", "reference": "'reference': b'x'",
+    "inputs": "'inputs': 'labels'", "inputs-list": "'inputs': ['observations']",
+    "alarm": "'alarm': 'never'", "deterministic": "'deterministic': 'no'",
+    "other": "'other_parameters': 1", "decides": "'horizon_decides_fit': None",
+    "requires": "'requires': 'torch'", "requires-numbers": "'requires': (3,)",
+    "version": "'version': '1\\n2'", "version-path": "'version': '../1'", "fit": "'fit_name': 3",
+    "extra": "'extra': 'a\\rb'", "parameters": "'parameters': 3",
+    "parameters-dict": "'parameters': {'size': 3}", "parameters-names": "'parameters': Known",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changed", [f"'name': {name}" for name in NAMES.values()] + [*FIELDS.values()],
+    ids=[f"name-{name}" for name in NAMES] + [*FIELDS],
+)  # fmt: skip
+def test_a_wrong_spec_is_told_and_the_others_go_on(changed, monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "odd", OFFERS.format(changed=changed))
+    plugins = discover()
+    assert {"rf", "clock"} <= plugins.offers.keys()
+    assert not {"odd", "fine"} & plugins.offers.keys()
+    (broken,) = plugins.broken
+    assert broken.plugin == "odd"
+    field = changed.split("'")[1]
+    assert re.match(rf"PluginError: {field} of a DetectorSpec is .*, expected ", broken.reason)
+    assert len(broken.reason) < 400
+    assert broken.reason.isprintable()
+    assert cli.main(["list", "detectors"]) == 1
+    out, err = capsys.readouterr()
+    assert "clock" in out
+    assert "[broken plug-in] PluginError" in " ".join((out + err).split())
+    with pytest.raises(UnknownNameError):
+        plugins.offer("fine")
+
+
+@pytest.mark.parametrize("name", [5, "../../etc", "a\nb", "RF", "x" * 300])
+def test_a_wrong_name_of_a_detector_of_ones_own(name, tiny_split):
+    with pytest.raises(PluginError, match="name of a DetectorSpec is"):
+        evaluate(DetectorSpec(name, object, ""), tiny_split)
+
+
+@pytest.mark.parametrize(
+    "name", ["a:B\\n", "a:../x", "a:" + "b" * 300, "a:b.c.d.e.f.g.h.i.j.k", "A:b", ":b"]
+)
+def test_a_wrong_name_made_for_a_colon(name, monkeypatch, tmp_path):
+    code = f"""
+        @hookimpl
+        def oodd_detector_from_spec(spec): return DetectorSpec("{name}", Good, "")
+    """
+    install(monkeypatch, tmp_path, "odd", code)
+    with pytest.raises(PluginError, match="name of a DetectorSpec is"):
+        discover().offer("odd:one")
+
+
+def test_escapes_of_an_import_error_do_not_reach_the_terminal(monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "odd", 'raise RuntimeError("\\x1b[2J" + "x" * 10**5)')
+    plugins = discover()
+    assert plugins.offers
+    (broken,) = plugins.broken
+    assert broken.reason.isprintable()
+    assert len(broken.reason) < 1000
+    assert cli.main(["list", "detectors"]) == 1
+    out, err = capsys.readouterr()
+    assert "\x1b[2J" not in out + err
