@@ -12,7 +12,7 @@ from oodd_eval.errors import UnknownNameError, UsageError
 Predicate = Callable[[str], bool]
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-SPEC_NAME: Final = DETECTOR_NAME + r"(:[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7})?"
+SPEC_NAME: Final = DETECTOR_NAME + r"(:\w{1,64}(\.\w{1,64}){0,7})?"
 """A detector's name, perhaps with a class behind a colon: it goes into tables, files and URLs."""
 
 PARAMETER_NAME: Final = r"[A-Za-z_]\w{0,63}"

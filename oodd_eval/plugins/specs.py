@@ -14,7 +14,7 @@ _TEXT: Final = "a printable line of at most 1000 characters"
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field that is wrong."""
     for name, expected, fits in (
-        ("name", "lower-case letters, digits and '-', at most 64, perhaps ':' and a class",
+        ("name", "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
          _matches(SPEC_NAME, spec.name)),
         ("factory", "a function or class", callable(spec.factory)),
         *((name, _TEXT, _is_line(getattr(spec, name)))
