@@ -43,7 +43,7 @@ def write_entry(root, identity, records, *, curves=(), trust="reported", **field
     given = {
         "title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
         "url": "https://example.org/page", "created": "2026-11-21",
-        "command": "oodd-eval run --detector all", "caption": "", "plugins": [],
+        "caption": "", "plugins": [],
     } | fields  # fmt: skip
     entry = EntryInfo(
         id=identity, detectors=sorted({r.detector for r in records}), split=first.split,

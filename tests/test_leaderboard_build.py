@@ -82,8 +82,7 @@ def board():
 def entry(name, records, trust="reported", **meta):
     first = records[0]
     given = {
-        "title": "An entry", "citation": "", "url": "", "caption": "",
-        "command": f"oodd-eval run --detector {name} --env all", "submitter": "Somebody",
+        "title": "An entry", "citation": "", "url": "", "caption": "", "submitter": "Somebody",
     }  # fmt: skip
     about = EntryInfo(
         id=name, detectors=sorted({r.detector for r in records}), split=first.split,
@@ -547,7 +546,7 @@ def test_nothing_that_others_wrote_becomes_markup():
     evil = "<script>x</script> | `a` \n# b [c](javascript:d)"
     hostile = entry(
         "hostile", [dataclasses.replace(record("riqn", [0.5] * SEEDS), detector=evil)],
-        title=evil, citation=evil, url="javascript:alert(1)", caption=evil, command=evil,
+        title=evil, citation=evil, url="javascript:alert(1)", caption=evil,
         submitter=evil,
     )  # fmt: skip
     text = page(sections([hostile]))
@@ -557,7 +556,7 @@ def test_nothing_that_others_wrote_becomes_markup():
     assert "\n# b" not in text
     assert "<javascript" not in text
     # A command stands in an indented block, on one line.
-    assert "\n    <script>x</script> | `a` # b [c](javascript:d)\n" in text
+    assert "\n    oodd-eval run --detector '<script>x</script> | `a` # b [c](javascript:d)'" in text
 
 
 # Numbers for machines

@@ -155,11 +155,15 @@ def child(group: h5py.Group, name: str) -> Any:
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise SplitError(f"{where} holds {name!r}, which points elsewhere: refused")
     if isinstance(found := group[name], h5py.Dataset) and found.shape:
-        _check_plain(f"{where.rstrip('/')}/{name}", found)
+        check_plain(f"{where.rstrip('/')}/{name}", found)
     return found
 
 
-def _check_plain(where: str, dataset: h5py.Dataset) -> None:
+def check_plain(where: str, dataset: h5py.Dataset) -> None:
+    """Raise `SplitError` unless a dataset's content is in its file, and no more than it can hold.
+
+    `where` names it in messages.
+    """
     layout, item = dataset.id.get_create_plist(), dataset.dtype.itemsize
     if dataset.is_virtual or layout.get_external_count():
         raise SplitError(f"{where} keeps its content in another file: refused")

@@ -215,9 +215,12 @@ def _entry(entry: SubmittedEntry) -> str:
     listed = [f"- {name}: {escape(text)}" for name, text in lines if text]
     if meta.url:
         listed.append(f"- Page: {_link(meta.url)}")
-    command = " ".join(meta.command.split())
-    # An indented block ends nowhere but at its line's end, whatever the command holds.
-    made = ["", "Made with:", "", f"    {command}"] if command else []
+    made = [
+        "",
+        "To run it again:",
+        "",
+        *(f"    {command}" for command in entry.commands),
+    ]
     return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, *made, ""])
 
 

@@ -14,13 +14,15 @@ Entries are read here after they were verified (`oodd_eval.leaderboard.verify`):
 """
 
 import json
-from collections.abc import Iterable
+import shlex
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from pydantic import TypeAdapter, ValidationError
 
+from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.grants import Grant, Trust, digest_of, read_grants
@@ -28,7 +30,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
-SCHEMA: Final = 2  # version of the layout of an entry; a reader refuses others
+SCHEMA: Final = 3  # version of the layout of an entry; a reader refuses others
 
 ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
@@ -40,11 +42,11 @@ class EntryInfo:
     """The content of ``entry.json``.
 
     Title, submitter, citation, url and caption (a note above the tables) are plain text for people;
-    all but the title may be empty, like the command that made the records. Detectors, sorted, split
-    and protocol are those of the records. `plugins` have ``distribution``, ``plugin``, ``version``
-    and ``source_digest``, the `environment` ``python``, ``platform`` and ``packages``; `primary`
-    are the rows that are ranked for their detectors, as `Setting` writes them. `files` has
-    ``sha256`` and ``bytes`` of all other files by relative name.
+    all but the title may be empty. Detectors, sorted, split and protocol are those of the records.
+    `plugins` have ``distribution``, ``plugin``, ``version`` and ``source_digest``, the
+    `environment` ``python``, ``platform`` and ``packages``; `primary` are the rows that are ranked
+    for their detectors, as `Setting` writes them. `files` has ``sha256`` and ``bytes`` of all other
+    files by relative name.
     """
 
     id: str
@@ -59,7 +61,6 @@ class EntryInfo:
     plugins: list[dict[str, str]]
     environment: dict[str, Any]
     created: str
-    command: str
     caption: str
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
     primary: list[str] = field(default_factory=list)
@@ -87,9 +88,50 @@ class SubmittedEntry:
         return self.grant.trust if self.grant else "reported"
 
     @property
+    def commands(self) -> list[str]:
+        """The commands that give its cells: derived from the records, as anybody may run them."""
+        return commands_of(self.records)
+
+    @property
     def curves(self) -> Path | None:
         """The file of curves; None when the entry has none."""
         return find_file(self.path / CURVES)
+
+
+def commands_of(records: Sequence[Record]) -> list[str]:
+    """Return ``oodd-eval run`` commands that give the cells of records, one for each setting."""
+    found: dict[Setting, tuple[set[str], set[int], set[str]]] = {}
+    for record in records:
+        environments, seeds, anomalies = found.setdefault(record.setting, (set(), set(), set()))
+        environments.add(record.environment)
+        seeds.add(record.seed)
+        anomalies.add(record.condition)
+    every = {record.condition for record in records}
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for setting, (environments, seeds, anomalies) in sorted(found.items(), key=_in_order):
+        whole = environments == set(ENVIRONMENTS)
+        options = ["--env", "all" if whole else ",".join(sorted(environments))]
+        if anomalies != every:
+            options += ["--anomaly", ",".join(sorted(anomalies))]
+        options += ["--split", records[0].split.partition("@")[0]]
+        options += ["--seed", ",".join(map(str, sorted(seeds)))]
+        if setting.horizon != 1:
+            options += ["--horizon", str(setting.horizon)]
+        for name, value in setting.overrides.items():
+            options += ["--param", f"{name}={json.dumps(value)}"]
+        alike.setdefault(tuple(options), []).append(setting.detector)
+    commands = (
+        shlex.join(["oodd-eval", "run", "--detector", ",".join(names), *options])
+        for options, names in alike.items()
+    )
+    return [" ".join(command.split()) for command in commands]  # one line, whatever names hold
+
+
+def _in_order(item: tuple[Setting, object]) -> tuple[bool, int, str]:
+    """Plain settings first, and those that may share a command one after the other."""
+    setting = item[0]
+    more = bool(setting.overrides)
+    return more, setting.horizon, json.dumps([setting.overrides, setting.detector])
 
 
 def read_entry(path: Path | str) -> SubmittedEntry:

@@ -212,20 +212,15 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
         "primary": [str(Setting.parse(row)) for row in statement.primary],
     }
     return EntryInfo(
-        **stated, detectors=detectors, split=first.split, split_digest=first.split_digest,
-        protocol=first.protocol, plugins=plugins, environment=environment,
-        created=datetime.now(UTC).date().isoformat(), command=command_of(records),
-    )  # fmt: skip
-
-
-def command_of(records: Sequence[Record]) -> str:
-    """Return the commands that records were made with, as far as they can be published."""
-    found = ""
-    for command in dict.fromkeys(str(r.provenance.get("command", "")) for r in records):
-        longer = f"{found} && {command}" if found else command
-        if command and not formats.complaint(formats.Command, longer):
-            found = longer
-    return found
+        **stated,
+        detectors=detectors,
+        split=first.split,
+        split_digest=first.split_digest,
+        protocol=first.protocol,
+        plugins=plugins,
+        environment=environment,
+        created=datetime.now(UTC).date().isoformat(),
+    )
 
 
 def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: str) -> list[Path]:

@@ -33,6 +33,10 @@ def save_state(directory: Path, *, kind: str, settings: Mapping[str, Any], array
     (directory / STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
 
 
+MOST_JSON: Final = 2**24  # bytes
+MOST_ARRAYS: Final = 2**32  # bytes of all, unpacked
+
+
 def load_state(directory: Path, *, kind: str, settings: Mapping[str, Any]) -> Arrays:
     """Return the arrays of a saved state.
 
@@ -41,16 +45,26 @@ def load_state(directory: Path, *, kind: str, settings: Mapping[str, Any]) -> Ar
     # What JSON makes of the settings is what was written: tuples come back as lists.
     wanted = {"kind": kind, "settings": json.loads(json.dumps(dict(settings)))}
     try:
-        state = json.loads((directory / STATE).read_text(encoding="utf-8"))
-        with np.load(directory / ARRAYS, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        state, arrays = _read(directory)
+    except Exception as error:  # noqa: BLE001  zip, NumPy and JSON raise many kinds for damage
         what = f"{str(directory)!r} cannot be read as a saved detector ({STATE}, {ARRAYS})"
         raise FittedStateError(f"{what}: {error}") from None
     if state != wanted:
         advice = "make the detector with the parameters that it was saved with"
         raise FittedStateError(f"{str(directory)!r} holds {state}, expected {wanted}: {advice}")
     return arrays
+
+
+def _read(directory: Path) -> tuple[Any, Arrays]:
+    if (size := (directory / STATE).stat().st_size) > MOST_JSON:
+        raise ValueError(f"{STATE} has {size} bytes, expected at most {MOST_JSON}")
+    state = json.loads((directory / STATE).read_text(encoding="utf-8"))
+    with zipfile.ZipFile(directory / ARRAYS) as packed:
+        size = sum(item.file_size for item in packed.infolist())
+    if size > MOST_ARRAYS:
+        raise ValueError(f"{ARRAYS} unpacks to {size} bytes, expected at most {MOST_ARRAYS}")
+    with np.load(directory / ARRAYS, allow_pickle=False) as stored:
+        return state, {name: stored[name] for name in stored.files}
 
 
 def take(arrays: Arrays, name: str, shape: tuple[int | None, ...], kind: str = "f") -> NDArray[Any]:

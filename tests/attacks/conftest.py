@@ -6,6 +6,7 @@
 from collections import Counter
 
 import pytest
+from helpers_fuzz import fuzz
 
 PLACE = "tests/attacks/"
 
@@ -15,6 +16,13 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if PLACE in item.nodeid:
             item.add_marker(pytest.mark.attacks)
+
+
+@pytest.fixture
+def fuzzed(request):
+    """Run a function on examples of a strategy: a few, or thousands with --long."""
+    long = request.config.getoption("--long")
+    return lambda strategy, tried: fuzz(strategy, tried, long=long)
 
 
 def pytest_terminal_summary(terminalreporter):

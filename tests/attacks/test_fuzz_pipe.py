@@ -6,9 +6,7 @@ With ``--long``, thousands of each. Never a traceback, much memory, or many seco
 import io
 import json
 import os
-import resource
 import tempfile
-import time
 from collections import deque
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -17,7 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from helpers_fuzz import ANY, damaged
 from hypothesis import strategies as st
 
 from oodd_eval.errors import OoddError
@@ -27,8 +25,6 @@ from oodd_eval.results.fits import INDEX, FitStore
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.scoring.unit import Scored
 
-MOST_SECONDS, MOST_BYTES = 20, 500 * 10**6
-
 LENGTHS = {"calibration": [5, 6], "test/nominal": [7]}
 RECORD = Record(
     detector="a", detector_version="1", plugin="p:a", parameters={"x": 1}, environment="ant",
@@ -37,37 +33,6 @@ RECORD = Record(
 ).to_json()  # fmt: skip
 
 
-@pytest.fixture
-def fuzzed(request):
-    """Run a function on examples: a few, or thousands with --long."""
-    count = 3000 if request.config.getoption("--long") else 60
-
-    def run(strategy, tried):
-        settled = settings(
-            max_examples=count, deadline=None, database=None, derandomize=count == 60,
-            suppress_health_check=list(HealthCheck),
-        )  # fmt: skip
-        settled(given(strategy)(bounded(tried)))()
-
-    return run
-
-
-def bounded(tried):
-    def one(case):
-        start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        tried(case)
-        assert time.monotonic() - start < MOST_SECONDS
-        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-        assert grown * 1024 < MOST_BYTES
-
-    return one
-
-
-ANY = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner),
-    max_leaves=6,
-)
 FIT = st.fixed_dictionaries(
     {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": st.booleans() | ANY}
 )
@@ -86,21 +51,6 @@ def saved(draw):
     buffer = io.BytesIO()
     np.save(buffer, np.zeros(shape, kind), allow_pickle=False)
     return draw(damaged(st.just(buffer.getvalue())))
-
-
-@st.composite
-def damaged(draw, contents):
-    content = bytearray(draw(contents))
-    for _ in range(draw(st.integers(0, 3))):
-        place = draw(st.integers(0, max(0, len(content) - 1)))
-        part = draw(st.binary(max_size=4))
-        if draw(st.booleans()):
-            content[place : place + len(part)] = part
-        elif draw(st.booleans()):
-            content[place:place] = part
-        else:
-            del content[place : place + draw(st.integers(1, 40))]
-    return bytes(content)
 
 
 def framed(content):

@@ -8,6 +8,7 @@ from helpers_submission import Draft
 
 from oodd_eval import evaluate
 from oodd_eval.errors import ResultsError
+from oodd_eval.leaderboard import verify as verification
 from oodd_eval.leaderboard.entry import read_entries, read_entry
 from oodd_eval.leaderboard.grants import GRANTS, Grant, digest_of, read_grants, write_grants
 from oodd_eval.leaderboard.sections import sections
@@ -210,3 +211,27 @@ def test_numbers_of_another_detector_are_found(rows, board, copy):
     copy(draft)
     draft.write()
     assert "the numbers of" in str(problems(board))
+
+
+# Verification of a whole directory
+
+
+@pytest.mark.parametrize("error", [RecursionError, MemoryError, KeyError, AssertionError])
+def test_what_breaks_the_check_of_an_entry_does_not_end_that_of_others(
+    rows, board, monkeypatch, error
+):
+    """Whatever nobody has thought of: the entry is refused, and the next one is checked."""
+    another(rows, board, "aaa", of="random").write()
+    checked = verification.verify_entry
+
+    def breaks(directory, **known):
+        if directory.name == "aaa":
+            raise error("\x1b[31mboom")
+        return checked(directory, **known)
+
+    monkeypatch.setattr(verification, "verify_entry", breaks)
+    found = {verdict.name: verdict for verdict in verify(board)}
+    assert [verdict.ok for verdict in found.values()] == [False, True]
+    (problem,) = found["aaa"].findings.problems
+    assert f"could not be checked ({error.__name__}: " in problem.text
+    assert "\x1b" not in problem.text

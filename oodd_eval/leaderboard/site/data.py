@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
-from oodd_eval.leaderboard.entry import SubmittedEntry
+from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
 from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell
@@ -41,7 +41,7 @@ WITH_INTERVALS: Final = (
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
 ENTRY_FIELDS: Final = (
-    "id", "title", "submitter", "created", "citation", "url", "caption", "command",
+    "id", "title", "submitter", "created", "citation", "url", "caption",
 )  # fmt: skip
 """Fields of an entry that the site shows."""
 
@@ -158,7 +158,7 @@ def _row(
                   "state"),
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
-        "trust": section.trust[row],
+        "trust": section.trust[row], "command": " && ".join(commands_of(records)),
         "entry": _entry(source, records[0].plugin),
         "cells": [_cell(r, names) for r in in_order],
         "intervals": _intervals(records, names, chosen), "curves": len(curves) - 1 if own else None,

@@ -93,6 +93,17 @@ def verify_entry(
     return verdict
 
 
+def _guarded(directory: Path, split: str | Path | None) -> EntryVerdict:
+    """Check an entry among others, which are to be checked whatever this one does."""
+    try:
+        return verify_entry(directory, split=split)
+    except Exception as error:  # noqa: BLE001  it holds what nobody has thought of
+        findings = Findings()
+        what = plain(f"{type(error).__name__}: {error}")
+        findings.refuse("entry", "", f"could not be checked ({what}): please report it")
+        return EntryVerdict(directory.name, findings, {})
+
+
 def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
     """Check ``entry.json`` by itself: its name, and the split it names.
 
@@ -183,7 +194,7 @@ def verify(
     stray, seen, numbers, digests = Findings(), Seen(), _Numbers(), {}
     for child in sorted(path.iterdir()):
         if child.is_symlink() or child.is_dir():
-            verdict = verify_entry(child, split=split)
+            verdict = _guarded(child, split)
             check_clashes(verdict.name, verdict.records, seen, verdict.findings)
             check_copies(verdict.name, verdict.records, numbers, verdict.findings)
             digests[child.name] = verdict.digest

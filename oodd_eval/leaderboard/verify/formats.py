@@ -7,7 +7,6 @@ line that can be printed, without ``<`` and ``>``: whatever shows it, it cannot 
 import functools
 import math
 import re
-import shlex
 from collections.abc import Callable, Collection, Mapping
 from datetime import date
 from typing import Annotated, Any, Final, Literal
@@ -29,7 +28,9 @@ MOST_RECORDS: Final = 20_000
 MOST_LINE: Final = 4 * MB
 MOST_TEST: Final = 2_000  # trajectories: with more, recomputing intervals takes too much room
 
-LONGEST_COMMAND: Final = 4000
+LONGEST_TEXT: Final = 4000  # of a parameter or of what a run says of itself
+_BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and signs that show nothing
+_YEARS: Final = range(2020, 2100)  # in which an entry can have been made
 LARGEST: Final = 2**53  # whole numbers beyond are not exact in a double
 MOST_COST: Final = 1e9  # seconds (thirty years) or megabytes: nobody measured more
 
@@ -58,7 +59,8 @@ def _one_of(known: Collection[Any]) -> AfterValidator:
 
 def _is_text(value: str, longest: int, least: int = 0) -> bool:
     marked = any(mark in value for mark in ("<", ">", "]("))
-    return least <= len(value) <= longest and value.isprintable() and not marked
+    seen = sum(c not in _BLANK and not c.isspace() for c in value)
+    return least <= seen and len(value) <= longest and value.isprintable() and not marked
 
 
 def _text(longest: int, least: int = 0) -> AfterValidator:
@@ -74,20 +76,6 @@ def _written_as(parse: Callable[[str], object], value: str) -> bool:
         return False
 
 
-def _is_command(value: str) -> bool:
-    """Tell commands of oodd-eval joined by ``&&`` from all else.
-
-    Whoever runs an entry again may paste its command into a shell, so that nothing else may be in
-    it: no other program, and no character that a shell would act on.
-    """
-    try:
-        parts = [(part, shlex.split(part)) for part in value.split(" && ") if value]
-    except ValueError:
-        return False
-    allowed = (["oodd-eval", "run"], ["oodd-eval", "reproduce"])
-    return all(words[:2] in allowed and shlex.join(words) == part for part, words in parts)
-
-
 def _is_free(value: Any, levels: int = _DEEPEST) -> bool:
     """Tell a JSON value that is neither deep nor large, and holds no text with markup."""
     if isinstance(value, dict | list):
@@ -95,7 +83,7 @@ def _is_free(value: Any, levels: int = _DEEPEST) -> bool:
         small = levels > 0 and len(value) <= _MOST_ITEMS
         return small and all(_is_free(item, levels - 1) for item in items)
     if isinstance(value, str):
-        return _is_text(value, LONGEST_COMMAND)
+        return _is_text(value, LONGEST_TEXT)
     if isinstance(value, int):
         return abs(value) <= LARGEST
     return value is None or math.isfinite(value)
@@ -106,7 +94,8 @@ Row = Annotated[str, _text(300, least=1), _rule(
     functools.partial(_written_as, Setting.parse),
     "detector and settings as on the board, such as 'riqn[h=5]'")]
 Day = Annotated[str, _rule(
-    functools.partial(_written_as, date.fromisoformat), "a date such as 2026-11-21")]
+    functools.partial(_written_as, date.fromisoformat), "a date such as 2026-11-21"),
+    _rule(lambda day: int(day[:4]) in _YEARS, "a year from 2020 to 2099")]
 EntryId = Annotated[str, _matching(
     r"(?!.*\.\.)[a-z0-9][a-z0-9._-]{0,79}",
     "at most 80 lower-case letters, digits, '.', '_', '-', no '..'")]
@@ -136,9 +125,6 @@ FileName = Annotated[str, _matching(
     r"(?!.*\.\.)(scores/)?[a-z0-9][a-z0-9._-]{0,170}",
     "a plain name of a file, in scores/ or in the entry itself")]
 GrantedBy = Annotated[str, _text(200, least=1)]
-Command = Annotated[str, _text(LONGEST_COMMAND), _rule(
-    _is_command, "'oodd-eval run' or 'oodd-eval reproduce' with plainly quoted words, or several "
-    "of these joined by ' && '")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Whole = Annotated[int, Field(ge=0, le=LARGEST)]
 Cost = Annotated[float, Field(ge=0, le=MOST_COST)] | None
@@ -184,7 +170,7 @@ _ENTRY: Final = strict_model(
     environment=strict_model(
         python=Annotated[str, _text(100, least=1)], platform=Annotated[str, _text(200)],
         packages=dict[Name, Version]),
-    created=Day, command=Command, caption=Annotated[str, _text(500)],
+    created=Day, caption=Annotated[str, _text(500)],
     primary=Annotated[list[Row], Field(max_length=100)],
     files=dict[FileName, strict_model(sha256=Digest, bytes=Whole)],  # type: ignore[misc]
 )

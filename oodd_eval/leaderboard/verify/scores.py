@@ -20,7 +20,8 @@ import numpy as np
 from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
-from oodd_eval.errors import OoddError, ResultsError
+from oodd_eval.data.stored import check_plain
+from oodd_eval.errors import OoddError, ResultsError, SplitError
 from oodd_eval.leaderboard.entry import CURVES, SCORES
 from oodd_eval.leaderboard.verify.files import Findings, find_text, parse_json, plain, shown
 from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, complaint
@@ -54,8 +55,17 @@ _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
     (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
     (lambda d, _: not len(d.attrs), "no attributes"),
     (lambda d, _: _filters(d) <= _FILTERS, "no filter but gzip and shuffle"),
+    (lambda d, _: _is_whole(d), "content that the file holds, in chunks of at most 64 MB"),
 )
 """Predicates of an item and its expected type, each safe where those before hold."""
+
+
+def _is_whole(item: h5py.Dataset) -> bool:
+    try:
+        check_plain(str(item.name), item)
+    except SplitError:
+        return False
+    return True
 
 
 def _filters(item: h5py.Dataset) -> set[int]:

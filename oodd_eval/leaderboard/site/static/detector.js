@@ -221,7 +221,7 @@ function facts(row) {
       ["Trust", `${row.trust}: ${(TRUST[row.trust] ?? "").toLowerCase()}`],
       ["Granted by", entry.grant && `${entry.grant.by} on ${entry.grant.day}: ${entry.grant.how}`],
       ["Date", entry.created],
-      ["Made by", element("code", {}, entry.command)],
+      ["To run it again", element("code", {}, row.command)],
       ["Citation", entry.citation],
       ["Address", /^https?:\/\//.test(entry.url)
         ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],

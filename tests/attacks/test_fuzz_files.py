@@ -1,0 +1,211 @@
+"""Random damage to what others publish or keep: splits, entries, grants, saved detectors.
+
+With ``--long``, thousands of each. Never a traceback, much memory, or many seconds.
+"""
+
+import io
+import json
+import shutil
+import tempfile
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_fuzz import ANY, damaged
+from helpers_split import make_split
+from hypothesis import strategies as st
+
+from oodd_eval import evaluate, load_split
+from oodd_eval.errors import FittedStateError, OoddError
+from oodd_eval.leaderboard.grants import GRANTS, read_grants
+from oodd_eval.leaderboard.rerun import ORDER, read_order
+from oodd_eval.leaderboard.submit import Statement, submit
+from oodd_eval.leaderboard.verify import verify
+from oodd_eval.plugins.state import ARRAYS, STATE, load_state, save_state
+
+
+def paths(value, above=()):
+    listed = enumerate(value) if isinstance(value, list) else ()
+    for key, inner in value.items() if isinstance(value, dict) else listed:
+        yield (*above, key)
+        yield from paths(inner, (*above, key))
+
+
+def replaced(value, path, new):
+    if not path:
+        return new
+    copied = value.copy()
+    copied[path[0]] = replaced(value[path[0]], path[1:], new)
+    return copied
+
+
+def changed(whole):
+    """Strategy: a JSON object as bytes, one value of which is another, or with damaged bytes."""
+    text = json.dumps(whole).encode()
+    places = st.sampled_from([*paths(whole)])
+    other = st.tuples(places, ANY).map(lambda p: json.dumps(replaced(whole, *p)).encode())
+    return damaged(st.just(text)) | other
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory):
+    return make_split(
+        tmp_path_factory.mktemp("where") / "split", ("cartpole",), train=2, calibration=2, test=2
+    )
+
+
+def read_whole(path):
+    split = load_split(path)
+    with split.opened() as data:
+        found = data("cartpole")
+        for part in (found.train, found.twins, found.anomalous("iid")):
+            assert sum(len(t) for t in part) > 0
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "cartpole.h5"])
+def test_whatever_stands_in_a_split_is_read_or_refused(fuzzed, split, name):
+    whole = (split / name).read_bytes()
+    contents = damaged(st.just(whole)) | st.binary(max_size=99)
+    if name == "manifest.json":
+        contents |= changed(json.loads(whole))
+
+    def tried(content):
+        with tempfile.TemporaryDirectory() as place:
+            other = shutil.copytree(split, Path(place) / "split")
+            (other / name).write_bytes(content)
+            if content == whole:
+                read_whole(other)
+            else:
+                with suppress(OoddError):
+                    read_whole(other)
+
+    read_whole(split)
+    fuzzed(contents, tried)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    home = tmp_path_factory.mktemp("results")
+    split = make_split(home / "split", calibration=20)
+    evaluate("persistence", split, output=home / "out")
+    return submit(home / "out", home / "results", Statement(), scores=True, split=split).place
+
+
+@pytest.mark.parametrize("name", ["entry.json", "records.jsonl", "curves.json", "scores"])
+def test_whatever_stands_in_an_entry_is_valid_or_refused(fuzzed, results, name):
+    file = next((results / name).iterdir()) if name == "scores" else results / name
+    whole = file.read_bytes()
+    contents = damaged(st.just(whole))
+    if name == "entry.json":
+        contents |= changed(json.loads(whole))
+    if name == "records.jsonl":
+        first, rest = whole.split(b"\n", 1)
+        contents |= changed(json.loads(first)).map(lambda line: line + b"\n" + rest)
+
+    def tried(content):
+        with tempfile.TemporaryDirectory() as place:
+            entry = shutil.copytree(results, Path(place) / "results" / results.name)
+            (entry / file.relative_to(results)).write_bytes(content)
+            (verdict,) = verify(entry)
+            assert verdict.ok == (content == whole) or name == "entry.json"
+            for text in (problem.text for problem in verdict.findings.problems):
+                assert "Traceback" not in text
+                assert text.isprintable()
+
+    fuzzed(contents, tried)
+
+
+GRANT = {"entry": "0" * 64, "trust": "re-run", "by": "us", "day": "2026-11-23", "how": "so"}
+ORDERED = {"entry": "0" * 64, "seed_base": 7, "day": "2026-11-23", "environments": ["ant"],
+           "sandbox": True, "schema": 1}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "whole", "read"),
+    [
+        (GRANTS, {"schema": 1, "grants": {"mine": GRANT}}, lambda place: read_grants(place / "r")),
+        (ORDER, ORDERED, read_order),
+    ],
+    ids=["grants", "order"],
+)
+def test_whatever_stands_in_files_of_maintainers_is_read_or_refused(fuzzed, name, whole, read):
+    def tried(content):
+        with tempfile.TemporaryDirectory() as place:
+            (Path(place) / name).write_bytes(content)
+            with suppress(OoddError):
+                assert read(Path(place)) is not None
+
+    fuzzed(changed(whole), tried)
+
+
+def state(place):
+    arrays = {"mean": np.zeros(5), "scale": np.ones(5), "count": np.arange(3)}
+    save_state(place, kind="mine/1", settings={"size": 3}, arrays=arrays)
+
+
+@pytest.mark.parametrize("name", [STATE, ARRAYS])
+def test_whatever_stands_in_a_saved_detector_is_loaded_or_refused(fuzzed, tmp_path, name):
+    state(tmp_path)
+    whole = (tmp_path / name).read_bytes()
+    contents = damaged(st.just(whole)) | st.binary(max_size=99)
+    if name == STATE:
+        contents |= changed(json.loads(whole))
+
+    def tried(content):
+        (tmp_path / name).write_bytes(content)
+        with suppress(FittedStateError):
+            load_state(tmp_path, kind="mine/1", settings={"size": 3})
+
+    fuzzed(contents, tried)
+
+
+def npz(**members):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+    return buffer.getvalue()
+
+
+def npy(shape, kind="<f8", content=b""):
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    header = header.ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content
+
+
+def single():
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3))
+    return buffer.getvalue()
+
+
+def encrypted():
+    content = bytearray(npz(mean=npy((1,), content=bytes(8))))
+    for mark, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(mark) + place] |= 1
+    return bytes(content)
+
+
+STATES = {
+    "deep": (STATE, b"[" * 10**6), "long": (STATE, b'"' + b"x" * 2**25 + b'"'),
+    "not-utf-8": (STATE, b"\xff\xfe"), "empty": (STATE, b""), "number": (STATE, b"1" * 10**5),
+    "no-zip": (ARRAYS, b"x"), "no-bytes": (ARRAYS, b""), "one-array": (ARRAYS, single()),
+    "bomb": (ARRAYS, npz(**{f"a{k}": npy((10**9,), "|i1", bytes(10**6)) for k in range(3)})),
+    "huge-shape": (ARRAYS, npz(a=npy((10**15,)))), "negative": (ARRAYS, npz(a=npy((-1,)))),
+    "objects": (ARRAYS, npz(a=npy((1,), "|O", b"cos\nsystem\n(S'true'\ntR."))),
+    "pickle": (ARRAYS, b"cos\nsystem\n(S'touch /tmp/x'\ntR."),
+    "header": (ARRAYS, npz(a=npy("(" * 5000))), "version": (ARRAYS, npz(a=b"\x93NUMPY\x09\x00")),
+    "encrypted": (ARRAYS, encrypted()),
+    "method": (ARRAYS, npz(a=b"x").replace(b"\x08\x00", b"\x63\x00")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", STATES)
+def test_a_saved_detector_that_is_none_is_refused(tmp_path, case):
+    state(tmp_path)
+    name, content = STATES[case]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FittedStateError, match=r"cannot be read as a saved detector|holds "):
+        load_state(tmp_path, kind="mine/1", settings={"size": 3})
