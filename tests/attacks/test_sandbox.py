@@ -288,12 +288,13 @@ def acts(monkeypatch, tmp_path):
 
 
 @pytest.fixture(autouse=True)
-def nothing_stays():
+def nothing_stays(tmp_path, monkeypatch):
     """No process and no directory of a sandbox is left."""
-    place = Path(tempfile.gettempdir())
-    before = {*place.glob("oodd-eval-*")}
+    place = tmp_path / "temporary"
+    place.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(place))  # other tests run beside these
     yield
-    assert {*place.glob("oodd-eval-*")} <= before
+    assert not [*place.glob("oodd-eval-*")]
     deadline = time.monotonic() + 5
     while running := [p for p in psutil.process_iter(["cmdline"]) if _inside(p)]:
         assert time.monotonic() < deadline, running
