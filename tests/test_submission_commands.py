@@ -15,7 +15,7 @@ from helpers_records import make_record
 from helpers_submission import Draft
 
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.leaderboard.entry import commands_of, read_entries
 from oodd_eval.leaderboard.submit import selected
 
@@ -64,14 +64,16 @@ def test_the_commands_of_an_entry_give_its_cells():
         )
         for seed in (1, 0) for environment in ("hopper", "ant")
     ]  # fmt: skip
-    common = "oodd-eval run --detector rf --env ant,hopper --split mini --seed 0,1"
+    common = "oodd-eval run --detector rf --env ant,hopper --anomaly iid --split mini --seed 0,1"
     assert commands_of(rows) == [
-        "oodd-eval run --detector npn,rf --env ant,hopper --split mini --seed 0,1",
+        "oodd-eval run --detector npn,rf --env ant,hopper --anomaly iid --split mini --seed 0,1",
         common + " --horizon 5",
         common + """ --param 'kind="a b"' --param 'size=[1, 2]'""",
     ]
-    (command,) = commands_of([replace(base, environment=name) for name in ENVIRONMENTS])
-    assert "--env all" in command
+    whole = [replace(base, environment=e, anomaly=a) for e in ENVIRONMENTS for a in TABLE1]
+    assert commands_of(whole) == [
+        f"oodd-eval run --detector {base.detector} --env all --split mini --seed {base.seed}"
+    ]
     (first, second) = commands_of(
         [replace(base, anomaly="iid"), replace(base, detector="npn", anomaly="drift")]
     )

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.grants import Grant, Trust, digest_of, read_grants
@@ -99,19 +99,21 @@ class SubmittedEntry:
 
 
 def commands_of(records: Sequence[Record]) -> list[str]:
-    """Return ``oodd-eval run`` commands that give the cells of records, one for each setting."""
+    """Return ``oodd-eval run`` commands that give the cells of records, and few others.
+
+    Detectors share a command when their environments, anomalies, seeds and parameters are the same.
+    """
     found: dict[Setting, tuple[set[str], set[int], set[str]]] = {}
     for record in records:
         environments, seeds, anomalies = found.setdefault(record.setting, (set(), set(), set()))
         environments.add(record.environment)
         seeds.add(record.seed)
         anomalies.add(record.condition)
-    every = {record.condition for record in records}
     alike: dict[tuple[str, ...], list[str]] = {}
     for setting, (environments, seeds, anomalies) in sorted(found.items(), key=_in_order):
         whole = environments == set(ENVIRONMENTS)
         options = ["--env", "all" if whole else ",".join(sorted(environments))]
-        if anomalies != every:
+        if anomalies != set(TABLE1):
             options += ["--anomaly", ",".join(sorted(anomalies))]
         options += ["--split", records[0].split.partition("@")[0]]
         options += ["--seed", ",".join(map(str, sorted(seeds)))]

@@ -1,4 +1,4 @@
-"""Whether what a plug-in offers is what `DetectorSpec` says: every field's type and alphabet."""
+"""Check every field of a `DetectorSpec` that a plug-in offers: its type, and its alphabet."""
 
 import re
 from dataclasses import fields, is_dataclass

@@ -241,7 +241,7 @@ def _environment(box: Sandbox | None) -> dict[str, str]:
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
     # A detector must not see the harness's settings, nor the test that pytest names.
     steering = ("OODD_EVAL_", "PYTEST_CURRENT_TEST")
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(steering)}
-    kept = box.environment() if box else kept
+    own = {name: value for name, value in os.environ.items() if not name.startswith(steering)}
+    kept = box.environment() if box else own
     single = dict.fromkeys(_SINGLE_THREAD, "1")
     return {**kept, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}

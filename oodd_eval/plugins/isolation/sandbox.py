@@ -1,8 +1,8 @@
 """A sandbox for one worker, by bubblewrap: what it may read, where it may write, and nothing else.
 
 The worker sees the system's programs and libraries, the interpreter and what can be imported, all
-read-only, and an empty directory as ``/tmp``, which is also its home and ends with it. It has
-namespaces of its own: no network, no process but its own, no user rights on the system.
+read-only. Its home is ``/tmp``: an empty directory, which is removed when the worker ends. It has
+no network, sees no process but its own, and has no capabilities.
 """
 
 import importlib.machinery
