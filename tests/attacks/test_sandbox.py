@@ -218,6 +218,12 @@ def test_the_same_plug_in_finds_it_without_a_sandbox(looked, what):
     assert what in looked[""]
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="the system forbids them to others in any case")
+@pytest.mark.parametrize("what", ["memory", "attached", "users"])
+def test_root_finds_it_without_a_sandbox(looked, what):
+    assert what in looked[""]
+
+
 ACTS = """
 MOST = 10**8
 
