@@ -13,7 +13,7 @@ from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard.entry import EntryInfo, read_entries
 from oodd_eval.leaderboard.grants import Grant, digest_of, read_grants, write_grants
-from oodd_eval.leaderboard.sections import graded_sections, sections
+from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING
@@ -69,10 +69,10 @@ def graded(root):
             values = {FOUND: [float(i < 8 * share) for i in range(8)], RANKING: [0.5] * 8}
             fields = {"strength": name, "values": values}
             lines.append(make_record(row, "cartpole", "iid", **fields).to_json() + "\n")
-    own = root / "graded" / "small"
+    own = root / "suites" / "small"
     own.mkdir(parents=True)
     (own / "records.jsonl").write_text("".join(lines), encoding="utf-8")
-    return graded_sections(root)
+    return suite_sections(root)
 
 
 def make_curves(record, seed, twins_seed=0):

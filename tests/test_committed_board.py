@@ -13,7 +13,7 @@ import pytest
 
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import graded_sections
+from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.leaderboard.verify import verify
 from oodd_eval.results.tables.board import boards
 
@@ -59,7 +59,7 @@ def check_board(board, scratch):
     entries = read_entries(results) if results.is_dir() else []
     if not entries:
         return [f"{name} is committed, but there are no entries" for name in rendered(board)]
-    leaderboard_build.build(entries, scratch, graded_sections(board))
+    leaderboard_build.build(entries, scratch, suite_sections(board))
     new, old = rendered(scratch), rendered(board)
     lines = [f"{name} is missing" for name in sorted(new - old)]
     lines += [f"{name} is of no entry" for name in sorted(old - new)]

@@ -206,6 +206,33 @@ def test_part_of_a_simpler_row_does_not_stand_for_a_whole_one(lacks):
     assert [(str(s.entry), s.rank) for s in ranks.standings if s.primary] == [("foo[h=10]", 1)]
 
 
+def test_rows_that_were_not_run_again_stand_below_those_that_were():
+    """They keep the rank they would have, and nothing of the others changes through them."""
+    best = [dataclasses.replace(r, detector="claimed", horizon=1)
+            for r in board() if r.detector == "riqn" and r.horizon == 1]  # fmt: skip
+    official = [r for r in board() if r.detector != "rf"]
+    alone = sections([entry("official", official, trust="re-run")])[0].ranks
+    assert not any(s.below for s in alone.standings)
+    found = sections([entry("official", official, trust="re-run"), entry("stranger", best)])[0]
+    *above, last = found.ranks.standings
+    assert (str(last.entry), last.below, last.primary, last.rank) == ("claimed", True, True, 1)
+    assert above == alone.standings
+    rows = layout.ranking(found.ranks, found.trust).rows
+    assert [rows[-1][i] for i in (0, 1, 3, 6)] == ["(1)", UNDEFINED, "claimed", "reported"]
+    assert any("run again on seeds of their own" in n for n in layout.ranking_notes(found.ranks))
+    # Re-scored is not run again; and where nothing was, all rows are ranked.
+    claims = [entry("official", official, trust="re-scored"), entry("stranger", best)]
+    assert not any(s.below for s in sections(claims)[0].ranks.standings)
+
+
+def test_a_claimed_row_is_not_primary_in_place_of_one_that_was_run_again():
+    ten = [r for r in board() if r.detector == "riqn" and r.horizon == 10]
+    one = [r for r in board() if r.detector == "riqn" and r.horizon == 1]
+    ranks = sections([entry("official", ten, trust="re-run"), entry("stranger", one)])[0].ranks
+    standings = [(s.entry.horizon, s.primary, s.below) for s in ranks.standings]
+    assert standings == [(10, True, False), (1, False, True)]
+
+
 def test_page_and_tables_are_the_golden_files():
     found = sections(entries())
     first = found[0]

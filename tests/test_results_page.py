@@ -120,5 +120,5 @@ def test_the_ladder_is_that_of_its_records():
 
 def test_the_page_of_the_ladder_is_printed_from_its_records(capsys):
     assert main(["show", str(GRADED), "--stored", "--markdown"]) == 0
-    told = "run `oodd-eval show leaderboard/graded/ladder --stored --markdown`"
+    told = "run `oodd-eval show leaderboard/suites/ladder --stored --markdown`"
     assert capsys.readouterr().out == (GRADED / "README.md").read_text(encoding="utf-8"), told

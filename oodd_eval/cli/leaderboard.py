@@ -16,7 +16,7 @@ from oodd_eval.leaderboard.build import build as build_board
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.grants import GRANTS
 from oodd_eval.leaderboard.rerun import read_order
-from oodd_eval.leaderboard.sections import graded_sections
+from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
 from oodd_eval.results.directory import ResultsDirectory
@@ -87,16 +87,16 @@ def build(options: argparse.Namespace) -> int:
     if not entries:
         return say(f"no entries in {options.results}", 5)
     output = Path(options.output)
-    graded = graded_sections(output)
+    suites = suite_sections(output)
     if not options.check:
-        written = build_board(entries, output, graded)
+        written = build_board(entries, output, suites)
         if options.verbosity >= 0:
             print("\n".join(str(output / name) for name in written))
         for name in stale(output, written):
             say(f"{output / name} is {STALE}: delete it", 0)
         return 0
     with tempfile.TemporaryDirectory() as fresh:
-        build_board(entries, Path(fresh), graded)
+        build_board(entries, Path(fresh), suites)
         lines = differences(Path(fresh), output)
     print("\n".join(lines) if lines else f"{output} is up to date")
     if not lines:

@@ -14,10 +14,10 @@ from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.leaderboard.sections import (
-    GRADED,
+    SUITES,
     TABLES,
-    GradedSection,
     LeaderboardSection,
+    SuiteSection,
     sections,
 )
 from oodd_eval.results.tables import layout, rendering
@@ -37,7 +37,7 @@ WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``com
 
 
 def build(
-    entries: Sequence[SubmittedEntry], output: Path, graded: Sequence[GradedSection] = ()
+    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = ()
 ) -> list[str]:
     """Write page, tables and site, the same bytes for the same entries; return their names.
 
@@ -45,12 +45,12 @@ def build(
     """
     found = sections(entries)
     address = f"{SITE}/{site.PAGE}"
-    files = {PAGE: page(found, graded, site=address)}
+    files = {PAGE: page(found, suites, site=address)}
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    files[address] = site.page(found, graded)
+    files[address] = site.page(found, suites)
     for name, text in files.items():
         write_text(output / name, text)
     return list(files)
@@ -76,7 +76,7 @@ def _files(output: Path) -> set[str]:
 
 
 def page(
-    sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = (), *, site: str = ""
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
 ) -> str:
     """Return the whole page, which links to the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
@@ -85,7 +85,7 @@ def page(
         parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
-    parts += [_graded(section) for section in graded]
+    parts += [_suite(section) for section in suites]
     parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
     return "\n".join(parts)
 
@@ -146,11 +146,12 @@ def _section(section: LeaderboardSection) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _graded(section: GradedSection) -> str:
-    """Return what rows find of anomalies of graded strength, with a link to all tables."""
-    place = f"{GRADED}/{section.name}/{PAGE}"
-    text = TEXTS["graded"].format(split=escape(section.board.split), place=place)
-    title = f"## Weaker anomalies: {escape(_title(section.board))}\n"
+def _suite(section: SuiteSection) -> str:
+    """Return what rows find on a further test suite, with a link to all tables."""
+    place = f"{SUITES}/{section.name}/{PAGE}"
+    texts = TEXTS["suites"]["graded" if section.graded else "other"]
+    title = f"## {texts['title']}: {escape(_title(section.board))}\n"
+    text = texts["text"].format(split=escape(section.board.split), place=place)
     return "\n".join([title, text, *map(table, section.tables[:1])])
 
 

@@ -1,7 +1,7 @@
 """Entries sorted into the boards of the leaderboard."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,7 +12,7 @@ from oodd_eval.leaderboard.grants import Trust
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import ladder
+from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import (
     Board,
     RankedBoard,
@@ -23,7 +23,7 @@ from oodd_eval.results.tables.board import (
 from oodd_eval.results.tables.layout import Table
 
 TABLES: Final = "tables"  # directory of the CSV files
-GRADED: Final = "graded"  # directory of results at graded strengths, one directory a split
+SUITES: Final = "suites"  # directory of results on further test suites, one directory a split
 
 _SPLITS_FIRST: Final = ("standard", "paper", "reduced", "mini")
 """Order of the boards: the leaderboard's own split, then from the most data to the least."""
@@ -66,21 +66,27 @@ class LeaderboardSection:
 
 
 @dataclass(frozen=True, slots=True)
-class GradedSection:
-    """A board of anomalies of graded strength: its directory's name, records and tables."""
+class SuiteSection:
+    """Results on a further test suite: its directory's name, records, tables.
+
+    It is `graded` where its anomalies have several strengths.
+    """
 
     name: str
     board: Board
     tables: list[Table]
+    graded: bool
 
 
-def graded_sections(place: Path) -> list[GradedSection]:
-    """Return what a leaderboard's directory has of results at graded strengths."""
-    return [
-        GradedSection(own.name, board, ladder.tables(board))
-        for own in sorted((place / GRADED).glob("*")) if own.is_dir()
-        for board in boards(ResultsDirectory(own).records())
-    ]  # fmt: skip
+def suite_sections(place: Path) -> list[SuiteSection]:
+    """Return what a leaderboard's directory has of results on further test suites."""
+    found = []
+    for own in sorted((place / SUITES).glob("*")):
+        for board in boards(ResultsDirectory(own).records()) if own.is_dir() else ():
+            graded = ladder.tables(board)
+            tables = graded or [layout.separability(board)]
+            found.append(SuiteSection(own.name, board, tables, graded=bool(graded)))
+    return found
 
 
 def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
@@ -103,19 +109,22 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     found = []
     for board in boards(records):
         sources = {r.setting: owners[row_of(r)] for r in board.records}
-        ranks = ranked(board.records, _primary(board.records, sources))
+        rerun = {row for row, entry in sources.items() if entry.trust == "re-run"}
+        ranks = ranked(board.records, _primary(board.records, sources, rerun), rerun)
         own = {entry.meta.id: entry for entry in sources.values()}
         found.append(LeaderboardSection(ranks, [own[name] for name in sorted(own)], sources))
     return sorted(found, key=lambda section: section.place)
 
 
-def _primary(records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry]) -> set[Setting]:
+def _primary(
+    records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry], rerun: Collection[Setting]
+) -> set[Setting]:
     """Return the primary row of each detector: what its entry declares, else the usual one.
 
     A declared row takes the place of another. So the entry has to be the only one with rows of the
     detector, or it would push somebody else's row out of the ranking, and its row has to be whole.
     """
-    found = {row.detector: row for row in primary_settings(records)}
+    found = {row.detector: row for row in primary_settings(records, rerun)}
     cells: dict[Setting, set[tuple[str, str]]] = {}
     for r in records:
         cells.setdefault(r.setting, set()).add(r.place)

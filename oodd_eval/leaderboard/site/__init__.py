@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
+from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.leaderboard.site.data import Json, site_data
 from oodd_eval.metrics.cusum import THRESHOLD
 
@@ -35,9 +35,9 @@ HEAVY: Final = 30  # A largest value this many times the typical one asks for a 
 _STATIC = Path(__file__).with_name("static")
 
 
-def page(sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = ()) -> str:
+def page(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> str:
     """Return the site of a leaderboard; the same entries give the same text."""
-    data, curves = site_data(sections, graded)
+    data, curves = site_data(sections, suites)
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     tags = (

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
-from oodd_eval.leaderboard.sections import GradedSection, LeaderboardSection
+from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell
 from oodd_eval.metrics.catalogue import (
@@ -54,7 +54,7 @@ SelectedCell = tuple[str, str]  # environment and anomaly
 
 
 def site_data(
-    sections: Sequence[LeaderboardSection], graded: Sequence[GradedSection] = ()
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
 ) -> tuple[Json, list[Json]]:
     """Return the data that the page needs at once, and the curves of single rows.
 
@@ -72,12 +72,12 @@ def site_data(
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
-        "power": [_power(section) for section in graded],
+        "power": [_power(section) for section in suites if section.graded],
     }  # fmt: skip
     return data, curves
 
 
-def _power(section: GradedSection) -> Json:
+def _power(section: SuiteSection) -> Json:
     """Return tables of a board of graded strengths, and each row's means along the ladder.
 
     Points are (strength, share of the return lost, value), the weakest strength first.
@@ -154,8 +154,8 @@ def _row(
         "version": records[0].detector_version, "plugin": records[0].plugin, "horizon": row.horizon,
         "parameters": records[0].parameters, "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        **_fields(standing, "trivial", "primary", "inputs", "rank", "alarm_rank", "ties",
-                  "state"),
+        **_fields(standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank",
+                  "ties", "state"),
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
         "trust": section.trust[row], "command": " && ".join(commands_of(records)),

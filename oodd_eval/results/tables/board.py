@@ -156,7 +156,8 @@ class Standing:
 
     `rank` is None, and `state` says why, for a row that is not ranked; `alarm_rank` is its rank by
     alarms, None where `alarm_state` says why. `primary` rows are one a detector; the others are
-    variants, whose rank is the one that they would have. `ties` are the letters of its tie groups,
+    variants, whose rank is the one that they would have. So is that of a row `below` the ranking,
+    which was not run again where others were. `ties` are the letters of its tie groups,
     `wins` is the mean of its win rates against the other ranked rows, and `inputs` is empty where
     no record names the detector's inputs.
     """
@@ -165,6 +166,7 @@ class Standing:
     records: list[Record]
     trivial: bool
     primary: bool
+    below: bool
     rank: int | None
     alarm_rank: int | None
     ties: str
@@ -183,7 +185,8 @@ class Standing:
 class RankedBoard(NamedTuple):
     """A board with its rankings and win rates, by the labels of the ranked rows.
 
-    All have the order of the standings: ranked rows by rank and mean, then the others by name.
+    All have the order of the standings: ranked rows by rank and mean, then the others by name, and
+    last what stands below the ranking, likewise.
     `alarms` is the ranking by alarms; it has no rows where the board lacks that metric.
     """
 
@@ -194,17 +197,26 @@ class RankedBoard(NamedTuple):
     rates: dict[tuple[str, str], float]
 
 
-def primary_settings(records: Iterable[Record]) -> set[Setting]:
+def primary_settings(
+    records: Iterable[Record], rerun: Collection[Setting] = ()
+) -> set[Setting]:  # fmt: skip
     """Return one row of each detector: of those with most cells and seeds enough the simplest.
 
     That is the row with the fewest other than default parameters, and then the least horizon. Cells
-    and seeds come first, so that part of a row does not stand for a detector that has a whole one.
+    and seeds come first, so that part of a row does not stand for a detector that has a whole one,
+    and `rerun` rows before all, so that nobody's claim takes the place of what was confirmed.
     """
     by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
         cells = {r.place for r in by_row[row]}
-        return -len(cells), _few_seeds(by_row[row]), len(row.parameters), *_name(row)
+        return (
+            row not in rerun,
+            -len(cells),
+            _few_seeds(by_row[row]),
+            len(row.parameters),
+            *_name(row),
+        )
 
     found: dict[str, Setting] = {}
     for row in sorted(by_row, key=order):
@@ -212,12 +224,16 @@ def primary_settings(records: Iterable[Record]) -> set[Setting]:
     return set(found.values())
 
 
-def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None) -> RankedBoard:
+def ranked(
+    records: Sequence[Record], primary: Collection[Setting] | None = None,
+    rerun: Collection[Setting] = (),
+) -> RankedBoard:  # fmt: skip
     """Rank the rows of one board that have a value in every cell, with all their detector seeds.
 
     Primary rows, one a detector, push others down; by default `primary_settings`. They need three
-    detector seeds, unless the seed changes nothing. `ResultsError`: ranked rows differ in their
-    numbers of test trajectories, or two rows have one name.
+    detector seeds, unless the seed changes nothing. Where rows are `rerun`, others stand below
+    these and push nobody down. `ResultsError`: ranked rows differ in their numbers of test
+    trajectories, or two rows have one name.
     """
     own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.place))
     by_row = grouped(own, lambda r: r.setting)
@@ -230,24 +246,29 @@ def ranked(records: Sequence[Record], primary: Collection[Setting] | None = None
     first = primary_settings(records) if primary is None else set(primary)
     cells = {r.place for r in records}
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
-    ranking, rows = _ranking(by_row, states, first, RANKING)
+    below = set(by_row).difference(rerun) if rerun else set()
+    ranking, rows = _ranking(by_row, states, first - below, RANKING)
     by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
                  for e, own in by_row.items()}  # fmt: skip
-    alarms, _ = _ranking(by_row, by_alarms, first, ALARM_RANKING)
+    alarms, _ = _ranking(by_row, by_alarms, first - below, ALARM_RANKING)
     rates = win_rates({
         label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}
         for label in ranking.ranks
     })  # fmt: skip
+    unranked = set(map(str, below))
     place = {label: i for i, label in enumerate(ranking.ranks)}
-    order = sorted(by_row, key=lambda e: (place.get(str(e), len(place)), _name(e)))
+    order = sorted(by_row, key=lambda e: (e in below, place.get(str(e), len(place)), _name(e)))
     board = Board([record for entry in order for record in by_row[entry]])
     standings = [
         Standing(
             entry=entry, records=by_row[entry], trivial=board.is_trivial(entry),
-            primary=entry in first, rank=ranking.ranks.get(str(entry)),
+            primary=entry in first, below=entry in below, rank=ranking.ranks.get(str(entry)),
             alarm_rank=alarms.ranks.get(str(entry)), ties=ranking.letters(str(entry)),
             state=states[entry], alarm_state=by_alarms[entry],
-            wins=nan_mean(rate for (one, _), rate in rates.items() if one == str(entry)),
+            wins=nan_mean(
+                rate for (one, other), rate in rates.items()
+                if one == str(entry) and other not in unranked
+            ),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
         )

@@ -247,7 +247,7 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     for one in ranks.standings:
         rank, detector, settings = _labels(one)
         inputs = one.inputs.replace("observations+actions", "+actions") or UNDEFINED
-        alarms = UNDEFINED if one.alarm_rank is None else str(one.alarm_rank)
+        alarms = _place(one.alarm_rank, one)
         rows.append([rank, one.ties or UNDEFINED, alarms, detector, settings, inputs,
                      trust.get(one.entry, UNDEFINED), *_texts(ranks.board, one.entry, columns),
                      _percent(one.wins)])  # fmt: skip
@@ -334,6 +334,11 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
             "A variant is a further row of a detector. It has the rank that it would have, and "
             "pushes no other row down."
         )
+    if any(one.below for one in ranks.standings):
+        lines.append(
+            "Ranked are rows that maintainers have run again on seeds of their own. The others "
+            "stand below, in brackets the rank that they would have, and push no row down."
+        )
     if ranks.alarms.ranks:
         title = metric_info(catalogue.ALARM_RANKING).title
         lines.append(f"Alarm rank: the same by {title[0].lower()}{title[1:]}, lower is better.")
@@ -369,10 +374,15 @@ def _labels(one: Standing) -> list[str]:
     overrides = [f"{k}={v}" for k, v in one.entry.overrides.items()]
     several = [f"{one.seeds} seeds"] if one.seeds > 1 else []
     return [
-        UNDEFINED if one.rank is None else str(one.rank),
+        _place(one.rank, one),
         one.entry.detector + " (trivial)" * one.trivial + " (variant)" * (not one.primary),
         ", ".join([f"Δ={one.entry.horizon}", *overrides, *several]),
     ]
+
+
+def _place(rank: int | None, one: Standing) -> str:
+    """Return a rank as printed: in brackets where it is the one that the row would have."""
+    return UNDEFINED if rank is None else f"({rank})" if one.below else str(rank)
 
 
 def _percent(rate: float) -> str:

@@ -43,6 +43,9 @@ function paperColumn(metric, title, unit, kind) {
   };
 }
 
+/** A rank as shown: in brackets where it is the one that the row would have. */
+const rankText = (row, rank) => row.below ? `(${rank})` : String(rank);
+
 const RANK = plainColumn(
   "rank", "Rank", "", "1 plus the number of rows that are significantly better over all cells",
   (row) => row.rank,
@@ -69,7 +72,7 @@ const LISTS = {
         metricColumn(board, "auc_smoothed"),
         metricColumn(board, "auc_unpaired"),
         plainColumn("alarm_rank", "Alarm rank", "", "The same rank by the censored delay of guaranteed alarms at 5 %",
-          (row) => row.alarm_rank, { text: (rank) => isNumber(rank) ? String(rank) : UNDEFINED }),
+          (row) => row.alarm_rank, { text: (rank, row) => isNumber(rank) ? rankText(row, rank) : UNDEFINED }),
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
         plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",

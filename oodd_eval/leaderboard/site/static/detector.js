@@ -33,7 +33,9 @@ function summary(board, row) {
   };
   return element("dl", { class: "cards" },
     card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched.meaning),
-    card("Rank", row.rank ?? UNDEFINED, row.rank ? `of ${board.rows.filter((r) => r.rank).length} ranked${row.ties && `, tie groups ${row.ties}`}` : row.state),
+    card("Rank", row.rank ? rankText(row, row.rank) : UNDEFINED, !row.rank ? row.state : row.below
+      ? "would have: not run again by maintainers"
+      : `of ${board.rows.filter((r) => r.rank && !r.below).length} ranked${row.ties && `, tie groups ${row.ties}`}`),
     card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc.meaning),
     card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay.meaning),
     card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin.meaning),

@@ -35,7 +35,8 @@ function rowsOf(board) {
     (state.trivial || !row.trivial));
 }
 
-/** Sort by a column, by matched AUC when the view has no such column; what has no value last. */
+/** Sort by a column, by matched AUC when the view has no such column; what has no value last. By rank
+ * and by matched AUC, what was not run again stands below what was. */
 function sorted(board, rows, columns) {
   const label = (a, b) => a.label.localeCompare(b.label);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
@@ -46,7 +47,8 @@ function sorted(board, rows, columns) {
   return [...rows].sort((a, b) => {
     const [x, y] = [value(a), value(b)];
     const defined = isNumber(y) - isNumber(x);
-    return defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
+    const below = column && !["rank", "auc_matched"].includes(column.key) ? 0 : a.below - b.below;
+    return below || defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
   });
 }
 
@@ -102,14 +104,14 @@ function header(column) {
 
 function tableRow(row, columns, values, best, start) {
   return element("tr", { class: row.trivial ? "trivial" : null, "data-row": row.id },
-    element("td", { class: "rank" }, row.rank ?? element("span", { title: row.state }, UNDEFINED),
+    element("td", { class: "rank" }, row.rank === null ? element("span", { title: row.state }, UNDEFINED) : rankText(row, row.rank),
       row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
     element("th", { scope: "row" },
       element("a", { href: address("detector", row.id) }, row.label), " ", badges(row),
       element("span", { class: "under" }, underLabel(row))),
     columns.map((column, i) => {
       const found = values[i];
-      const text = column.text ? column.text(found.value) : meanText(found, column.kind);
+      const text = column.text ? column.text(found.value, row) : meanText(found, column.kind);
       const strong = isNumber(found.value) && !row.trivial && found.value === best[i];
       return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.state ? reasonOf(row) : null },
         column.whisker && whisker(found, start),
@@ -185,6 +187,9 @@ function notesOf(board, rows) {
   ];
   if (selectsLess(state)) {
     lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
+  }
+  if (rows.some((r) => r.below)) {
+    lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
   }
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
   const captions = new Map();
