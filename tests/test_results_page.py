@@ -10,7 +10,9 @@ import pytest
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables import ladder
 from oodd_eval.results.tables.board import boards
 
@@ -103,11 +105,11 @@ def test_verdicts_are_counted_rightly():
         assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
 
 
-GRADED = ROOT / "leaderboard" / "graded" / "ladder"
+SUITES = ROOT / "leaderboard" / "suites"
 
 
 def test_the_ladder_is_that_of_its_records():
-    (board,) = boards(ResultsDirectory(GRADED).records())
+    (board,) = boards(ResultsDirectory(SUITES / "ladder").records())
     overview = ladder.tables(board)[0]
     names = overview.header[5:]
     found = re.findall(r"^\| `([a-z-]+)` \| (\S+ \[[^]]+\]) \| (.+) \|$", PAGE, re.MULTILINE)
@@ -118,7 +120,33 @@ def test_the_ladder_is_that_of_its_records():
     assert found == expected
 
 
-def test_the_page_of_the_ladder_is_printed_from_its_records(capsys):
-    assert main(["show", str(GRADED), "--stored", "--markdown"]) == 0
-    told = "run `oodd-eval show leaderboard/suites/ladder --stored --markdown`"
-    assert capsys.readouterr().out == (GRADED / "README.md").read_text(encoding="utf-8"), told
+@pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5"])
+def test_the_page_of_a_suite_is_printed_from_its_records(suite, capsys):
+    own = SUITES / suite
+    assert main(["show", str(own), "--stored", "--markdown"]) == 0
+    told = f"run `oodd-eval show leaderboard/suites/{suite} --stored --markdown`"
+    assert capsys.readouterr().out == (own / "README.md").read_text(encoding="utf-8"), told
+
+
+UNDER_NOISE = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
+
+
+def test_the_table_under_noise_is_that_of_the_records():
+    """Detector seed 0 on mini and on both noisy splits, metric by metric."""
+    entries = read_entries(ROOT / "leaderboard" / "results")
+    (mini,) = boards([r for e in entries for r in e.records if r.seed == 0])
+    noisy = (ResultsDirectory(SUITES / name).records() for name in ("noisy-1", "noisy-5"))
+    (one,), (five,) = map(boards, noisy)
+
+    def mean(board, row, metric):
+        return 100 * board.mean(row, board.environments, board.anomalies, metric).value
+
+    number = r" \| ".join([r"(-?[\d.]+)"] * 9)
+    rows = re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", PAGE, re.MULTILINE)
+    assert {r[0] for r in rows} == {row.detector for row in five.entries}
+    for name, *found in rows:
+        row = Setting(name)
+        expected = [mean(board, row, m) for m in UNDER_NOISE for board in (mini, one, five)]
+        assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
+    shown = [float(r[3]) for r in rows]
+    assert shown == sorted(shown, reverse=True)
