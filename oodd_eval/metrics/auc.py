@@ -10,6 +10,7 @@ Time runs over observation rows. The ``onset`` is the row from which on an anoma
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -23,7 +24,7 @@ SMOOTHING: Final = 0.03  # weight of the newest score in the moving average of `
 FAR_START: Final = 20  # first row that ``far`` counts: horizons and warm-ups end here at the latest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Contribution:
     """A ratio of sums: numerators and denominators of n test trajectories, 0 / 0 if undefined.
 
@@ -40,7 +41,7 @@ class Contribution:
     denominator: Floats
     median: bool = False
 
-    @property
+    @cached_property
     def value(self) -> float:
         """Sum of numerators over sum of denominators, or median; NaN when the latter is 0."""
         if self.median and self.n:
@@ -48,7 +49,7 @@ class Contribution:
         total = float(self.denominator.sum())
         return float(self.numerator.sum()) / total if total else float("nan")
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of trajectories that contribute."""
         return int(np.count_nonzero(self.denominator))

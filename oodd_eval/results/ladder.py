@@ -130,7 +130,8 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
     found = []
     for name in rung_names(records):
         own = [r for r in at_rung(records, name) if r.ok]
-        rungs = {_place(r): rungs_of(*_place(r))[r.strength] for r in own}
+        strengths = {_place(r): r.strength for r in own}
+        rungs = {place: rungs_of(*place)[rung] for place, rung in strengths.items()}
         logs = (math.log(rung.strength / unit(place)) for place, rung in rungs.items())
         lost = nan_mean(1 - rung.kept for rung in rungs.values())
         value = mean_over_cells((r.seed, r.value(metric)) for r in own)

@@ -49,6 +49,7 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
+        self._contributions: dict[tuple[int, str], Contribution] = {}
         self._plugins: dict[Setting, str] = {}
         for (setting, _, _), own in self._cells.items():
             self._plugins.setdefault(setting, own[0].plugin)
@@ -91,9 +92,9 @@ class Board:
         if failed := next((r for r in records if not r.ok), None):
             return Value(state=failed.status, cells=len(records), partial=partial, brief=brief)
         terms = [r for r in records if intervals and metric in r.per_trajectory]
-        drawn = [drawn_cell(r.environment, r.seed, contribution(r, metric)) for r in terms]
+        drawn = [drawn_cell(r.environment, r.seed, self._contribution(r, metric)) for r in terms]
         low, high = mean_interval(drawn, kind=metric_info(metric).interval) if drawn else (NAN, NAN)
-        return Value(_mean(records, metric), low, high, "", len(records), partial, brief)
+        return Value(self._mean(records, metric), low, high, "", len(records), partial, brief)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
@@ -101,10 +102,26 @@ class Board:
         for place in itertools.product(self.environments, self.anomalies):
             cells = [self._cells.get((entry, *place), []) for entry in (first, second)]
             ok = all(cells) and all(r.ok for cell in cells for r in cell)
-            if ok and not any(math.isnan(_mean(cell, metric)) for cell in cells):
+            if ok and not any(math.isnan(self._mean(cell, metric)) for cell in cells):
                 pairs.append(cells)
-        one, two = (_mean((r for pair in pairs for r in pair[i]), metric) for i in (0, 1))
+        one, two = (self._mean((r for pair in pairs for r in pair[i]), metric) for i in (0, 1))
         return one, two, len(pairs)
+
+    def _mean(self, records: Iterable[Record], metric: str) -> float:
+        """Return the mean over the cells where a metric is defined."""
+        return mean_over_cells(
+            # Thresholds are no ratios of sums.
+            (r.seed, self._contribution(r, metric).value if metric in r.per_trajectory
+             else r.value(metric))
+            for r in records
+        )  # fmt: skip
+
+    def _contribution(self, record: Record, metric: str) -> Contribution:
+        """Return a record's contribution, made once."""
+        key = id(record), metric
+        if key not in self._contributions:
+            self._contributions[key] = contribution(record, metric)
+        return self._contributions[key]
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
@@ -131,15 +148,6 @@ def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
     numerators, denominators = map(np.array, record.per_trajectory[metric])
     return Contribution(numerators, denominators, metric in NAMES and metric_info(metric).median)
-
-
-def _mean(records: Iterable[Record], metric: str) -> float:
-    """Return the mean over the cells where a metric is defined."""
-    return mean_over_cells(
-        # Thresholds are no ratios of sums.
-        (r.seed, contribution(r, metric).value if metric in r.per_trajectory else r.value(metric))
-        for r in records
-    )
 
 
 class Cost(NamedTuple):
