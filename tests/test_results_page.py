@@ -105,6 +105,25 @@ def test_verdicts_are_counted_rightly():
         assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
 
 
+def test_the_table_at_the_papers_losses_is_that_of_both_reproductions():
+    def means(split):
+        file = ROOT / "leaderboard" / "reproduction" / split / "tables" / "table-5.csv"
+        with file.open() as lines:
+            own = [r for r in csv.DictReader(lines) if r["environment"] == "mean"]
+        return {(r["series"], r["anomalies"]): r for r in own if r["metric"] == "auc"}
+
+    ours, same = means("mini"), means("mini-paper")
+    section = PAGE.split("### At the paper's losses")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| ([A-Z+]+) \| ([\d. |]+) \|$", section, re.MULTILINE)
+    assert [r[0] for r in rows] == ["RIQN", "RIQN+MS", "NPN", "RF", "AVG"]
+    for name, found in rows:
+        keys = [(name, group) for group in ("sensor", "dynamics")]
+        expected = [v for k in keys for v in (same[k]["paper"], ours[k]["value"], same[k]["value"])]
+        assert [float(n) for n in found.split(" | ")] == pytest.approx(
+            [100 * float(v) for v in expected], abs=0.051
+        )
+
+
 SUITES = ROOT / "leaderboard" / "suites"
 
 
