@@ -217,14 +217,8 @@ def primary_settings(
     by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
-        cells = {r.place for r in by_row[row]}
-        return (
-            row not in rerun,
-            -len(cells),
-            _few_seeds(by_row[row]),
-            len(row.parameters),
-            *_name(row),
-        )
+        cells, few = {r.place for r in by_row[row]}, _few_seeds(by_row[row])
+        return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
 
     found: dict[str, Setting] = {}
     for row in sorted(by_row, key=order):
