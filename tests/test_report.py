@@ -210,6 +210,14 @@ def test_notes_name_split_digest_protocol_and_what_is_missing():
     assert "Means over sensor anomalies are without calibration, drift, shutdown." in notes
 
 
+def test_a_note_says_how_many_cells_were_made_with_uncommitted_changes():
+    clean, dirty = (make_record(anomaly=a) for a in ("iid", "drift"))
+    clean.provenance["git_dirty"], dirty.provenance["git_dirty"] = False, True
+    notes = layout.notes(Board([clean, dirty]))
+    assert "Made with uncommitted changes of oodd-eval's checkout: 1 cells." in notes
+    assert not any("uncommitted" in line for line in layout.notes(Board([clean])))
+
+
 @given(st.text(max_size=60))
 def test_no_text_breaks_a_markdown_table(text):
     record = make_record(status="error", reason=text)

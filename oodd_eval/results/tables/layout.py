@@ -319,6 +319,8 @@ def notes(board: Board) -> list[str]:
             f"Brief cells, marked {_BRIEF}: {names}. Half of their episodes end within 20 rows of "
             "the onset."
         )
+    if changed := sum(bool(r.provenance.get("git_dirty")) for r in board.records):
+        lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {changed} cells.")
     lines.append(
         f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
         "* marks a mean over fewer cells than other rows have. A failure is shown as its state."
