@@ -503,6 +503,17 @@ def test_nothing_but_tables_scrolls_sideways_in_a_narrow_window(browser, width):
         browser.resize(1280, 1000)
 
 
+def test_a_long_override_makes_no_column_wide(browser):
+    width = browser.run(
+        """
+        const row = document.querySelector("#ranking tbody th");
+        row.querySelector("a").textContent = "riqn[widths=" + "128;".repeat(120) + "]";
+        return row.getBoundingClientRect().width;
+        """
+    )
+    assert width < 450
+
+
 def test_every_drawing_and_control_has_a_name(browser):
     open_row(browser, "riqn")
     nameless = browser.run(
