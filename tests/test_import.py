@@ -2,6 +2,7 @@
 
 import csv
 import json
+import tracemalloc
 import zipfile
 
 import h5py
@@ -279,6 +280,11 @@ def huge(root):
         archive.writestr("observations.npy", start + header)
 
 
+def odd_method(root):
+    with zipfile.ZipFile(root / "train" / "run-1.npz", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("observations.npy", b"anything")
+
+
 def objects(root):
     rewritten(root / "train" / "run-1.npz", observations=np.array([[{}]], dtype=object))
 
@@ -290,6 +296,7 @@ def changed(place, **arrays):
 BROKEN = [
     (broken_row, r"run-1.npz: observations hold 1 values .* row 7, column 1"),
     (huge, r"run-1.npz, observations has 12000000000 bytes, expected at most"),
+    (odd_method, r"run-1.npz cannot be read: .* neither stored nor deflated"),
     (objects, r"run-1.npz, observations has dtype \|O, expected numbers"),
     (lambda r: (r / "train" / "run-1.npz").write_bytes(b"no zip"), r"run-1.npz cannot be read"),
     (changed("train", observations=None), r"lacks the array obs"),
@@ -325,6 +332,8 @@ def test_what_is_wrong_with_an_episode_is_said_with_its_file(tmp_path, spoil, me
         (5, "0.4,1,x,3,0,1", r"run-1.csv, line 5, column 'obs:flow': 'x', expected a number"),
         (5, "0.4,1", r"run-1.csv, line 5, column 'obs:flow': nothing, expected a number"),
         (5, "0.4,1,2,3,,1", r"run-1.csv, line 5, column 'action:valve': '', expected a number"),
+        (5, "0.4," * 2**18, r"run-1.csv cannot be read: .* more than 1048576 characters"),
+        (1, "", r"run-1.csv has the columns \[\], expected those of"),
         (1, "time,obs:a", r"run-1.csv has the columns \['time', 'obs:a'\], expected those of"),
     ],
 )
@@ -335,6 +344,25 @@ def test_what_is_wrong_with_a_table_is_said_with_its_line(tmp_path, line, text, 
     lines[line - 1] = text
     path.write_text("\n".join(lines))
     with pytest.raises(TrajectoryError, match=message):
+        imported(tmp_path, "csv")
+
+
+def test_a_long_table_takes_little_memory(tmp_path):
+    as_csv(tmp_path)
+    path = tmp_path / "train" / "run-1.csv"
+    header = path.read_text().splitlines()[0]
+    path.write_text("\n".join([header, *["12" + ",34" * header.count(",")] * 30_000]))
+    tracemalloc.start()
+    imported(tmp_path, "csv")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10 * path.stat().st_size
+
+
+def test_a_table_without_any_line_is_refused(tmp_path):
+    as_csv(tmp_path)
+    (tmp_path / "train" / "run-0.csv").write_bytes(b"")
+    with pytest.raises(TrajectoryError, match=r"run-0.csv has the columns \[\], expected obs:NAME"):
         imported(tmp_path, "csv")
 
 

@@ -33,6 +33,7 @@ from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFound
 
 ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
 MOST_ARCHIVE: Final = 10**12
+MOST_MEMBERS: Final = 10_000  # of an archive: a tar file of 10 MB may have millions
 PATIENCE: Final = 60.0
 SLOWEST: Final = 4096
 """Seconds in which a download may be slow, and the bytes a second that it must have later."""
@@ -258,7 +259,9 @@ def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
     found: list[tuple[PurePosixPath, Callable[[], Any]]] = []
     opened: Callable[[], Any]
     zipped = isinstance(archive, zipfile.ZipFile)
-    for item in archive.infolist() if zipped else archive.getmembers():
+    for number, item in enumerate(archive.infolist() if zipped else archive):
+        if number == MOST_MEMBERS:
+            raise SplitError(f"{file} holds more than {MOST_MEMBERS} files, expected one split")
         if item.is_dir() if zipped else item.isdir():
             continue
         name = item.filename if zipped else item.name

@@ -5,6 +5,7 @@ an HDF5 file with a group for each, or the directory of a Minari dataset. Every 
 observations of shape (T + 1, D); actions of shape (T, A) and rewards of shape (T,) may be unknown.
 """
 
+import array
 import csv
 import json
 import re
@@ -26,9 +27,11 @@ from oodd_eval.errors import SplitError, TrajectoryError, UsageError
 from oodd_eval.names import check_known
 
 MOST_BYTES: Final = 2**28  # of one array, and of one text file
+MOST_LINE: Final = 2**20  # characters of a line of a CSV file
 ONSETS: Final = "onsets.csv"
 ARRAYS: Final = ("observations", "actions", "rewards", "onset")
 _NUMBERS: Final = "fiub"  # kinds of dtypes
+_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that NumPy writes
 _BROKEN: Final = (*BROKEN, EOFError, zipfile.BadZipFile, zlib.error)
 
 Array = NDArray[Any]
@@ -183,6 +186,8 @@ def _npz(path: Path) -> dict[str, Array]:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in ARRAYS if f"{name}.npy" in archive.namelist()]
             for name in names:
+                if archive.getinfo(f"{name}.npy").compress_type not in _METHODS:
+                    raise zipfile.BadZipFile(f"{name} is neither stored nor deflated")
                 with archive.open(f"{name}.npy") as member:
                     old = npy.read_magic(member) == (1, 0)
                     header = npy.read_array_header_1_0 if old else npy.read_array_header_2_0
@@ -198,7 +203,7 @@ def _npz(path: Path) -> dict[str, Array]:
 
 def _open_csv(place: Path) -> Logs:
     files = _files(place, ".csv")
-    columns, _ = _table(files[0], None)
+    columns, _ = next(_lines(files[0]))
     named = {
         kind: tuple(quantity(c.partition(":")[2]) for c in columns if c.startswith(f"{kind}:"))
         for kind in ("obs", "action")
@@ -210,8 +215,7 @@ def _open_csv(place: Path) -> Logs:
     def read() -> Iterator[Log]:
         onsets = _onsets(place)
         for path in files:
-            _, rows = _table(path, columns)
-            found = {k: _cells(path, columns, rows, k) for k in ("obs", "action", "reward")}
+            found = _table(path, columns)
             actions = found["action"] if named["action"] else None
             rewards = found["reward"].ravel() if "reward" in columns else None
             onset = onsets.get(path.stem)
@@ -220,37 +224,69 @@ def _open_csv(place: Path) -> Logs:
     return Logs(read, named["obs"], named["action"])
 
 
-def _table(path: Path, expected: list[str] | None) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of a file, which has the columns of the other files."""
+def _lines(path: Path) -> Iterator[tuple[list[str], int]]:
+    """Yield the header and the rows of a file with their numbers; empty ones at its end count not.
+
+    One at a time, as a cell takes 20 times the bytes that it has in the file.
+    """
+    empty: list[tuple[list[str], int]] = []
+    number = 0
     try:
-        with _text(path) as lines:
-            header, *rows = list(csv.reader(lines)) or [[]]
+        with _text(path) as text:
+            pieces = iter(lambda: text.readline(MOST_LINE + 1), "")
+            for number, row in enumerate(csv.reader(_no_longer(pieces)), start=1):
+                empty.append((row, number))
+                if number == 1 or any(row):
+                    yield from empty
+                    empty.clear()
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise _broken(str(path), error) from error
-    if expected is not None and header != expected:
+    if not number:
+        yield [], 1
+
+
+def _no_longer(lines: Iterator[str]) -> Iterator[str]:
+    for line in lines:
+        if len(line) > MOST_LINE:
+            raise csv.Error(f"a line has more than {MOST_LINE} characters")
+        yield line
+
+
+def _table(path: Path, columns: list[str]) -> dict[str, Array]:
+    """Return the numbers of each kind of columns; only observations follow the last transition."""
+    rows = _lines(path)
+    header, _ = next(rows)
+    if header != columns:
         raise TrajectoryError(
-            f"{path} has the columns {header}, expected those of the other files: {expected}"
+            f"{path} has the columns {header}, expected those of the other files: {columns}"
         )
-    while rows and not any(rows[-1]):
-        rows.pop()
-    return header, rows
+    own = {kind: [i for i, c in enumerate(columns) if c.partition(":")[0] == kind]
+           for kind in ("obs", "action", "reward")}  # fmt: skip
+    found = {kind: array.array("d") for kind in own}
+    before: tuple[list[str], int] | None = None
+    for row, number in rows:
+        if before:
+            for kind in ("action", "reward"):
+                found[kind].extend(_numbers(path, columns, own[kind], *before))
+        found["obs"].extend(_numbers(path, columns, own["obs"], row, number))
+        before = row, number
+        if 8 * sum(map(len, found.values())) > MOST_BYTES:
+            most = MOST_BYTES // 8
+            raise TrajectoryError(f"{path} has more than {most} numbers: split the episode")
+    return {kind: np.array(found[kind]).reshape(-1, len(own[kind]) or 1) for kind in own}
 
 
-def _cells(path: Path, columns: list[str], rows: list[list[str]], kind: str) -> Array:
-    """Return the numbers of one kind of columns; nothing follows the last row but observations."""
-    own = [i for i, column in enumerate(columns) if column.partition(":")[0] == kind]
-    used = rows if kind == "obs" else rows[:-1]
-    found = np.empty((len(used), len(own)))
-    for i, row in enumerate(used):
-        for j, c in enumerate(own):
-            try:
-                found[i, j] = float(row[c])
-            except (ValueError, IndexError):
-                got = repr(row[c]) if c < len(row) else "nothing"
-                raise TrajectoryError(
-                    f"{path}, line {i + 2}, column {columns[c]!r}: {got}, expected a number"
-                ) from None
-    return found
+def _numbers(
+    path: Path, columns: list[str], own: list[int], row: list[str], number: int
+) -> Iterator[float]:
+    for c in own:
+        try:
+            yield float(row[c])
+        except (ValueError, IndexError):
+            got = repr(row[c]) if c < len(row) else "nothing"
+            raise TrajectoryError(
+                f"{path}, line {number}, column {columns[c]!r}: {got}, expected a number"
+            ) from None
 
 
 def _open_hdf5(place: Path) -> Logs:
@@ -275,13 +311,13 @@ def _group(where: str, name: str, group: Any) -> Log:
     if not isinstance(group, h5py.Group):
         raise TrajectoryError(f"{where} is a dataset, expected a group for each episode")
     found: dict[str, Array] = {}
-    for array in (*ARRAYS, "terminations"):
-        if array in group:
-            dataset = child(group, array)
+    for part in (*ARRAYS, "terminations"):
+        if part in group:
+            dataset = child(group, part)
             if not isinstance(dataset, h5py.Dataset):
-                raise TrajectoryError(f"{where}, {array} is a group, expected an array of numbers")
-            _must_be_numbers(f"{where}, {array}", dataset.dtype, dataset.size)
-            found[array] = dataset[()]
+                raise TrajectoryError(f"{where}, {part} is a group, expected an array of numbers")
+            _must_be_numbers(f"{where}, {part}", dataset.dtype, dataset.size)
+            found[part] = dataset[()]
     if "observations" not in found:
         raise TrajectoryError(f"{where} lacks the dataset observations")
     said = {k: group.attrs[k] for k in ("onset", "seed", "parameters") if k in group.attrs}

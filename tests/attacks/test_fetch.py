@@ -212,7 +212,14 @@ def broken_xz(directory, archive):
     archive.write_bytes(content)
 
 
+def many_members(directory, archive):
+    with tarfile.open(archive, "w:gz") as packed:
+        for i in range(10_001):
+            packed.addfile(tarfile.TarInfo(str(i)))
+
+
 ARCHIVES = {
+    "ten thousand members": many_members,
     "an encrypted zip": encrypted,
     "a zip of an unknown method": unknown_method,
     "a zip whose directory is broken": flipped(zipped(), -30),

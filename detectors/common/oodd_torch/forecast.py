@@ -20,8 +20,11 @@ from torch import Tensor
 from oodd_torch.network import GRID, Ensemble
 from oodd_torch.training import predict
 
-ROWS = 4096
-"""Forecasts of one network that are computed together at horizon 1: bounds memory."""
+ROWS = 256
+"""Forecasts of one network that are computed together at horizon 1.
+
+Every group is scored in a process of its own, to which arrays that fit the cache cost the least.
+"""
 
 ROLLOUTS = 1024
 """The same at larger horizons, where arrays that fit the processor's cache are quicker."""

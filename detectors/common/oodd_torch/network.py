@@ -213,8 +213,8 @@ class Ensemble(torch.nn.Module):
         if self._split:
             index = index.movedim(-1, 1).flatten(0, 1)[..., None]  # (K, G, N, 1)
         k, g, n, p = index.shape
-        flat = index.reshape(k, -1)
-        phi = torch.stack([table[i][flat[i]] for i in range(k)])
+        first = table.shape[1] * torch.arange(k, device=index.device)[:, None, None, None]
+        phi = table.flatten(0, 1).index_select(0, (first + index).flatten())
         return self._fold(phi.reshape(k, g, n, p, -1))
 
     def _fold(self, phi: Tensor) -> Tensor:
