@@ -7,7 +7,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Literal, get_args
 
@@ -18,6 +18,7 @@ from oodd_eval.errors import ResultsError
 
 GRANTS: Final = "trust.json"
 
+Means = dict[str, dict[str, tuple[float, float]]]
 Trust = Literal["reported", "re-scored", "re-run"]
 TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest first
 
@@ -26,7 +27,8 @@ TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest
 class Grant:
     """A level of trust above ``"reported"``, of the entry whose ``entry.json`` has a digest.
 
-    `by` is who granted it, `day` when (ISO 8601), and `how` what was compared with what.
+    `by` is who granted it, `day` when (ISO 8601), and `how` what was compared with what. `means`
+    are over the cells that a re-run has, by row and metric: the entry's, and the re-run's.
     """
 
     entry: str
@@ -34,6 +36,7 @@ class Grant:
     by: str
     day: str
     how: str
+    means: Means = field(default_factory=dict)
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 

@@ -5,11 +5,12 @@ x seed. Both are written and read as text here and nowhere else. The device that
 is no part of its identity.
 """
 
+import functools
 import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from oodd_eval.errors import UsageError
 
@@ -48,8 +49,10 @@ class Setting:
         cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
     ) -> "Setting":
         """Make a setting from a mapping of the parameters that are not at their default."""
-        given = overrides or {}
-        texts = ((k, json.dumps(given[k], sort_keys=True, default=str)) for k in sorted(given))
+        if not overrides:  # of most records, of which a board has tens of thousands
+            return _plain(detector, horizon)
+        names = sorted(overrides)
+        texts = ((k, json.dumps(overrides[k], sort_keys=True, default=str)) for k in names)
         return cls(detector, horizon, tuple(texts))
 
     @property
@@ -83,6 +86,9 @@ class Setting:
     def label(self, seed: int) -> str:
         """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
         return _bracketed(self.detector, {"h": self.horizon, "seed": seed, **self.overrides})
+
+
+_plain: Final = functools.lru_cache(maxsize=1024)(Setting)
 
 
 @dataclass(frozen=True, slots=True)

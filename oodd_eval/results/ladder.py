@@ -63,11 +63,14 @@ def at_rung(records: Sequence[Record], name: str) -> list[Record]:
     A place has no rung of its own for a level where the strength of a weaker rung is nearest to it:
     its largest sensible strength costs less, or the policy fails between two near strengths.
     """
-    chosen = {}
-    for place in ladders(records):
-        known = [n for n in rungs_of(*place) if RUNGS.index(n) <= RUNGS.index(name)]
-        chosen[place] = known[-1] if known else name
+    chosen = {place: _nearest(rungs_of(*place), name) for place in ladders(records)}
     return [r for r in records if r.strength and r.strength == chosen.get(_place(r))]
+
+
+def _nearest(rungs: Iterable[str], name: str) -> str:
+    """Return the rung of a place, or its next weaker one; the name itself where there is none."""
+    known = [n for n in rungs if RUNGS.index(n) <= RUNGS.index(name)]
+    return known[-1] if known else name
 
 
 def thresholds(records: Sequence[Record]) -> Thresholds:
@@ -128,11 +131,12 @@ class Point(NamedTuple):
 def curve(records: Sequence[Record], metric: str) -> list[Point]:
     """Return a metric of one row along the ladder, the weakest rung first."""
     found = []
+    known = {place: rungs_of(*place) for place in ladders(records)}
     for name in rung_names(records):
-        own = [r for r in at_rung(records, name) if r.ok]
-        strengths = {_place(r): r.strength for r in own}
-        rungs = {place: rungs_of(*place)[rung] for place, rung in strengths.items()}
-        logs = (math.log(rung.strength / unit(place)) for place, rung in rungs.items())
+        chosen = {place: _nearest(rungs, name) for place, rungs in known.items()}
+        own = [r for r in records if r.ok and r.strength and r.strength == chosen.get(_place(r))]
+        rungs = {place: known[place][chosen[place]] for place in dict.fromkeys(map(_place, own))}
+        logs = (math.log(rung.strength / known[p][UNIT].strength) for p, rung in rungs.items())
         lost = nan_mean(1 - rung.kept for rung in rungs.values())
         value = mean_over_cells((r.seed, r.value(metric)) for r in own)
         found.append(Point(math.exp(nan_mean(logs)), lost, value))

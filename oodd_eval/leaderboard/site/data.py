@@ -24,10 +24,9 @@ from oodd_eval.metrics.catalogue import (
 )
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
-from oodd_eval.results.identity import Setting
 from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import Board, Standing, contribution
+from oodd_eval.results.tables.board import Standing, contribution, grouped
 
 _COMPARED: Final = (
     "false_episodes", "early", "delay", "delay_censored", "missed", "found_within_20",
@@ -85,6 +84,7 @@ def _power(section: SuiteSection) -> Json:
     board, tables = section.board, section.tables[:2]
     by_name = {str(row): row for row in board.entries}
     rows = [by_name[line[0]] for line in tables[0].rows] if tables else []
+    records = grouped(board.records, lambda r: r.setting)
     metrics = [metric_info(name) for name in (FOUND, RANKING)]
     return {
         **_fields(board, "split", "digest"),
@@ -92,15 +92,14 @@ def _power(section: SuiteSection) -> Json:
         "metrics": [_metric(info.name) | {"chance": info.name == RANKING} for info in metrics],
         "rows": [
             {"label": str(row), "trivial": board.is_trivial(row),
-             "points": [_points(board, row, info.name) for info in metrics]}
+             "points": [_points(records[row], info.name) for info in metrics]}
             for row in rows
         ],
     }  # fmt: skip
 
 
-def _points(board: Board, row: Setting, metric: str) -> list[list[float | None]]:
-    own = [r for r in board.records if r.setting == row]
-    return [[_short(value) for value in point] for point in curve(own, metric)]
+def _points(records: Sequence[Record], metric: str) -> list[list[float | None]]:
+    return [[_short(value) for value in point] for point in curve(records, metric)]
 
 
 def _fields(thing: object, *names: str) -> Json:

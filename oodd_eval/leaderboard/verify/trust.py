@@ -18,7 +18,7 @@ from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import EntryInfo
-from oodd_eval.leaderboard.grants import TRUST, Grant, Trust, read_grants, write_grants
+from oodd_eval.leaderboard.grants import TRUST, Grant, Means, Trust, read_grants, write_grants
 from oodd_eval.leaderboard.rerun import RerunOrder
 from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
@@ -54,12 +54,14 @@ _FIELDS: Final = ("detector_version", "plugin", "plugin_source", "status", "dete
 class Rerun:
     """The result of a comparison with a re-run, in one line and in a line for every row.
 
-    It is confirmed when every row was run again in `LEAST` environments, and all agrees.
+    It is confirmed when every row was run again in `LEAST` environments, and all agrees. `means`
+    are those of a `Grant`.
     """
 
     how: str
     lines: list[str]
     confirmed: bool
+    means: Means
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,7 @@ def compare_rerun(
     again, place = _usable(records, fresh, findings)
     ours = grouped(records.values(), _place)
     both = {key: (own, again[key]) for key, own in ours.items() if key in again}
-    lines = []
+    lines, means = [], Means()
     for row in dict.fromkeys(row for row, _, _ in ours):
         own = {(env, condition): pair for (r, env, condition), pair in both.items() if r == row}
         whole = {env for env, _ in own if all((env, a) in own for a in TABLE1)}
@@ -123,8 +125,10 @@ def compare_rerun(
             findings.refuse("re-run", str(row), why)
             continue
         cells = sum(key[0] == row for key in ours)
-        told = _differences(str(row), own, findings)
-        lines.append("; ".join([f"{row}: {len(own)} of {cells} cells run again", *told]))
+        told = list(_differences(str(row), own, findings))
+        means[str(row)] = {metric: pair for metric, pair, _ in told}
+        line = [f"{row}: {len(own)} of {cells} cells run again", *(text for *_, text in told)]
+        lines.append("; ".join(line))
     for where, record in records.items():
         for other in again.get(_place(record), ())[:1]:
             for field in _FIELDS:
@@ -132,7 +136,7 @@ def compare_rerun(
                 findings.expect(where, field, new, old, "as in the re-run")
     drawn = str(order or "by the verifier's word")
     how = f"{place}, {drawn}, {len(both)} of {len(ours)} cells"
-    return Rerun(how, lines, confirmed=findings.count == before)
+    return Rerun(how, lines, findings.count == before, means)
 
 
 def _place(record: Record) -> _Place:
@@ -168,8 +172,11 @@ def _differences(
     label: str,
     cells: Mapping[tuple[str, str], tuple[list[Record], list[Record]]],
     findings: Findings,
-) -> Iterator[str]:
-    """Compare means over paired cells of a row, as text; refuse what chance does not explain."""
+) -> Iterator[tuple[str, tuple[float, float], str]]:
+    """Compare means over paired cells of a row; refuse what chance does not explain.
+
+    Yields metric, the entry's mean and the re-run's, and the same as text.
+    """
     for metric in COMPARED:
         drawn: tuple[list[DrawnCell], list[DrawnCell]] = ([], [])
         pairs: dict[str, list[list[float]]] = {}
@@ -179,9 +186,9 @@ def _differences(
                  for r in side if r.ok and metric in r.per_trajectory]
                 for side in sides
             ]  # fmt: skip
-            pair = [nan_mean(cell.contribution.value for cell in side) for side in own]
-            if not any(map(math.isnan, pair)):
-                pairs.setdefault(environment, []).append(pair)
+            both = [nan_mean(cell.contribution.value for cell in side) for side in own]
+            if not any(map(math.isnan, both)):
+                pairs.setdefault(environment, []).append(both)
                 for all_of_side, one in zip(drawn, own, strict=True):
                     all_of_side.extend(one)
         means = np.array([np.mean(own, axis=0) for own in pairs.values()]).reshape(-1, 2)
@@ -196,7 +203,8 @@ def _differences(
         wide = by_chance(change, episodes)
         environment = list(pairs)[int(np.argmax(np.abs(change)))]
         most = f"most in {environment}, by {np.max(np.abs(change)):.2g}"
-        yield f"{metric} {other:.4g} for {mine:.4g} ({most})"
+        pair = float(f"{mine:.6g}"), float(f"{other:.6g}")
+        yield metric, pair, f"{metric} {other:.4g} for {mine:.4g} ({most})"
         if (mine - other) * (-1 if info.better == "lower" else 1) > wide:
             message = f"is {other:.4g}, but {mine:.4g} in the entry: chance explains {wide:.2g}"
             findings.refuse("re-run", f"{label} {metric}", f"{message}, not the whole difference")
@@ -227,9 +235,11 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
             f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
             f"is {level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
         )
-    how = verdict.rerun.how if verdict.rerun else "every metric recomputed from its scores"
+    how, means = "every metric recomputed from its scores", Means()
+    if verdict.rerun:
+        how, means = verdict.rerun.how, verdict.rerun.means
     day = datetime.now(UTC).date().isoformat()
-    granted = Grant(verdict.digest, level, by, day, how)
+    granted = Grant(verdict.digest, level, by, day, how, means)
     results = directory.absolute().parent
     write_grants(results, read_grants(results) | {verdict.name: granted})
     return granted
