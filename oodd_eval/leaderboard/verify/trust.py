@@ -127,8 +127,8 @@ def compare_rerun(
         cells = sum(key[0] == row for key in ours)
         told = list(_differences(str(row), own, findings))
         means[str(row)] = {metric: pair for metric, pair, _ in told}
-        line = [f"{row}: {len(own)} of {cells} cells run again", *(text for *_, text in told)]
-        lines.append("; ".join(line))
+        differences = [text for *_, text in told if text]
+        lines.append("; ".join([f"{row}: {len(own)} of {cells} cells run again", *differences]))
     for where, record in records.items():
         for other in again.get(_place(record), ())[:1]:
             for field in _FIELDS:
@@ -175,7 +175,7 @@ def _differences(
 ) -> Iterator[tuple[str, tuple[float, float], str]]:
     """Compare means over paired cells of a row; refuse what chance does not explain.
 
-    Yields metric, the entry's mean and the re-run's, and the same as text.
+    Yields metric, the entry's mean and the re-run's, and the difference as text where there is one.
     """
     for metric in COMPARED:
         drawn: tuple[list[DrawnCell], list[DrawnCell]] = ([], [])
@@ -193,9 +193,13 @@ def _differences(
                     all_of_side.extend(one)
         means = np.array([np.mean(own, axis=0) for own in pairs.values()]).reshape(-1, 2)
         change = means[:, 0] - means[:, 1]
-        if len(change) < 2 or not change.any():
+        if len(change) < 2:
             continue
         info, (mine, other) = metric_info(metric), means.mean(axis=0)
+        pair = float(f"{mine:.6g}"), float(f"{other:.6g}")
+        if not change.any():
+            yield metric, pair, ""
+            continue
         ends = [mean_interval(side, kind=info.interval) for side in drawn]
         episodes = math.hypot(
             *(float(np.nan_to_num(high - low)) / 2 / _NORMAL for low, high in ends)
@@ -203,7 +207,6 @@ def _differences(
         wide = by_chance(change, episodes)
         environment = list(pairs)[int(np.argmax(np.abs(change)))]
         most = f"most in {environment}, by {np.max(np.abs(change)):.2g}"
-        pair = float(f"{mine:.6g}"), float(f"{other:.6g}")
         yield metric, pair, f"{metric} {other:.4g} for {mine:.4g} ({most})"
         if (mine - other) * (-1 if info.better == "lower" else 1) > wide:
             message = f"is {other:.4g}, but {mine:.4g} in the entry: chance explains {wide:.2g}"
