@@ -133,6 +133,11 @@ def test_fresh_seeds_confirm_within_what_chance_explains(
     assert (granted.trust, granted.by) == ("re-run", "M. Aintainer")
     assert granted.how.startswith("fresh seeds (split fresh, digest ")
     assert granted.how.endswith("24 of 24 cells")
+    entry, again = (
+        np.mean([r.value("auc_matched") for r in records if r.detector == "persistence"])
+        for records in (read_entry(draft.path).records, ResultsDirectory(fresh).records())
+    )
+    assert granted.means["persistence"]["auc_matched"] == pytest.approx((entry, again), rel=1e-5)
 
 
 def test_an_honest_row_is_rarely_refused_and_a_raised_one_is_found():
