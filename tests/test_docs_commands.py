@@ -114,6 +114,7 @@ WITH_COMMANDS = [path for path in PAGES if commands(path.read_text())]
 WITH_PYTHON = [path for path in PAGES if python_blocks(path.read_text())]
 
 FRAGMENTS = {
+    "README.md": "test_live_wrappers runs it and reads what it prints",
     "docs/tutorial.md": "a piece of the test file that `new` writes, which test_new runs",
     "detectors/README.md": "the plug-in that the commands of the page run",
 }

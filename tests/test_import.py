@@ -333,6 +333,7 @@ def test_what_is_wrong_with_an_episode_is_said_with_its_file(tmp_path, spoil, me
         (5, "0.4,1", r"run-1.csv, line 5, column 'obs:flow': nothing, expected a number"),
         (5, "0.4,1,2,3,,1", r"run-1.csv, line 5, column 'action:valve': '', expected a number"),
         (5, "0.4," * 2**18, r"run-1.csv cannot be read: .* more than 1048576 characters"),
+        (5, "", r"run-1.csv, line 5, column 'obs:pressure.*': nothing, expected a number"),
         (1, "", r"run-1.csv has the columns \[\], expected those of"),
         (1, "time,obs:a", r"run-1.csv has the columns \['time', 'obs:a'\], expected those of"),
     ],

@@ -229,16 +229,18 @@ def _lines(path: Path) -> Iterator[tuple[list[str], int]]:
 
     One at a time, as a cell takes 20 times the bytes that it has in the file.
     """
-    empty: list[tuple[list[str], int]] = []
+    empty: tuple[list[str], int] | None = None
     number = 0
     try:
         with _text(path) as text:
             pieces = iter(lambda: text.readline(MOST_LINE + 1), "")
             for number, row in enumerate(csv.reader(_no_longer(pieces)), start=1):
-                empty.append((row, number))
-                if number == 1 or any(row):
-                    yield from empty
-                    empty.clear()
+                if number > 1 and not any(row):
+                    empty = empty or (row, number)
+                    continue
+                if empty:
+                    yield empty
+                yield row, number
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise _broken(str(path), error) from error
     if not number:
