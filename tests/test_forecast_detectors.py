@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers_forecast import Walker, one_step, slow_errors
+from helpers_saved import assert_zero_scales_are_refused
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms, riqn_r
 from oodd_torch.forecast import Forecaster, arrange, quantile_levels, rollouts
@@ -473,6 +474,12 @@ def test_damaged_fits_are_refused(damage, message, tmp_path):
     damage(tmp_path)
     with pytest.raises(FittedStateError, match=message):
         npn(seed=1, horizon=1, **SMALL).load(tmp_path)
+
+
+def test_a_saved_scale_of_zero_is_refused(tmp_path):
+    saved = npn(seed=1, horizon=1, **SMALL).fit(waves())
+    fresh = npn(seed=1, horizon=1, **SMALL)
+    assert_zero_scales_are_refused(saved, fresh, tmp_path, ["std", "residual"])
 
 
 def edit(directory, **changes):

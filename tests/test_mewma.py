@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers_saved import assert_zero_scales_are_refused
 from oodd_common.charts import distance, product, smooth, whitening
 from oodd_mewma import make_mewma, make_mewma_a
 from oodd_mewma.forecast import Moments, regressors
@@ -327,3 +328,8 @@ def test_a_fit_of_another_horizon_is_refused(make, tmp_path):
     make(horizon=2).fit(NOMINAL).save(tmp_path)
     with pytest.raises(FittedStateError, match="'horizon': 2"):
         make(horizon=3).load(tmp_path)
+
+
+def test_a_saved_scale_of_zero_is_refused(tmp_path):
+    scales = ["std", "action_scale", "residual_scale", "distance_std"]
+    assert_zero_scales_are_refused(make_mewma_a().fit(NOMINAL), make_mewma_a(), tmp_path, scales)

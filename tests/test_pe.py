@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers_saved import assert_zero_scales_are_refused
 from oodd_pe import make_pe
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.network import LEAST_SCALES, DensityNetworks, train
@@ -331,6 +332,11 @@ def test_more_memories_is_another_fit(fitted, tmp_path):
     fitted["pe"].save(tmp_path)
     with pytest.raises(FittedStateError, match="memories"):
         make_pe("pe", **SMALL, memories=[0.5]).load(tmp_path)
+
+
+def test_a_saved_scale_of_zero_is_refused(fitted, tmp_path):
+    scales = ["std", "action_scale", "error_scale", "input_scale"]
+    assert_zero_scales_are_refused(fitted["pe-a"], make_pe("pe-a", **SMALL), tmp_path, scales)
 
 
 def test_sensors_that_never_vary_are_no_obstacle():

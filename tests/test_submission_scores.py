@@ -231,6 +231,33 @@ def test_tampered_curves_are_refused_by_their_field(submissions, tmp_path, case)
     assert_refused(draft.verdict(submissions.split), field)
 
 
+def part(name, key, value):
+    """Change one list or number of the first unit; a list is the value at every point."""
+
+    def change(content):
+        found = content["units"][0][name]
+        found[key] = [value] * len(found[key]) if isinstance(found[key], list) else value
+
+    return curves(change)
+
+
+@pytest.mark.parametrize(
+    ("tamper", "field"),
+    [
+        (part("roc", "tpr", 1), "units[0].roc"),
+        (part("delay_far", "missed", 0.777), "units[0].delay_far"),
+        (part("delay_far", "far", 0.777), "units[0].delay_far"),
+        (part("delay_far", "delay_censored", 0.777), "units[0].delay_far"),
+        (part("delay_far", "threshold", 0.777), "units[0].delay_far"),
+        (part("example", "auc_matched", 0.0123), "units[0].example.auc_matched"),
+    ],
+)
+def test_curves_that_contradict_their_record_are_refused(submissions, tmp_path, tamper, field):
+    draft = Draft(submissions.full, tmp_path)
+    tamper(draft)
+    assert_refused(draft.verdict(), field)
+
+
 def test_scores_confirm_every_metric(submissions):
     from oodd_eval.leaderboard.verify import verify_entry
 

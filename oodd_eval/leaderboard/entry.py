@@ -154,8 +154,15 @@ def read_entry(path: Path | str) -> SubmittedEntry:
             "version of oodd-eval"
         )
     grant = read_grants(file.absolute().parents[1]).get(meta.id)
-    granted = grant if grant and grant.entry == digest_of(content) else None
-    return SubmittedEntry(file.parent, meta, ResultsDirectory(path).records(), granted)
+    granted = grant and grant.entry == digest_of(content) and _has_its_files(file.parent, meta)
+    records = ResultsDirectory(path).records()
+    return SubmittedEntry(file.parent, meta, records, grant if granted else None)
+
+
+def _has_its_files(directory: Path, meta: EntryInfo) -> bool:
+    """Tell whether the files that an entry names are as it says: a grant is of these."""
+    named = {directory / name: known.get("sha256") for name, known in meta.files.items()}
+    return all(p.is_file() and digest_of(p.read_bytes()) == own for p, own in named.items())
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:

@@ -50,7 +50,7 @@ class _Layout:
 
 
 def digest_of(content: bytes) -> str:
-    """Return the SHA-256 digest of the bytes of an ``entry.json``, as a grant names it."""
+    """Return the SHA-256 digest of the bytes of a file, as grants and entries name it."""
     return hashlib.sha256(content).hexdigest()
 
 

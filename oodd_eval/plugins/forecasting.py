@@ -47,10 +47,15 @@ class FeatureScale:
         return cls(rows.mean(axis=0), np.where(std < CONSTANT, 1.0, std))
 
     @classmethod
-    def of(cls, arrays: Arrays) -> "FeatureScale":
-        """Return the scale among saved arrays; `FittedStateError` where there is none."""
+    def of(cls, arrays: Arrays, name: str = "") -> "FeatureScale":
+        """Return the scale among saved arrays; `FittedStateError` where there is none.
+
+        With a `name` it is the two rows of that array.
+        """
+        if name:
+            arrays = dict(zip(("mean", "std"), take(arrays, name, (2, None)), strict=True))
         mean = take(arrays, "mean", (None,))
-        return cls(mean, take(arrays, "std", mean.shape))
+        return cls(mean, take(arrays, "std", mean.shape, "+"))
 
     def arrays(self) -> Arrays:
         """Return what `of` reads."""

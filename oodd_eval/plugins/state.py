@@ -70,18 +70,20 @@ def _read(directory: Path) -> tuple[Any, Arrays]:
 def take(arrays: Arrays, name: str, shape: tuple[int | None, ...], kind: str = "f") -> NDArray[Any]:
     """Return one array of `load_state`, or raise `FittedStateError` when it is something else.
 
-    `shape` has the expected lengths, None where any will do; `kind` is ``"f"`` for finite floats
-    and ``"i"`` for integers.
+    `shape` has the expected lengths, None where any will do; `kind` is ``"f"`` for finite floats,
+    ``"+"`` for positive ones, such as scales, and ``"i"`` for integers.
     """
     found = arrays.get(name)
     if (
         found is None
-        or found.dtype.kind != kind
+        or found.dtype.kind != ("i" if kind == "i" else "f")
         or found.ndim != len(shape)
         or any(n is not None and n != m for n, m in zip(shape, found.shape, strict=True))
-        or (kind == "f" and not np.isfinite(found).all())
+        or not np.isfinite(found).all()
+        or (kind == "+" and not (found > 0).all())
     ):
         what = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
-        expected = f"finite numbers of kind {kind!r} and shape {shape} (None: any)"
+        numbers = {"f": "finite floats", "+": "positive finite floats", "i": "integers"}[kind]
+        expected = f"{numbers} of shape {shape} (None: any)"
         raise FittedStateError(f"saved array {name!r} is {what}, expected {expected}")
     return found

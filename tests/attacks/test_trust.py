@@ -96,6 +96,17 @@ CHANGES = {
 }
 
 
+def test_records_that_are_not_those_of_the_grant_have_none(rows, board):
+    draft = another(rows, board, "mine", of="random")
+    draft.write()
+    digest = digest_of(draft.file("entry.json").read_bytes())
+    write_grants(board, {"mine": Grant(digest, "re-run", "us", "2026-11-23", "fresh seeds")})
+    assert read_entry(draft.path).trust == "re-run"
+    file = draft.file("records.jsonl")
+    file.write_text(file.read_text().replace('"peak_rss_mb": ', '"peak_rss_mb": 1', 1))
+    assert read_entry(draft.path).trust == "reported"
+
+
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_changed_entry_has_lost_its_grant(rows, board, change):
     draft = another(rows, board, "mine", of="random")

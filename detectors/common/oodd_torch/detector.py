@@ -237,7 +237,7 @@ class NetworkDetector(StorableWindowDetector):
             raise FittedStateError(
                 f"{str(directory / WEIGHTS)!r} cannot be read as weights of this detector: {error}"
             ) from None
-        residual = take(arrays, "residual", (sensors,)).astype(np.float32)
+        residual = take(arrays, "residual", (sensors,), "+").astype(np.float32)
         self._take(
             network.to(self.device), take(arrays, "history", (None, None)).tolist(), residual
         )

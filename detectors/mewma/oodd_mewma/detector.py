@@ -212,15 +212,15 @@ class MewmaDetector(StorableWindowDetector):
     def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
         d, w = sensors, len(self.parameters.weights)
         self.observation_scale_ = FeatureScale(
-            take(arrays, "mean", (d,)), take(arrays, "std", (d,))
+            take(arrays, "mean", (d,)), take(arrays, "std", (d,), "+")
         )
-        self.action_scale_ = FeatureScale(*take(arrays, "action_scale", (2, None)))
+        self.action_scale_ = FeatureScale.of(arrays, "action_scale")
         used = len(self.action_scale_.mean) if self.actions else 0
         self.coefficients_ = take(arrays, "coefficients", (self.window * (d + used) + 1, d))
-        self.residual_scale_ = take(arrays, "residual_scale", (d,))
+        self.residual_scale_ = take(arrays, "residual_scale", (d,), "+")
         self.whitening_ = take(arrays, "whitening", (w, d, d))
         self.distance_mean_ = take(arrays, "distance_mean", (w, 1))
-        self.distance_std_ = take(arrays, "distance_std", (w, 1))
+        self.distance_std_ = take(arrays, "distance_std", (w, 1), "+")
 
 
 def _scale_of(arrays: Sequence[NDArray[np.float32]]) -> FeatureScale:

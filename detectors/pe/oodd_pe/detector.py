@@ -343,14 +343,14 @@ class ProbabilisticEnsemble(StorableWindowDetector):
 
     def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
         self.observation_scale_ = FeatureScale.of(arrays)
-        self.action_scale_ = FeatureScale(*take(arrays, "action_scale", (2, None)))
+        self.action_scale_ = FeatureScale.of(arrays, "action_scale")
         self.varying_ = take(arrays, "varying", (None,), "i")
         d = len(self.varying_)
         commands = len(self.action_scale_.mean)
         inputs = self.window * (d + commands) + 1
         self.ridge_ = take(arrays, "ridge", (inputs + 1, d))
-        self.error_scale_ = take(arrays, "error_scale", (d,))
-        self.input_scale_ = take(arrays, "input_scale", (inputs,))
+        self.error_scale_ = take(arrays, "error_scale", (d,), "+")
+        self.input_scale_ = take(arrays, "input_scale", (inputs,), "+")
         p = self.parameters
         self.ensemble_ = DensityEnsemble.restored(
             arrays, DensityNetworks(p.members, inputs, d, p.width)

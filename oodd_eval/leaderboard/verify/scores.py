@@ -26,6 +26,7 @@ from oodd_eval.leaderboard.entry import CURVES, SCORES
 from oodd_eval.leaderboard.verify.files import Findings, find_text, parse_json, plain, shown
 from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, complaint
 from oodd_eval.leaderboard.verify.records import Records, compare_metrics, same
+from oodd_eval.metrics.cusum import THRESHOLD
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
 from oodd_eval.results.directory import EXPLAINED, ORDER_BITS, ResultsDirectory
@@ -39,6 +40,8 @@ PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in TABLE1))
 """Groups of a score file."""
 
 ROUNDED: Final = {"rel_tol": 0.01, "abs_tol": 2e-5}  # curves have three digits and five decimals
+
+AREA: Final = 0.002  # what rounding changes of the area below a curve
 
 _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
 _EXPLAINED: Final = dict.fromkeys(EXPLAINED, np.dtype(np.int32))  # of anomalous parts, if at all
@@ -238,6 +241,9 @@ def check_curves(
             findings.expect(name, f"units[{i}].{field}", value, unit[field], "as in its record")
         if unit["example"]["index"] >= record.counts["test"]:
             findings.refuse(name, f"units[{i}].example.index", "is no test trajectory")
+            continue
+        for field, message in _contradictions(unit, record):
+            findings.refuse(name, f"units[{i}].{field}", message)
     for cell, record in undrawn.items():
         if (record.setting, record.seed) in rows:
             message = f"lack {cell}: a row has curves of all its evaluated cells, or of none"
@@ -248,6 +254,30 @@ def check_curves(
             why = f"but a row's curves are of its first seed, {first[setting]}"
             findings.refuse(name, "units", f"are of {setting.label(seed)}, {why}")
     return units if findings.count == before else None
+
+
+def _contradictions(unit: Json, record: Record) -> Complaints:
+    """Yield fields of a cell's curves that say otherwise than its record does."""
+    fpr, tpr = (np.array(unit["roc"][name], np.float64) for name in ("fpr", "tpr"))
+    low, high = (float(np.diff(fpr) @ ends) for ends in (tpr[:-1], tpr[1:]))
+    area = record.value("auc_matched")
+    if area < low - AREA or area > high + AREA:
+        yield "roc", f"has an area from {low:.4f} to {high:.4f}, but auc_matched is {area:.4f}"
+    swept = unit["delay_far"]
+    far, delay, missed = map(record.value, ("far_twin", "delay_censored", "missed"))
+    drawn = zip(*(swept[n] for n in ("threshold", "far", "delay_censored", "missed")), strict=True)
+    if not any(all(map(_close, point, (THRESHOLD, far, delay, missed))) for point in drawn):
+        yield "delay_far", f"lacks the record's {far:.4g}, {delay:.4g}, {missed:.4g} at {THRESHOLD}"
+    example = unit["example"]
+    terms = record.per_trajectory.get("auc_matched", ([], []))
+    own = [n / d if d else math.nan for n, d in zip(*terms, strict=True)]
+    if own and not _close(example["auc_matched"], own[example["index"]]):
+        yield "example.auc_matched", f"is not the record's {own[example['index']]:.4f}"
+
+
+def _close(drawn: float | None, value: float) -> bool:
+    """Tell whether a number is another one rounded for drawing; None is an undefined one."""
+    return math.isnan(value) if drawn is None else math.isclose(drawn, value, **ROUNDED)
 
 
 def check_recomputed_curves(
