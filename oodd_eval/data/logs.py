@@ -225,16 +225,16 @@ def _open_csv(place: Path) -> Logs:
 
 
 def _lines(path: Path) -> Iterator[tuple[list[str], int]]:
-    """Yield the header and the rows of a file with their numbers; empty ones at its end count not.
+    """Yield header and rows of a file with their line numbers, without empty rows at its end.
 
-    One at a time, as a cell takes 20 times the bytes that it has in the file.
+    They come one at a time: in memory, the text of a cell takes 20 times its bytes in the file.
     """
     empty: tuple[list[str], int] | None = None
     number = 0
     try:
         with _text(path) as text:
             pieces = iter(lambda: text.readline(MOST_LINE + 1), "")
-            for number, row in enumerate(csv.reader(_no_longer(pieces)), start=1):
+            for number, row in enumerate(csv.reader(_bounded(pieces)), start=1):
                 if number > 1 and not any(row):
                     empty = empty or (row, number)
                     continue
@@ -247,7 +247,7 @@ def _lines(path: Path) -> Iterator[tuple[list[str], int]]:
         yield [], 1
 
 
-def _no_longer(lines: Iterator[str]) -> Iterator[str]:
+def _bounded(lines: Iterator[str]) -> Iterator[str]:
     for line in lines:
         if len(line) > MOST_LINE:
             raise csv.Error(f"a line has more than {MOST_LINE} characters")

@@ -235,7 +235,7 @@ def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]
     """
     score_many = getattr(detector, "score_many", None)
     scores = list(score_many(chunk)) if score_many else [detector.score(x) for x in chunk]
-    # What made a masked array has imported this; to import it in every group takes 50 ms.
+    # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
     masked = sys.modules.get("numpy.ma")
     if masked and any(masked.is_masked(one) for one in scores):
         # Only its data would be sent on, with whatever stands where it is masked.

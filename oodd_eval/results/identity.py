@@ -49,7 +49,7 @@ class Setting:
         cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
     ) -> "Setting":
         """Make a setting from a mapping of the parameters that are not at their default."""
-        if not overrides:  # of most records, of which a board has tens of thousands
+        if not overrides:  # as in most of the tens of thousands of records that a board reads
             return _plain(detector, horizon)
         names = sorted(overrides)
         texts = ((k, json.dumps(overrides[k], sort_keys=True, default=str)) for k in names)

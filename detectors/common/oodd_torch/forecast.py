@@ -23,7 +23,7 @@ from oodd_torch.training import predict
 ROWS = 256
 """Forecasts of one network that are computed together at horizon 1.
 
-Every group is scored in a process of its own, to which arrays that fit the cache cost the least.
+Each group is scored in a new process. There, arrays that fit the processor's cache are quickest.
 """
 
 ROLLOUTS = 1024

@@ -257,7 +257,7 @@ def check_curves(
 
 
 def _contradictions(unit: Json, record: Record) -> Complaints:
-    """Yield fields of a cell's curves that say otherwise than its record does."""
+    """Yield the fields of a cell's curves that contradict its record, and how."""
     fpr, tpr = (np.array(unit["roc"][name], np.float64) for name in ("fpr", "tpr"))
     low, high = (float(np.diff(fpr) @ ends) for ends in (tpr[:-1], tpr[1:]))
     area = record.value("auc_matched")
@@ -267,7 +267,8 @@ def _contradictions(unit: Json, record: Record) -> Complaints:
     far, delay, missed = map(record.value, ("far_twin", "delay_censored", "missed"))
     drawn = zip(*(swept[n] for n in ("threshold", "far", "delay_censored", "missed")), strict=True)
     if not any(all(map(_close, point, (THRESHOLD, far, delay, missed))) for point in drawn):
-        yield "delay_far", f"lacks the record's {far:.4g}, {delay:.4g}, {missed:.4g} at {THRESHOLD}"
+        told = f"far {far:.4g}, delay_censored {delay:.4g} and missed {missed:.4g}"
+        yield "delay_far", f"lacks the record's {told} at threshold {THRESHOLD}"
     example = unit["example"]
     terms = record.per_trajectory.get("auc_matched", ([], []))
     own = [n / d if d else math.nan for n, d in zip(*terms, strict=True)]
