@@ -93,6 +93,7 @@ class Browser:
             select.dispatchEvent(new Event("change", { bubbles: true }));
         """
         self.run(script, name, text)
+        self.wait_for("!document.querySelector('[aria-busy]')")
 
     def press(self, *names):
         """Press keys, or chords such as ``shift+tab``, on whatever has the focus."""

@@ -1,7 +1,8 @@
 """Entries of a leaderboard made by hand, and the data of a site as large as it gets."""
 
 import functools
-import itertools
+import json
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from helpers_records import make_record
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
+from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import EntryInfo, read_entries
 from oodd_eval.leaderboard.grants import Grant, digest_of, read_grants, write_grants
 from oodd_eval.leaderboard.sections import sections, suite_sections
@@ -173,7 +175,7 @@ def other_levels(columns):
 
 
 def one_row(root):
-    """Data and curves of a site of one detector on all cells."""
+    """Index and parts of a site of one detector on all cells."""
     rng = np.random.default_rng(0)
     records, units = [], []
     for e in ENVIRONMENTS:
@@ -194,35 +196,50 @@ def one_row(root):
 
 
 @functools.cache
-def full(detectors=14, splits=2):
-    """Data and curves of a site as large as the real one gets: all cells, and all metrics.
+def full(rows):
+    """Files of a site with so many detectors on all cells and with all metrics.
 
-    One row is computed, of numbers as long as real ones; the others are copies of other names.
+    One row is computed, of numbers as long as real ones; the others are copies of other names. Of
+    their data files only that of the second is there.
     """
     with tempfile.TemporaryDirectory() as directory:
-        data, curves = one_row(Path(directory))
+        data, parts = one_row(Path(directory))
     (board,) = data["boards"]
     (row,) = board["rows"]
-    names = [f"detector-{i}" for i in range(detectors)]
-    data["boards"] = [
-        board
-        | {
-            "id": f"split-{split}",
-            "rows": [
-                row
-                | {
-                    "id": f"split-{split}/{name}",
-                    "label": name,
-                    "rank": i + 1,
-                    "curves": split * detectors + i,
-                }
-                for i, name in enumerate(names)
-            ],
-            "comparisons": [
-                [one, other, 0.0123456, -0.0123456, 0.0234567, 0.00149985]
-                for one, other in itertools.permutations(names, 2)
-            ],
-        }
-        for split in range(splits)
+    names = [f"detector-{i}" for i in range(rows)]
+    board["rows"] = [
+        row | {"id": f"board/{name}", "part": name, "label": name, "detector": name, "rank": i + 1}
+        for i, name in enumerate(names)
     ]
-    return data, curves * (splits * detectors)
+    part = parts[row["part"]]
+    part |= {"comparisons": [[name, 0.0123456, -0.012345, 0.0234567, 0.0015] for name in names]}
+    content = part | {"curves": site.packed(part["curves"])}
+    found = {
+        site.PAGE: site.index(data),
+        f"{site.PARTS}/{names[1]}.js": site.data_file(names[1], content),
+    }
+    for name in board["parts"].values():
+        (values,) = parts[name]["values"].values()
+        ends = {
+            key: pair
+            for (own,) in [parts[name]["intervals"].values() or [{}]]
+            for key, pair in own.items()
+        }
+        shared = {"values": dict.fromkeys(names, values), "intervals": dict.fromkeys(names, ends)}
+        found[f"{site.PARTS}/{name}.js"] = site.data_file(name, shared)
+    return found
+
+
+def write_site(directory, files):
+    """Write a site's files and return the address of its page."""
+    for name, text in files.items():
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / name).write_text(text, encoding="utf-8")
+    return (directory / site.PAGE).as_uri()
+
+
+def read_part(files, name):
+    """What a data file hands over, read as the page's script reads it."""
+    quoted = re.fullmatch(r"ooddPart\('([a-z0-9-]+)','(.*)'\);\n", files[f"{site.PARTS}/{name}.js"])
+    assert quoted[1] == name
+    return json.loads(re.sub(r"\\(.)", r"\1", quoted[2]))

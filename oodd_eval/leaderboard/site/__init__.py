@@ -1,8 +1,8 @@
 """The leaderboard's site: a page and data files beside it, from disk or from any web server.
 
 The page holds styles, scripts and the index of all rows. Its content security policy allows that
-style and script, by digest, and scripts beside the page: the data files, loaded when they are needed.
-Each calls one function with its name and its content as JSON text. What they hold is computed in
+style and script, by digest, and scripts beside the page: the data files, loaded when needed. Each
+calls one function with its name and its content as JSON text. What they hold is computed in
 `oodd_eval.leaderboard.site.data`; here curves are made small.
 """
 
@@ -38,14 +38,15 @@ _STATIC = Path(__file__).with_name("static")
 
 
 def files(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, project: str = ""
-) -> dict[str, str]:
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *,
+    project: str = "",
+) -> dict[str, str]:  # fmt: skip
     """Return the files of a leaderboard's site by name; the same entries give the same bytes.
 
     `project` is the address of code and documents; without it the page does not link to them.
     """
     data, parts = site_data(sections, suites)
-    found = {PAGE: _page(data | {"project": project})}
+    found = {PAGE: index(data | {"project": project})}
     for name, part in parts.items():
         if part.get("curves"):
             part = part | {"curves": packed(part["curves"])}  # noqa: PLW2901
@@ -53,7 +54,8 @@ def files(
     return found
 
 
-def _page(data: Json) -> str:
+def index(data: Json) -> str:
+    """Return the page with its index of all rows."""
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     parts = {

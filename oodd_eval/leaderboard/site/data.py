@@ -1,8 +1,9 @@
 """The content of the site as plain data: an index of boards and rows, and parts loaded on demand.
 
-The index has what the first view of every table shows, in whole numbers of the last printed digit.
-A part is a row with all its cells and curves, or one metric of all cells of a board. Everything that
-is not simple arithmetic is computed here; the page filters, averages over cells, sorts and draws.
+The index has what the first view of every table shows, in whole numbers of the last printed
+digit. A part is a row with all its cells and curves, or one metric of all cells of a board.
+Everything that is not simple arithmetic is computed here; the page filters, averages over cells,
+sorts and draws.
 """
 
 import hashlib
@@ -231,9 +232,7 @@ def _summaries(
     return found
 
 
-def _by_cell(
-    standing: Standing, cells: Sequence[SelectedCell], metric: str
-) -> list[float | None]:
+def _by_cell(standing: Standing, cells: Sequence[SelectedCell], metric: str) -> list[float | None]:
     """Return a row's mean over detector seeds in every cell; None where there is none."""
     own = grouped(standing.records, lambda r: (r.environment, r.anomaly))
     whole = [all(r.ok for r in own.get(cell, ())) for cell in cells]

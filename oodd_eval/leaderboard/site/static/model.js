@@ -90,7 +90,8 @@ function mean(board, row, metric, selection = EVERYTHING) {
   const part = partOf(board, metric);
   if (!part) return found;
   found.value = meanOf(chosen.map((i) => part.values[row.part][i]));
-  const key = `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
+  const key = chosen.length === 1 ? board.cells[chosen[0]].join("|")
+    : `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
   [found.low, found.high] = part.intervals[row.part]?.[key] ?? [null, null];
   return found;
 }

@@ -58,16 +58,25 @@ function groupedBy(items, key) {
   return found;
 }
 
+/** A function of rows that is worked out once for each. */
+function once(of) {
+  const known = new Map();
+  return (row) => {
+    if (!known.has(row)) known.set(row, of(row));
+    return known.get(row);
+  };
+}
+
 const rankOfView = () => LISTS[state.view].rank ?? RANK;
 
 /** Sort by a column, by matched AUC when the view has no such column; what has no value last. By rank
  * and by matched AUC, what was not run again stands below what was. */
 function sorted(board, rows, columns) {
-  const label = (a, b) => a.label.localeCompare(b.label);
+  const label = (a, b) => a.label < b.label ? -1 : Number(a.label > b.label);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
-  const matched = (row) => mean(board, row, "auc_matched", state).value;
+  const matched = once((row) => mean(board, row, "auc_matched", state).value);
   const column = [rankOfView(), ...columns].find((c) => c.key === state.sort);
-  const value = column ? (row) => column.of(row, state).value : matched;
+  const value = column ? once((row) => column.of(row, state).value) : matched;
   const sign = column && state.ascending ? 1 : -1;
   return [...rows].sort((a, b) => {
     const [x, y] = [value(a), value(b)];
@@ -85,6 +94,7 @@ function sortBy(key, better) {
 }
 
 let drawing = 0;
+let body = null; // lines of the table that stands there: they are kept where only their order changes
 
 /** Draw the table, once the data that its columns need is there. */
 async function drawTable() {
@@ -107,9 +117,9 @@ async function drawTable() {
   markNavigation(state.view === "guaranteed" ? ALARMS : "");
   const rows = sorted(board, rowsOf(board), columns);
   const lines = folded(rows);
-  const found = new Map(rows.map((row) => [row, columns.map((column) => column.of(row, state))]));
-  const best = columns.map((column, i) => bestOf(column, rows.filter((r) => !r.trivial).map((r) => found.get(r)[i].value)));
-  const start = axisStart(board);
+  const { sort, ascending, ...shown } = state;
+  const key = JSON.stringify([shown, [...unfolded]]);
+  if (body?.key !== key) body = { key, lines: linesOf(board, rows, lines, columns) };
   const focused = document.activeElement?.dataset?.key;
   const table = element("table", { id: "ranking", class: "board" },
     captionOf(what(board, rows)),
@@ -118,12 +128,20 @@ async function drawTable() {
       header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", class: "left", better: "lower" }),
       ...columns.map(header),
     ])),
-    element("tbody", {}, lines.map((line) => tableRow(line, columns, found.get(line.row), best, start))),
+    element("tbody", {}, lines.map(({ row }) => body.lines.get(row))),
   );
   place.replaceChildren(columns.length ? table : element("p", { class: "note" }, LISTS[state.view].empty));
   if (focused) place.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   document.getElementById("notes").replaceChildren(...notesOf(board, rows));
   history.replaceState(null, "", tableAddress());
+}
+
+/** The elements of the table's lines, by row. */
+function linesOf(board, rows, lines, columns) {
+  const found = new Map(rows.map((row) => [row, columns.map((column) => column.of(row, state))]));
+  const best = columns.map((column, i) => bestOf(column, rows.filter((r) => !r.trivial).map((r) => found.get(r)[i].value)));
+  const start = axisStart(board);
+  return new Map(lines.map((line) => [line.row, tableRow(line, columns, found.get(line.row), best, start)]));
 }
 
 /** The value that a column marks; null where it marks none. */
