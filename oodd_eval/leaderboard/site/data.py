@@ -16,6 +16,7 @@ from typing import Any, Final
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
+from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
 from oodd_eval.metrics import bootstrap, catalogue
 from oodd_eval.metrics.bootstrap import DrawnCell, nan_mean
 from oodd_eval.metrics.catalogue import (
@@ -156,6 +157,7 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         }  # fmt: skip
     return {
         "id": section.name,
+        "episodes": _episodes(section, parts, rows),
         "cells": cells,
         "parts": {name: metric_part(section.name, name) for name in names},
         **_fields(board, "split", "digest", "protocol", "limit"),
@@ -166,6 +168,23 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         "rows": rows,
         "resamples": ranks.ranking.resamples,
     }
+
+
+def _episodes(
+    section: LeaderboardSection, parts: dict[str, Json], rows: Sequence[Json]
+) -> dict[str, str]:
+    """Add a part for each environment with the sensors of the episodes that rows show."""
+    if not (split := shipped_split(section.ranks.board.digest)):
+        return {}
+    wanted: dict[str, list[tuple[str, int]]] = {}
+    for curves in (parts[row["part"]]["curves"] for row in rows):
+        for cell, shown in curves.items():
+            environment, anomaly = cell.split("/")
+            wanted.setdefault(environment, []).append((anomaly, shown["example"]["index"]))
+    names = {environment: part_name(f"{section.name}/{environment}") for environment in wanted}
+    for environment, name in names.items():
+        parts[name] = shown_episodes(split, environment, wanted[environment])
+    return names
 
 
 def _row(

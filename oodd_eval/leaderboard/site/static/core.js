@@ -96,3 +96,7 @@ function dropdown(name, label, options, chosen, choose) {
 }
 
 const isDark = () => document.documentElement.dataset.theme === "dark";
+
+/** A box that scrolls sideways when its content is wider than the page, by keyboard, too. */
+const scroller = (...children) =>
+  element("div", { class: "scroll", tabindex: 0, role: "group", "aria-label": "Scrolls sideways" }, children);

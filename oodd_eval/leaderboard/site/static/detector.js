@@ -93,7 +93,7 @@ function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, "auc
   };
   const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
   const ordered = groups.flatMap((g) => inGroup(board, g));
-  return element("div", { class: "scroll" }, element("table", { class: "heat" },
+  return scroller(element("table", { class: "heat" },
     captionOf(caption),
     element("thead", {},
       element("tr", {}, element("td", {}), groups.map((g) => element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
@@ -133,7 +133,13 @@ function cellPart(board, row, cell) {
   const seed = row.seeds.length > 1 ? element("p", { class: "note" }, `Curves of detector seed ${curves.seed}; numbers are means over seeds.`) : null;
   return [sentence, seed,
     element("div", { class: "figures" }, rocFigure(curves.roc, at("auc_matched")), delayFigure(curves.delay_far)),
-    trajectoryFigure(curves.example)];
+    trajectoryFigure(curves.example, sensorsOf(board, cell, curves.example))];
+}
+
+/** A promise of what sensors read in an example, where the site has that; null where not. */
+function sensorsOf(board, cell, example) {
+  const name = board.episodes[cell.environment];
+  return name ? load(name).then((episodes) => episodes[`${cell.anomaly}/${example.index}`] ?? null) : null;
 }
 
 /** Curves of one cell of a row, unpacked; undefined where there are none. */
@@ -160,7 +166,7 @@ function comparisons(board, row) {
   const found = [...part.comparisons];
   if (!found.length) return null;
   const links = new Map(board.rows.map((r) => [r.label, r.id]));
-  return section("Against the others", "comparisons", element("div", { class: "scroll" }, element("table", { class: "plain" },
+  return section("Against the others", "comparisons", scroller(element("table", { class: "plain" },
     captionOf(`Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
     element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
       element("th", { scope: "col", class: i ? null : "left" }, t)))),
@@ -192,7 +198,7 @@ function paperPart(board, row) {
     return [element("td", {}, meanText(meanOfRow(board, row, metric, selection), kind)),
       element("td", { class: "paper" }, show(paperMean(row, metric, selection), kind))];
   });
-  return section("Beside the paper", "paper", element("div", { class: "scroll" }, element("table", { class: "plain" },
+  return section("Beside the paper", "paper", scroller(element("table", { class: "plain" },
     captionOf("Here, and in the paper\u2019s Table 5 (\u0394 = 1). Policies, split and alarm unit are not the paper\u2019s, so digits are not expected to agree."),
     element("thead", {},
       element("tr", {}, element("td", {}), columns.map(({ metric, group }) => element("th", { scope: "colgroup", colspan: 2 },
@@ -204,7 +210,7 @@ function paperPart(board, row) {
 }
 
 function metricsTable(board, row) {
-  return element("div", { class: "scroll" }, element("table", { class: "plain" },
+  return scroller(element("table", { class: "plain" },
     captionOf("Means over all cells"),
     element("thead", {}, element("tr", {}, ["Metric", "Mean", "95 % interval", "Meaning"].map((t, i) =>
       element("th", { scope: "col", class: i % 3 ? null : "left" }, t)))),

@@ -44,7 +44,7 @@ function difference(board, rows, selection) {
 }
 
 function pairTable(board, rows) {
-  return element("div", { class: "scroll" }, csvButton("side-by-side", () => document.getElementById("pair")),
+  return scroller(csvButton("side-by-side", () => document.getElementById("pair")),
     element("table", { class: "plain", id: "pair" }, captionOf("Means over all cells with 95 % intervals"),
       element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Metric"), rows.map((row) => element("th", { scope: "col" }, row.label)))),
       element("tbody", {}, board.metrics.map((metric) => {

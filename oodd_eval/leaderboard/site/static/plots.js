@@ -79,14 +79,14 @@ function line(plot, xs, ys, kind) {
 /** A figure: drawings, legend, caption, and the numbers behind them. */
 function figure(drawings, legend, caption, numbers) {
   return element("figure", {},
-    element("div", { class: "scroll" }, drawings),
+    scroller(drawings),
     legend.length ? element("ul", { class: "legend" }, legend.map(([kind, text]) => element("li", {},
       shape("svg", { width: 26, height: 10, viewBox: "0 0 26 10", "aria-hidden": "true" },
         kind === "point"
           ? shape("circle", { class: kind, cx: 13, cy: 5, r: 4 })
           : shape("line", { class: `line ${kind}`, x1: 1, x2: 25, y1: 5, y2: 5 })), text))) : null,
     element("figcaption", {}, caption),
-    numbers && element("details", {}, element("summary", {}, "Numbers"), element("div", { class: "scroll" }, numbers())));
+    numbers && element("details", {}, element("summary", {}, "Numbers"), scroller(numbers())));
 }
 
 function numbersTable(columns) {
@@ -156,7 +156,22 @@ function axisOf(values, unit, step, label) {
 
 let curtains = 0;
 
-function trajectoryFigure(example) {
+/** Drawings of sensors, the twin's dashed, over the same time as an example. */
+function sensorCharts(sensors, example, x, wide, onset) {
+  return sensors.map(({ name, step, own, twin }) => {
+    const part = (values) => values.slice(example.start, example.start + Math.max(example.scores.length, example.twin.length)).map((v) => v * step);
+    const [first, second] = [part(own), part(twin)];
+    const all = [...first, ...second];
+    const range = [Math.min(...all), Math.max(...all, Math.min(...all) + step)];
+    const plot = chart(`Sensor: ${name}`, { ...x, label: null }, { range, ticks: ticks(...range, 3), label: "" }, { ...wide, height: 130, top: 24 });
+    plot.drawing.append(shape("text", { class: "label", x: plot.left, y: 14 }, name), onset(plot, false),
+      line(plot, second.map((_, i) => example.start + i), second, TWIN),
+      line(plot, first.map((_, i) => example.start + i), first, ANOMALOUS));
+    return plot;
+  });
+}
+
+function trajectoryFigure(example, sensors = null) {
   const rows = (list) => list.map((_, i) => example.start + i);
   const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
   const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
@@ -185,9 +200,17 @@ function trajectoryFigure(example) {
     return found === undefined ? "none in this window" : found === example.onset ? "at the onset" : `${found - example.onset} step${found === example.onset + 1 ? "" : "s"} after the onset`;
   };
   const names = [scores, cusum].map((_, i) => `curtain-${++curtains}-${i}`);
-  const controls = player(example, [curtain(scores, names[0]), curtain(cusum, names[1])]);
+  const reveals = [curtain(scores, names[0]), curtain(cusum, names[1])];
+  const controls = player(example, reveals);
+  const above = sensors && element("figure", {});
+  sensors?.then((found) => {
+    for (const plot of sensorCharts(found ?? [], example, x, wide, onset)) {
+      above.append(scroller(plot.drawing));
+      reveals.push(curtain(plot, `curtain-${++curtains}`));
+    }
+  }, (error) => above.append(notLoaded(error)));
   const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;
-  return [controls, figure([scores.drawing, cusum.drawing],
+  return [controls, above ?? [], figure([scores.drawing, cusum.drawing],
     [[ANOMALOUS, "anomalous trajectory"], [TWIN, "its nominal twin"], ["threshold", `alarm threshold ${DATA.threshold}`]],
     `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
     `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms. ` +
