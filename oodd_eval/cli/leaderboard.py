@@ -1,4 +1,4 @@
-"""``oodd-eval leaderboard``: build the board, verify, run again and submit entries."""
+"""``oodd-eval leaderboard``: the published board, and its making from entries that are verified."""
 
 import argparse
 import tempfile
@@ -7,7 +7,7 @@ from typing import Final
 
 from rich.console import Console
 
-from oodd_eval.cli import EXPRESSION, NAMES, Parser, rerun, say
+from oodd_eval.cli import EXPRESSION, NAMES, Parser, board, rerun, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
@@ -50,6 +50,7 @@ def define(parser: Parser) -> None:
     add("--grant", default="", metavar="NAME",
         help=f"write the trust level that was reached into {GRANTS}, in this name")
     rerun.define(action("rerun", "run an entry's detectors again on seeds drawn now"))
+    board.define(action)
     add = action("submit", "write an entry from a results directory").options(
         submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
     )
