@@ -16,6 +16,7 @@ from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results.identity import Setting
@@ -625,7 +626,8 @@ def test_build_writes_page_tables_and_site(tmp_path, capsys):
     assert set(capsys.readouterr().out.split()) == {str(output / name) for name in written}
     text = (output / "README.md").read_text()
     for name in (*written, "results"):
-        assert f"]({name})" in text or name == "README.md"
+        assert f"]({name})" in text or name in ("README.md", "site/index.html", PUBLISHED)
+    assert "open `site/index.html`" in text
 
 
 def test_building_again_gives_the_same_bytes(tmp_path):
@@ -657,7 +659,6 @@ def test_check_names_every_file_that_differs(tmp_path, capsys):
     assert code == 1
     said = capsys.readouterr()
     assert said.out.splitlines() == [
-        "site/index.html: differs",
         f"{name}-cells.csv: missing",
         f"{name}-ranking.csv: differs",
         "tables/old.csv: no part of the leaderboard any more",

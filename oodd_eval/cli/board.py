@@ -130,8 +130,8 @@ def _told(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
         )
     if placed.own - placed.published:
         lines.append(
-            "New rows are ranked as if they had been run again by a maintainer. Until then an entry "
-            "stands below the rows that were."
+            "New rows are ranked as if a maintainer had run them again. Until then an entry stands "
+            "below the rows that were."
         )
     return lines
 

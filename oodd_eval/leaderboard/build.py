@@ -89,11 +89,11 @@ def _content(path: Path) -> bytes:
 def page(
     sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
 ) -> str:
-    """Return the whole page, which links to the `site` if there is one."""
+    """Return the whole page, which names the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
     parts = [TEXTS["introduction"]]
     if site:
-        parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
+        parts.append(TEXTS["site"].format(site=site))
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
     parts += [_suite(section) for section in suites]

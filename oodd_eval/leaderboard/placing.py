@@ -169,22 +169,24 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
     Differences are paired, with 95 % intervals, in the metric's own unit. None: it has no rank.
     """
     lines = []
+    near = {str(s.entry) for s in ranks.standings if s.primary and not s.below}
     for name, ranking, metric in (
         ("matched AUC", ranks.ranking, RANKING),
         ("delay", ranks.alarms, ALARM_RANKING),
     ):
-        tests = {c.second: c for c in ranking.comparisons if c.first == str(row)}
+        own = (c for c in ranking.comparisons if c.first == str(row) and c.second in near)
+        tests = {c.second: c for c in own}
         worse = {c.first for c in ranking.comparisons if c.second == str(row) and c.better}
         order = list(ranking.ranks)
         here = order.index(str(row)) if str(row) in order else len(order)
         above = [other for other in order[:here] if other in tests][-1:]
         below = [other for other in order[here:] if other in tests][:1]
         for other in (*above, *below):
-            better = "better" if tests[other].better else "not told apart"
+            better = "better" if tests[other].better else "tie"
             verdict = "worse" if other in worse else better
             difference = _difference(tests[other], metric)
             lines.append([name, other, str(ranking.ranks[other]), difference, verdict])
-    header = ["metric", "against", "its rank", "difference", "verdict"]
+    header = ["metric", "against", "rank", "difference", "verdict"]
     note = "Paired differences over the same test episodes, this row minus the other."
     title = f"{row} and the rows next to it"
     return Table(title, header, lines, labels=2, note=note) if lines else None
