@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-import yaml
 from helpers_wheel import pip
 
 pytestmark = pytest.mark.packaging
@@ -73,14 +72,6 @@ def test_what_is_handed_out_works_in_environments_of_its_own(tmp_path):
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("works in an environment of its own") == len(files) == 2
-
-
-def test_the_citation_has_the_version():
-    from oodd_eval import __version__
-
-    told = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    assert told["version"] == __version__
-    assert f"version = {{{__version__}}}" in (ROOT / "docs/cite.md").read_text()
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):
