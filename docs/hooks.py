@@ -24,7 +24,9 @@ DOCS = "docs/"
 
 ELSEWHERE = (
     "CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
-    "leaderboard/README.md", "leaderboard/site/index.html", "training/README.md",
+    "leaderboard/README.md", "leaderboard/site/index.html", "leaderboard/reproduction/*/README.md",
+    "leaderboard/reproduction/*/figures/*", "leaderboard/reproduction/*/*.csv",
+    "leaderboard/reproduction/*/tables/*.csv", "training/README.md",
 )  # fmt: skip
 """Files outside docs/ that are part of the site, under the same paths."""
 

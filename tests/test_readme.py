@@ -1,5 +1,6 @@
 """The README's commands and the names in the documents cannot rot."""
 
+import csv
 import re
 import tomllib
 from pathlib import Path
@@ -7,6 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers_docs import parse
+
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.results.directory import ResultsDirectory
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -66,3 +70,37 @@ def test_citations_have_the_version():
     assert f"version = {{{__version__}}}" in cite
     assert f"oodd-eval {__version__}, split" in cite
     assert f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "index.md").read_text()
+
+
+def test_the_three_lines_are_the_boards():
+    (file,) = (ROOT / "leaderboard" / "tables").glob("mini-*-ranking.csv")
+    with file.open() as lines:
+        board = {r["detector"]: r for r in csv.DictReader(lines) if r["primary"] == "true"}
+    line = r"^\| `([a-z-]+)`, [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$"
+    rows = re.findall(line, README, re.MULTILINE)
+    assert [name for name, *_ in rows] == ["pe-a", "mewma-a", "riqn"]
+    for name, *shown in rows:
+        metrics = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
+        expected = [100 * float(board[name][metric]) for metric in metrics]
+        assert [float(n) for n in shown] == pytest.approx(expected, abs=0.051), name
+
+
+def test_the_output_of_the_main_command_is_that_of_the_committed_records(
+    tmp_path, capsys, monkeypatch
+):
+    from oodd_eval.cli.main import main
+
+    wanted = re.search(r"--detector (\S+)", commands()["main"])[1].split(",")
+    records = [
+        record
+        for entry in read_entries(ROOT / "leaderboard" / "results")
+        for record in entry.records
+        if str(record.setting) in wanted and (record.seed, record.split) == (0, "mini")
+    ]
+    in_order = sorted(records, key=lambda record: wanted.index(record.detector))
+    ResultsDirectory(tmp_path).merge_records(in_order)
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["show", "--stored", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    shown = re.search(r"first:\n\n```text\n(.*?)```", README, re.DOTALL)[1]
+    assert printed[: len(shown)] == shown

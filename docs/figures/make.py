@@ -1,7 +1,9 @@
-"""Draw the figures of docs/protocol.md from the split that comes with the package.
+"""Draw the README's figure and those of docs/protocol.md.
 
-``python docs/figures/make.py [DIRECTORY]`` writes the SVG files, here unless told otherwise. One
-episode of Hopper goes through all of them; nothing in them is made up.
+``python docs/figures/make.py [DIRECTORY]`` writes the SVG files, here unless told otherwise. The
+README's is drawn from the committed results on the ladder. One episode of Hopper, from the split
+that comes with the package, goes through the others. They have no background, and colours that can
+be read on white and on black.
 """
 
 import argparse
@@ -22,13 +24,23 @@ from oodd_eval.metrics.catalogue import HEADLINE
 from oodd_eval.metrics.cusum import UNIT, Standardization, cusum
 from oodd_eval.plugins.contract import Detector, Scores
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.ladder import FOUND, curve
 
 ENVIRONMENT = "hopper"
 DYNAMICS, SENSOR = "components", "shutdown"
 EPISODE = 2
 """Which test seed: one in which the anomaly is found neither at once nor with difficulty."""
 
-NOMINAL, ANOMALOUS, ONSET, ALARM = "#555555", "#D55E00", "#000000", "#0072B2"
+GREY = "#808080"
+NOMINAL, ANOMALOUS, ONSET, ALARM = GREY, "#D55E00", GREY, "#2E86C1"
+
+LADDER = Path(__file__).parents[2] / "leaderboard" / "suites" / "ladder"
+DRAWN = {
+    "pe-a": "#D55E00", "pe": "#C9820A", "mewma-a": "#2E86C1", "riqn-r": "#B0569B", "npn": "#13916B",
+    "riqn": "#7A6FD0", "rf": "#A0703C", "persistence": GREY,
+}  # fmt: skip
+"""Rows of the README's figure: the best, those of the paper, and one that knows nothing."""
 
 STYLE = {
     "svg.hashsalt": "oodd-eval",
@@ -39,10 +51,15 @@ STYLE = {
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": "#888888",
+    "text.color": GREY,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": GREY,
+    "axes.facecolor": "none",
+    "xtick.color": GREY,
+    "ytick.color": GREY,
     "legend.frameon": False,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
     "path.simplify": False,
 }
 
@@ -148,12 +165,12 @@ def draw_alarms(data: EnvironmentData, mewma: Scored) -> Figure:
                     facecolors=style, linewidths=0.9, label=name,
                 )  # fmt: skip
             delay = int(first_delay(alarms, onset))
-    above.axhline(rule.drift / UNIT, color="#888888", lw=0.8, ls=":")
-    below.axhline(rule.threshold / UNIT, color="#888888", lw=0.8, ls=":")
+    above.axhline(rule.drift / UNIT, color=GREY, lw=0.8, ls=":")
+    below.axhline(rule.threshold / UNIT, color=GREY, lw=0.8, ls=":")
     for axes, name, height in ((above, "drift", rule.drift), (below, "threshold", rule.threshold)):
         axes.annotate(
             name, (0, height / UNIT), xycoords=("axes fraction", "data"), fontsize=8,
-            xytext=(3, 2), textcoords="offset points", color="#555555",
+            xytext=(3, 2), textcoords="offset points", color=GREY,
         )  # fmt: skip
         mark_onset(axes, onset)
     above.set_title("Standardized score of the detector mewma", pad=14)
@@ -230,6 +247,28 @@ def draw_guaranteed(data: EnvironmentData, mewma: Scored) -> Figure:
     return figure
 
 
+def draw_power() -> Figure:
+    """Draw how many anomalies some rows find, from the weakest rung of the ladder on."""
+    figure = Figure(figsize=(7.6, 3.6), layout="constrained")
+    axes = figure.subplots()
+    records = list(ResultsDirectory(LADDER).records())
+    for name, colour in DRAWN.items():
+        own = [r for r in records if str(r.setting) == name]
+        points = curve(own, FOUND)
+        axes.plot([p.strength for p in points], [100 * p.value for p in points],
+                  color=colour, lw=1.8, label=name)  # fmt: skip
+    axes.axvline(1, color=GREY, lw=1, ls="--")
+    axes.annotate("costs 1 % of the return", (1, 0.02), xycoords=("data", "axes fraction"),
+                  xytext=(4, 0), textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_ylim(0, 100)
+    axes.set_xlabel("strength of the anomaly")
+    axes.set_ylabel("found within 100 steps (%)")
+    axes.set_title("at most 5 % of nominal episodes raise an alarm", loc="left")
+    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
 def draw_all(directory: Path) -> None:
     """Write all figures; the same versions write the same bytes."""
     data = load_split("mini").environment(ENVIRONMENT)
@@ -239,6 +278,7 @@ def draw_all(directory: Path) -> None:
         "alarms": lambda: draw_alarms(data, mewma),
         "clock": lambda: draw_clock(data, mewma),
         "guaranteed": lambda: draw_guaranteed(data, mewma),
+        "power": draw_power,
     }
     with mpl.rc_context(STYLE):
         for name, draw in figures.items():

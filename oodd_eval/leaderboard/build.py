@@ -51,9 +51,11 @@ def build(
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    files[address] = site.page(found, suites)
+    files |= {f"{SITE}/{name}": text for name, text in site.files(found, suites).items()}
     for name, text in files.items():
         write_text(output / name, text)
+    for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
+        old.unlink()
     write_bytes(output / PUBLISHED, content(found, suites))
     return [*files, PUBLISHED]
 

@@ -1,8 +1,9 @@
-"""The leaderboard's site: one HTML file that works from disk, without a server or a network.
+"""The leaderboard's site: a page and data files beside it, from disk or from any web server.
 
-Data is embedded as JSON, styles and scripts are in the page, and its content security policy
-allows nothing else, by digest. What is embedded is computed in `oodd_eval.leaderboard.site.data`;
-here its curves are made small.
+The page holds styles, scripts and the index of all rows. Its content security policy allows that
+style and script, by digest, and scripts beside the page: the data files, loaded when they are needed.
+Each calls one function with its name and its content as JSON text. What they hold is computed in
+`oodd_eval.leaderboard.site.data`; here curves are made small.
 """
 
 import base64
@@ -22,10 +23,11 @@ from oodd_eval.leaderboard.site.data import Json, site_data
 from oodd_eval.metrics.cusum import THRESHOLD
 
 PAGE: Final = "index.html"
+PARTS: Final = "data"  # directory of the data files
 
 SCRIPTS: Final = (
-    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "power.js",
-    "detector.js", "main.js",
+    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "player.js",
+    "power.js", "overviews.js", "detector.js", "pair.js", "main.js",
 )  # fmt: skip
 """Parts of the page's one script, in order."""
 
@@ -35,21 +37,37 @@ HEAVY: Final = 30  # A largest value this many times the typical one asks for a 
 _STATIC = Path(__file__).with_name("static")
 
 
-def page(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> str:
-    """Return the site of a leaderboard; the same entries give the same text."""
-    data, curves = site_data(sections, suites)
+def files(
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, project: str = ""
+) -> dict[str, str]:
+    """Return the files of a leaderboard's site by name; the same entries give the same bytes.
+
+    `project` is the address of code and documents; without it the page does not link to them.
+    """
+    data, parts = site_data(sections, suites)
+    found = {PAGE: _page(data | {"project": project})}
+    for name, part in parts.items():
+        if part.get("curves"):
+            part = part | {"curves": packed(part["curves"])}  # noqa: PLW2901
+        found[f"{PARTS}/{name}.js"] = data_file(name, part)
+    return found
+
+
+def _page(data: Json) -> str:
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
-    tags = (
-        f'<script type="application/json" id="curves-{i}">{embedded(packed(part))}</script>'
-        for i, part in enumerate(curves)
-    )
     parts = {
         "version": __version__, "style": style, "style-hash": _digest(style), "script": script,
-        "script-hash": _digest(script), "data": embedded(data), "curves": "\n".join(tags),
+        "script-hash": _digest(script), "data": embedded(data),
     }  # fmt: skip
     # One pass, so that nothing in the data is taken for a place to fill in.
     return re.sub(r"@([a-z-]+)@", lambda match: parts[match[1]], _static("page.html"))
+
+
+def data_file(name: str, value: Any) -> str:
+    """Return a script that hands a value over as JSON text, in which nothing can act as code."""
+    text = embedded(value).replace("\\", "\\\\").replace("'", "\\'")
+    return f"ooddPart('{name}','{text}');\n"
 
 
 def embedded(value: Any) -> str:

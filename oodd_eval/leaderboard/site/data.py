@@ -1,10 +1,13 @@
-"""The content of the site as plain data: boards, rows, cells, intervals, curves.
+"""The content of the site as plain data: an index of boards and rows, and parts loaded on demand.
 
-Everything that is not simple arithmetic is computed here, such as the intervals of means over all
-selections of cells; the page filters, averages over cells, sorts and draws.
+The index has what the first view of every table shows, in whole numbers of the last printed digit.
+A part is a row with all its cells and curves, or one metric of all cells of a board. Everything that
+is not simple arithmetic is computed here; the page filters, averages over cells, sorts and draws.
 """
 
+import hashlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, Final
@@ -13,7 +16,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.metrics import bootstrap, catalogue
-from oodd_eval.metrics.bootstrap import DrawnCell
+from oodd_eval.metrics.bootstrap import DrawnCell, nan_mean
 from oodd_eval.metrics.catalogue import (
     GUARANTEED,
     HEADLINE,
@@ -25,7 +28,7 @@ from oodd_eval.metrics.catalogue import (
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.tables.board import Standing, contribution, grouped
 
 _COMPARED: Final = (
@@ -39,10 +42,15 @@ WITH_INTERVALS: Final = (
 )  # fmt: skip
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
+SUMMARIES: Final = ("all|all", "all|sensor", "all|dynamics")
+"""Selections of cells whose means stand in the index; other means are made from a part."""
+
 ENTRY_FIELDS: Final = (
     "id", "title", "submitter", "created", "citation", "url", "caption",
 )  # fmt: skip
 """Fields of an entry that the site shows."""
+
+RANKING_PLACE: Final = WITH_INTERVALS.index(RANKING)
 
 _ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
 
@@ -54,15 +62,15 @@ SelectedCell = tuple[str, str]  # environment and anomaly
 
 def site_data(
     sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
-) -> tuple[Json, list[Json]]:
-    """Return the data that the page needs at once, and the curves of single rows.
+) -> tuple[Json, dict[str, Json]]:
+    """Return the index, and the parts by name.
 
-    A row names its place in the list of curves, which are by ``environment/anomaly``.
+    A row of the index names its part. The part of a board's metric has the name of `metric_part`.
     """
     entries = {entry.meta.id: entry for section in sections for entry in section.entries}
     units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
-    curves: list[Json] = []
-    shown = [_board(section, units, curves) for section in sections]
+    parts: dict[str, Json] = {}
+    shown = [_board(section, units, parts) for section in sections]
     names = dict.fromkeys(name for board in shown for name in board["metrics"])
     used = {*TABLE1, *(name for board in shown for name in board["anomalies"])}
     kinds = [a for a in ANOMALIES.values() if a.id in used]
@@ -73,7 +81,18 @@ def site_data(
         "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
         "power": [_power(section) for section in suites if section.graded],
     }  # fmt: skip
-    return data, curves
+    return data, parts
+
+
+def part_name(text: str) -> str:
+    """Return a safe file name for anything: what can be read of it, and the start of a digest."""
+    slug = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:40]
+    return f"{slug}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def metric_part(board: str, metric: str) -> str:
+    """Return the name of the part with a metric of all cells of a board."""
+    return part_name(f"{board}/{metric}")
 
 
 def _power(section: SuiteSection) -> Json:
@@ -113,55 +132,126 @@ def _metric(name: str) -> Json:
     return {"title": title, "meaning": info.summary, "kind": info.unit, "higher": higher}
 
 
-def _board(section: LeaderboardSection, units: Units, curves: list[Json]) -> Json:
+def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) -> Json:
     ranks, board = section.ranks, section.ranks.board
     found = {name for r in board.records for name in r.metrics}
     # The plain ones stand there even where every cell of the board has failed.
     by_level = [f"{m}_{suffix}" for suffix in LEVELS for m in (*GUARANTEED, "threshold")]
     names = [*METRICS, *(name for name in (*by_level, *catalogue.ATTRIBUTION) if name in found)]
     have = {(r.environment, r.anomaly) for r in board.records}
-    chosen = selections([c for c in product(board.environments, board.anomalies) if c in have])
+    cells = [c for c in product(board.environments, board.anomalies) if c in have]
+    chosen = selections(cells)
+    rows, ends = [], {}
+    for standing in ranks.standings:
+        row, part = _row(section, standing, names, chosen, units)
+        rows.append(row)
+        parts[row["part"]] = part
+        ends[row["part"]] = _ranking_intervals(part)
+    for metric in names:
+        values = {row["part"]: _by_cell(s, cells, metric)
+                  for row, s in zip(rows, ranks.standings, strict=True)}  # fmt: skip
+        parts[metric_part(section.name, metric)] = {
+            "values": values, "intervals": ends if metric == RANKING else {},
+        }  # fmt: skip
     return {
         "id": section.name,
+        "cells": cells,
+        "parts": {name: metric_part(section.name, name) for name in names},
         **_fields(board, "split", "digest", "protocol", "limit"),
         "tests": board.test_seeds(),
         **_fields(board, "environments", "anomalies"),
         "metrics": names,
         "intervals": _with_intervals(names),
-        "rows": [_row(section, s, names, chosen, units, curves) for s in ranks.standings],
-        "comparisons": [
-            [c.first, c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
-            for c in ranks.ranking.comparisons
-        ],
+        "rows": rows,
         "resamples": ranks.ranking.resamples,
-        "wins": [[one, other, _short(rate)] for (one, other), rate in ranks.rates.items()],
     }
 
 
 def _row(
     section: LeaderboardSection, standing: Standing, names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]], units: Units, curves: list[Json],
-) -> Json:  # fmt: skip
+    chosen: Mapping[str, Sequence[SelectedCell]], units: Units,
+) -> tuple[Json, Json]:  # fmt: skip
+    """Return a row's line of the index, and its part."""
     row, records = standing.entry, standing.records
-    source = section.sources[row]
-    own = _curves(units.get(source.meta.id, []), records)
-    if own:
-        curves.append(own)
+    source, label, ranks = section.sources[row], str(row), section.ranks
     in_order = sorted(records, key=lambda r: (_ORDER[r.environment, r.anomaly], r.seed))
-    return {
-        "id": f"{section.name}/{row!s}", "label": str(row), "detector": row.detector,
-        "version": records[0].detector_version, "plugin": records[0].plugin, "horizon": row.horizon,
-        "parameters": records[0].parameters, "overrides": row.overrides,
+    intervals = _intervals(records, names, chosen)
+    identity = f"{section.name}/{label}"
+    have = {(r.environment, r.anomaly) for r in records}
+    line = {
+        "id": identity, "part": part_name(identity), "label": label, "detector": row.detector,
+        "plugin": records[0].plugin, "horizon": row.horizon, "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
         **_fields(standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank",
                   "ties", "state"),
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
-        "trust": section.trust[row], "command": " && ".join(commands_of(records)),
-        "entry": _entry(source, records[0].plugin),
-        "cells": [_cell(r, names) for r in in_order],
-        "intervals": _intervals(records, names, chosen), "curves": len(curves) - 1 if own else None,
+        "trust": section.trust[row], **_fields(source.meta, "submitter", "caption"),
+        "missing": [i for i, cell in enumerate(chosen.get("all|all", [])) if cell not in have],
+        "failed": [[chosen["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
+                   for r in in_order if not r.ok],
+        "means": _summaries(section, standing, names, chosen, intervals),
     }  # fmt: skip
+    compared = [c for c in ranks.ranking.comparisons if label in (c.first, c.second)]
+    part = {
+        "version": records[0].detector_version, "parameters": records[0].parameters,
+        "command": " && ".join(commands_of(records)), "entry": _entry(source, records[0].plugin),
+        "cells": [_cell(r, names) for r in in_order], "intervals": intervals,
+        "comparisons": [
+            [c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
+            for c in compared if c.first == label
+        ],
+        "worse_than": [c.first for c in compared if c.second == label and c.better],
+        "wins": {other: _short(rate) for (one, other), rate in ranks.rates.items() if one == label},
+        "curves": _curves(units.get(source.meta.id, []), records),
+    }  # fmt: skip
+    return line, part
+
+
+def _summaries(
+    section: LeaderboardSection, standing: Standing, names: Sequence[str],
+    chosen: Mapping[str, Sequence[SelectedCell]], intervals: Json,
+) -> dict[str, list[list[int | None]]]:  # fmt: skip
+    """Return means over the selections of the index: values, then low and high ends.
+
+    They are whole numbers of the last digit that is printed, None where there is none.
+    """
+    board, found = section.ranks.board, {}
+    for key in (key for key in SUMMARIES if key in chosen):
+        environments, anomalies = (list(dict.fromkeys(c)) for c in zip(*chosen[key], strict=True))
+        means = [board.mean(standing.entry, environments, anomalies, name) for name in names]
+        values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
+        own = intervals.get(key, [None] * len(_with_intervals(names)))
+        ends = [
+            [_digits(NAN if pair is None or pair[i] is None else pair[i], name)
+             for pair, name in zip(own, _with_intervals(names), strict=True)]
+            for i in (0, 1)
+        ]  # fmt: skip
+        found[key.partition("|")[2]] = [values, *ends]
+    return found
+
+
+def _by_cell(
+    standing: Standing, cells: Sequence[SelectedCell], metric: str
+) -> list[float | None]:
+    """Return a row's mean over detector seeds in every cell; None where there is none."""
+    own = grouped(standing.records, lambda r: (r.environment, r.anomaly))
+    whole = [all(r.ok for r in own.get(cell, ())) for cell in cells]
+    return [
+        _short(nan_mean(r.value(metric) for r in own.get(cell, ()))) if ok else None
+        for cell, ok in zip(cells, whole, strict=True)
+    ]
+
+
+def _ranking_intervals(part: Json) -> dict[str, list[float | None]]:
+    """Return a row's intervals of matched AUC by selection; a cell of one record has its own."""
+    found = {key: ends[RANKING_PLACE] for key, ends in part["intervals"].items()}
+    once = grouped(part["cells"], lambda cell: (cell["environment"], cell["anomaly"]))
+    for (environment, anomaly), cells in once.items():
+        if len(cells) == 1 and "values" in cells[0]:
+            own = [cells[0][end][RANKING_PLACE] for end in ("low", "high")]
+            found[f"{environment}|{anomaly}"] = own
+    return {key: pair for key, pair in found.items() if pair and None not in pair}
 
 
 def _entry(entry: SubmittedEntry, plugin: str) -> Json:
@@ -194,8 +284,10 @@ def _intervals(
     """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
     metrics = _with_intervals(names)
     found: dict[str, list[list[float | None] | None]] = {}
+    few = {key: cells for key, cells in chosen.items() if key in SUMMARIES}
     for i, metric in enumerate(metrics):
-        for key, pair in selection_intervals(records, metric, chosen).items():
+        wanted = chosen if metric == RANKING else few
+        for key, pair in selection_intervals(records, metric, wanted).items():
             bounds = [_printed(value, metric_info(metric).unit) for value in pair]
             found.setdefault(key, [None] * len(metrics))[i] = bounds
     return found
@@ -216,6 +308,12 @@ def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
     return found
 
 
+def _digits(value: float, metric: str) -> int | None:
+    """Return a number as a whole number of the last digit that is printed of it."""
+    near = _printed(value, (kind := metric_info(metric).unit))
+    return None if near is None else round(near * (10 if kind == "steps" else 1000))
+
+
 def _short(value: float) -> float | None:
     """Round to six digits, finer than anything printed; None for what is undefined."""
     if not math.isfinite(value):
@@ -226,6 +324,8 @@ def _short(value: float) -> float | None:
 
 def _printed(value: float, kind: str) -> float | None:
     """Round an end of an interval to what is printed: nothing is computed from it."""
+    if not math.isfinite(value):
+        return None
     # A percentage is rounded as one, so that the page and other tables have the same digits.
     if kind == "percent":
         return _short(round(round(100 * value, 1) / 100, 3))

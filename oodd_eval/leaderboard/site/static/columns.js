@@ -22,6 +22,7 @@ function metricColumn(board, metric, options = {}) {
     marked: isMarked(metric, kind),
     kind,
     interval: options.interval ?? false,
+    needs: (selection) => isSummary({ ...selection, ...options.within }) ? [] : [metric],
     of: (row, selection) => mean(board, row, metric, { ...selection, ...options.within }),
   };
 }
@@ -51,9 +52,14 @@ const RANK = plainColumn(
   (row) => row.rank,
 );
 
+const ALARM_RANK = plainColumn(
+  "alarm_rank", "Rank", "", "1 plus the number of rows that alarm significantly sooner: censored delay of guaranteed alarms at 5 %",
+  (row) => row.alarm_rank,
+);
+
 const LISTS = {
   ranking: {
-    title: "Ranking",
+    title: "Separability",
     columns(board, selection) {
       const columns = [
         { ...metricColumn(board, "auc_matched", { interval: true }), whisker: true },
@@ -71,8 +77,6 @@ const LISTS = {
       columns.push(
         metricColumn(board, "auc_smoothed"),
         metricColumn(board, "auc_unpaired"),
-        plainColumn("alarm_rank", "Alarm rank", "", "The same rank by the censored delay of guaranteed alarms at 5 %",
-          (row) => row.alarm_rank, { text: (rank, row) => isNumber(rank) ? rankText(row, rank) : UNDEFINED }),
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
         plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",
@@ -94,12 +98,14 @@ const LISTS = {
     ],
   },
   guaranteed: {
-    title: "Guaranteed alarms",
+    title: "Alarms",
+    rank: ALARM_RANK,
+    sort: "alarm_rank",
     columns: (board) => ["at_5pct", "at_10pct", "at_1pct"].flatMap((suffix) =>
-      ["delay", "missed", "found_within_20", "found_within_100", "found_within_100_null",
+      ["delay_censored", "delay", "missed", "found_within_20", "found_within_100", "found_within_100_null",
         "false_episodes", "early"]
         .map((m) => `${m}_${suffix}`)
-        .filter((m) => board.metrics.includes(m))
+        .filter((m) => board.metrics.includes(m) && (suffix === "at_5pct" || !m.startsWith("delay_censored")))
         .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),
     empty: "No record of this board has guaranteed alarms: too few calibration episodes.",
   },

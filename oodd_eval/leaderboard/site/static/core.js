@@ -57,3 +57,42 @@ const titleOfUnit = { percent: "%", steps: "steps", rate: "share" };
 
 /** Ids as they may stand in an address, piece by piece. */
 const address = (...pieces) => "#/" + pieces.map(encodeURIComponent).join("/");
+
+/** A table as CSV: what stands in its cells, without marks of sorting. */
+function csvOf(table) {
+  const text = (cell) => (cell.dataset.csv ?? cell.textContent).replace(/\s+/g, " ").trim();
+  const quoted = (value) => /[",\n]/.test(value) ? `"${value.replaceAll('"', '""')}"` : value;
+  // A spreadsheet would run a text that begins like a formula.
+  const safe = (value) => /^[=+@\t]/.test(value) ? `'${value}` : value;
+  return [...table.rows].map((row) => [...row.cells].map((cell) => quoted(safe(text(cell)))).join(",")).join("\n") + "\n";
+}
+
+/** Hand a text over as a file. */
+function download(name, text, type = "text/csv") {
+  const link = element("a", { href: URL.createObjectURL(new Blob([text], { type })), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+/** A button that hands over the table that `find` returns when it is pressed. */
+const csvButton = (name, find) =>
+  element("button", { type: "button", class: "action", onclick: () => download(`${name}.csv`, csvOf(find())) }, "CSV");
+
+/** A group of radio buttons that look like tabs; `choose` is called with the chosen value. */
+function tabs(name, legend, options, chosen, choose) {
+  return element("fieldset", { class: "views" }, element("legend", {}, legend), options.map(([value, title]) =>
+    element("label", {}, element("input", {
+      type: "radio", name, value, checked: String(value) === String(chosen), onchange: () => {
+        choose(value);
+        document.querySelector(`[name="${name}"][value="${CSS.escape(String(value))}"]`)?.focus();
+      },
+    }), element("span", {}, title))));
+}
+
+/** A drop-down list with its label. */
+function dropdown(name, label, options, chosen, choose) {
+  return element("label", {}, element("span", {}, label), element("select", { name, onchange: (event) => choose(event.target.value) },
+    options.map(([value, text]) => element("option", { value, selected: value === chosen }, text))));
+}
+
+const isDark = () => document.documentElement.dataset.theme === "dark";

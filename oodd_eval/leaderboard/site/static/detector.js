@@ -1,13 +1,15 @@
 // The page of one row: facts, all cells, curves of the chosen cell, comparisons, the paper's digits.
 
 function detectorPage(board, row, chosen) {
-  const first = row.cells.find((c) => !c.status) ?? row.cells[0];
-  const cell = row.cells.find((c) => chosen && c.environment === chosen[0] && c.anomaly === chosen[1]) ?? first;
+  const cell = chosenCell(row, chosen);
+  const others = board.rows.filter((other) => other !== row).map((other) => [other.id, other.label]);
   return [
     element("p", { class: "back" }, element("a", { href: tableAddress() }, "\u2190 All detectors")),
     element("h1", { tabindex: "-1" }, row.label, " ", badges(row)),
     element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${underLabel(row)}`),
     summary(board, row),
+    others.length ? element("form", { class: "choices", autocomplete: "off" },
+      dropdown("against", "Beside", [["", "choose a detector"], ...others], "", (id) => { if (id) location.hash = address("compare", row.id, id); })) : null,
     section("Cells", "cells", heat(board, row, cell),
       element("p", { class: "note" }, "Choose a cell to see its curves below.")),
     section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell", cellPart(board, row, cell)),
@@ -16,6 +18,12 @@ function detectorPage(board, row, chosen) {
     section("All metrics", "metrics", metricsTable(board, row)),
     section("Where it is from", "source", facts(row)),
   ];
+}
+
+/** The cell that an address names, or the first one with a result. */
+function chosenCell(row, chosen) {
+  const { cells } = PARTS.get(row.part);
+  return cells.find((c) => chosen && c.environment === chosen[0] && c.anomaly === chosen[1]) ?? cells.find((c) => !c.status) ?? cells[0];
 }
 
 const section = (title, id, ...content) =>
@@ -42,43 +50,51 @@ function summary(board, row) {
     card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`));
 }
 
-/** Colours of a matched AUC: from white at chance to teal at 1, or to orange at 0. */
+/** Colours of a matched AUC: from the page's own at chance to teal at 1, or to orange at 0. */
 function colours(value) {
   if (!isNumber(value)) return {};
   const far = Math.min(1, Math.abs(value - 0.5) * 2);
-  const end = value >= 0.5 ? [14, 98, 116] : [178, 84, 24];
-  const back = [255, 255, 255].map((v, i) => Math.round(v + (end[i] - v) * 0.9 * far));
+  const [above, under, none] = isDark() ? [[64, 178, 196], [214, 120, 60], [23, 29, 36]] : [[14, 98, 116], [178, 84, 24], [255, 255, 255]];
+  const end = value >= 0.5 ? above : under;
+  const back = none.map((v, i) => Math.round(v + (end[i] - v) * 0.9 * far));
   // White or black, whichever stands out more.
   const [r, g, b] = back.map((v) => (v / 255) ** 2.2);
   return { back: `rgb(${back.join(" ")})`, front: 0.2126 * r + 0.7152 * g + 0.0722 * b > 0.179 ? "#000" : "#fff" };
 }
 
-/** Matched AUC by environment and anomaly; every value is a link to its cell. */
-function heat(board, row, chosen) {
-  const cellAt = (e, a) => mean(board, row, "auc_matched", { environment: e, group: "all", anomaly: a });
-  const filled = (found, content, extra = {}) => {
-    const { back, front } = colours(found.value);
-    const node = element("td", extra, content);
-    if (back) Object.assign(node.style, { backgroundColor: back, color: front });
-    return node;
-  };
-  const text = (found) => meanText({ ...found, partial: false }, "percent") || "";
+/** A field with the colours of a value. */
+function painted(node, value) {
+  const { back, front } = colours(value);
+  if (back) Object.assign(node.style, { backgroundColor: back, color: front });
+  return node;
+}
+
+/**
+ * Matched AUC by environment and anomaly; every value is a link to its cell at `link`. `of` gives
+ * the number of a selection.
+ */
+function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, "auc_matched", selection),
+  link = (...cell) => address("detector", row.id, ...cell), caption = "Matched AUC (%): teal is better than chance, orange is worse") {
+  const cellAt = (e, a) => of({ environment: e, group: "all", anomaly: a });
+  const shade = (found) => found.gap && isNumber(found.value) ? 0.5 + found.value : found.value;
+  const filled = (found, content, extra = {}) => painted(element("td", extra, content), shade(found));
+  const text = (found) => found.gap && !found.state ? signed(found.value) : meanText({ ...found, partial: false }, "percent") || "";
   const tip = (found) => isNumber(found.low) ? `95 % interval ${show(found.low, "percent")} to ${show(found.high, "percent")}` : null;
   const one = (e, a) => {
     const found = cellAt(e, a);
     if (!found.cells) return element("td", {});
     const current = e === chosen.environment && a === chosen.anomaly;
-    const link = element("a", { href: address("detector", row.id, e, a), "aria-current": current ? "true" : null }, text(found));
-    return filled(found, link, { class: current ? "current" : null, title: tip(found) });
+    const node = element("a", { href: link(e, a), "aria-current": current ? "true" : null }, text(found));
+    return filled(found, node, { class: current ? "current" : null, title: tip(found) });
   };
   const total = (selection) => {
-    const found = mean(board, row, "auc_matched", { ...EVERYTHING, ...selection });
+    const found = of({ ...EVERYTHING, ...selection });
     return filled(found, text(found), { class: "total", title: tip(found) });
   };
   const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
   const ordered = groups.flatMap((g) => inGroup(board, g));
   return element("div", { class: "scroll" }, element("table", { class: "heat" },
-    captionOf("Matched AUC (%): white is 50, chance; teal is better, orange is worse than chance"),
+    captionOf(caption),
     element("thead", {},
       element("tr", {}, element("td", {}), groups.map((g) => element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
       element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
@@ -94,11 +110,9 @@ function heat(board, row, chosen) {
 /** Numbers and drawings of one cell. */
 function cellPart(board, row, cell) {
   const selection = { environment: cell.environment, group: "all", anomaly: cell.anomaly };
-  const of = (metric) => mean(board, row, metric, selection);
-  if (of("auc_matched").state) {
-    const failed = row.cells.find((c) => c.status && selects(selection, c));
-    return element("p", { class: "failure" }, element("strong", {}, failed.status), `: ${failed.reason}`);
-  }
+  const of = (metric) => meanOfRow(board, row, metric, selection);
+  const { state, reason } = of("auc_matched");
+  if (state) return element("p", { class: "failure" }, element("strong", {}, state), `: ${reason}`);
   const text = (metric) => {
     const found = of(metric);
     const { kind } = DATA.metrics[metric];
@@ -113,7 +127,7 @@ function cellPart(board, row, cell) {
     `What changes: ${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}. ${guaranteed}At the paper\u2019s threshold: delay ${text("delay")}, ` +
     `against ${text("delay_null")} from false alarms alone; missed ${text("missed")}; ` +
     `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`);
-  const curves = row.curves === null ? null : curvesOf(row, `${cell.environment}/${cell.anomaly}`);
+  const curves = curvesOf(row, `${cell.environment}/${cell.anomaly}`);
   if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
   const at = (metric) => of(metric).value;
   const seed = row.seeds.length > 1 ? element("p", { class: "note" }, `Curves of detector seed ${curves.seed}; numbers are means over seeds.`) : null;
@@ -122,15 +136,10 @@ function cellPart(board, row, cell) {
     trajectoryFigure(curves.example)];
 }
 
-const readCurves = new Map();
-
 /** Curves of one cell of a row, unpacked; undefined where there are none. */
 function curvesOf(row, name) {
-  if (!readCurves.has(row.curves)) {
-    readCurves.set(row.curves, JSON.parse(document.getElementById(`curves-${row.curves}`).textContent));
-  }
-  const { lists, cells } = readCurves.get(row.curves);
-  const cell = cells[name];
+  const { lists, cells } = PARTS.get(row.part).curves;
+  const cell = cells?.[name];
   if (!cell) return undefined;
   const looked = (places) => Object.fromEntries(Object.entries(places).map(([key, place]) => [key, lists[place]]));
   const scaled = (values, step) => step === null ? values : values.map((v) => v === null ? null : v * step);
@@ -147,22 +156,27 @@ function curvesOf(row, name) {
 
 /** The row against every other ranked row. */
 function comparisons(board, row) {
-  const found = board.comparisons.filter(([first]) => first === row.label);
+  const part = PARTS.get(row.part);
+  const found = [...part.comparisons];
   if (!found.length) return null;
-  const back = new Map(board.comparisons.filter(([, second]) => second === row.label).map((c) => [c[0], c]));
-  const wins = new Map(board.wins.filter(([first]) => first === row.label).map(([, other, rate]) => [other, rate]));
   const links = new Map(board.rows.map((r) => [r.label, r.id]));
-  const verdict = (p, other) => p <= 0.05 ? "better" : back.get(other)?.[5] <= 0.05 ? "worse" : "not told apart";
   return section("Against the others", "comparisons", element("div", { class: "scroll" }, element("table", { class: "plain" },
     captionOf(`Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
     element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
       element("th", { scope: "col", class: i ? null : "left" }, t)))),
-    element("tbody", {}, found.sort((a, b) => a[2] - b[2]).map(([, other, difference, low, high, p]) => element("tr", {},
-      element("th", { scope: "row" }, element("a", { href: address("detector", links.get(other)) }, other)),
+    element("tbody", {}, found.sort((a, b) => a[1] - b[1]).map(([other, difference, low, high]) => element("tr", {},
+      element("th", { scope: "row" }, element("a", { href: address("compare", row.id, links.get(other)) }, other)),
       element("td", {}, signed(difference)),
       element("td", {}, `[${signed(low)}, ${signed(high)}]`),
-      element("td", { class: verdict(p, other).split(" ")[0] }, verdict(p, other)),
-      element("td", {}, isNumber(wins.get(other)) ? (100 * wins.get(other)).toFixed(0) : UNDEFINED)))))));
+      element("td", { class: verdictOf(part, other).split(" ")[0] }, verdictOf(part, other)),
+      element("td", {}, isNumber(part.wins[other]) ? (100 * part.wins[other]).toFixed(0) : UNDEFINED)))))));
+}
+
+/** Whether a row is better or worse than another, after Holm's correction over the board. */
+function verdictOf(part, other) {
+  const found = part.comparisons.find(([name]) => name === other);
+  if (!found) return "not compared";
+  return found[4] <= 0.05 ? "better" : part.worse_than.includes(other) ? "worse" : "not told apart";
 }
 
 const signed = (share) => isNumber(share) ? `${share < 0 ? "\u2212" : "+"}${Math.abs(100 * share).toFixed(1)}` : UNDEFINED;
@@ -175,7 +189,7 @@ function paperPart(board, row) {
   const numbers = (environment) => columns.flatMap(({ metric, group }) => {
     const selection = { environment, group, anomaly: "all" };
     const { kind } = DATA.metrics[metric];
-    return [element("td", {}, meanText(mean(board, row, metric, selection), kind)),
+    return [element("td", {}, meanText(meanOfRow(board, row, metric, selection), kind)),
       element("td", { class: "paper" }, show(paperMean(row, metric, selection), kind))];
   });
   return section("Beside the paper", "paper", element("div", { class: "scroll" }, element("table", { class: "plain" },
@@ -209,11 +223,11 @@ function facts(row) {
   const list = (known) => element("dl", { class: "facts" }, known.filter(([, value]) => value).map(([name, value]) =>
     [element("dt", {}, name), element("dd", {}, value)]));
   const text = (value) => typeof value === "string" ? value : JSON.stringify(value);
-  const { entry } = row;
+  const { entry, version, parameters, command } = PARTS.get(row.part);
   return [
     list([
-      ["Plug-in", `${row.plugin} ${row.version}`],
-      ["Parameters", Object.entries(row.parameters).map(([name, value]) => `${name} = ${text(value)}`).join(", ")],
+      ["Plug-in", `${row.plugin} ${version}`],
+      ["Parameters", Object.entries(parameters).map(([name, value]) => `${name} = ${text(value)}`).join(", ")],
       ["Seeds", row.seeds.join(", ")],
     ]),
     element("h3", {}, entry.title || entry.id),
@@ -223,12 +237,25 @@ function facts(row) {
       ["Trust", `${row.trust}: ${(TRUST[row.trust] ?? "").toLowerCase()}`],
       ["Granted by", entry.grant && `${entry.grant.by} on ${entry.grant.day}: ${entry.grant.how}`],
       ["Date", entry.created],
-      ["To run it again", element("code", {}, row.command)],
-      ["Citation", entry.citation],
+      ["To run it again", element("code", {}, command)],
+      ["Citation", element("div", {}, element("pre", { class: "bibtex" }, bibtexOf(row, entry)),
+        element("button", { type: "button", class: "action", onclick: () => download(`${entry.id}.bib`, bibtexOf(row, entry), "text/plain") }, "BibTeX"))],
       ["Address", /^https?:\/\//.test(entry.url)
         ? element("a", { href: entry.url, rel: "noopener noreferrer external" }, entry.url) : entry.url],
       ["Source digest", entry.source_digest],
       ["Note", entry.caption],
     ]),
   ];
+}
+
+/** How an entry is cited: its own BibTeX, or one made of what it says. */
+function bibtexOf(row, entry) {
+  if (/^\s*@\w+\s*\{/.test(entry.citation)) return entry.citation;
+  const plain = (text) => text.replace(/[\\{}]/g, "");
+  const lines = [
+    ["title", `${plain(entry.title || entry.id)} (${plain(row.label)})`], ["author", `{${plain(entry.submitter)}}`],
+    ["year", entry.created.slice(0, 4)], ["url", /^https?:\/\//.test(entry.url) ? plain(entry.url) : ""],
+    ["note", ["Entry of the oodd-eval leaderboard", plain(entry.citation)].filter(Boolean).join(". ")],
+  ].filter(([name, value]) => value && !(name === "author" && value === "{}"));
+  return `@misc{oodd-eval-${entry.id.replace(/[^A-Za-z0-9-]/g, "-")},\n${lines.map(([name, value]) => `  ${name} = {${value}}`).join(",\n")}\n}\n`;
 }

@@ -13,22 +13,24 @@ function drawFilters() {
   const anomalies = [["all", "All anomalies"], ...inGroup(board, state.group).map((a) => [a, DATA.anomalies[a].title])];
   const horizons = [...new Set(board.rows.map((row) => row.horizon))].sort((a, b) => a - b);
   const inputs = [...new Set(board.rows.map((row) => row.inputs).filter(Boolean))].sort();
-  const views = Object.entries(LISTS).map(([name, list]) =>
-    element("label", {}, element("input", {
-      type: "radio", name: "view", value: name, checked: state.view === name, onchange: choose("view"),
-    }), element("span", {}, list.title)));
+  const views = Object.entries(LISTS).map(([name, list]) => [name, list.title]);
   document.getElementById("filters").replaceChildren(
+    element("label", {}, element("span", {}, "Search"), element("input", {
+      type: "search", name: "search", value: state.search, placeholder: "detector, plug-in, submitter",
+      oninput: (event) => { state.search = event.target.value; drawTable(); },
+    })),
     select("board", "Split", DATA.boards.map((b) => [b.id, boardTitle(b)])),
     select("environment", "Environment", environments),
     select("group", "Group", groups),
     select("anomaly", "Anomaly", anomalies),
     select("horizon", "Horizon", [["all", "All horizons"], ...horizons.map((h) => [String(h), `\u0394 = ${h}`])]),
     select("inputs", "Inputs", [["all", "All inputs"], ...inputs.map((i) => [i, i.replace("+", " + ")])]),
-    element("fieldset", { class: "views" }, element("legend", {}, "Columns"), views),
+    tabs("view", "Columns", views, state.view, (value) => { change("view", value); }),
     element("label", { class: "check" }, element("input", {
       type: "checkbox", name: "trivial", checked: state.trivial,
       onchange: (event) => { state.trivial = event.target.checked; drawTable(); },
     }), " trivial rows"),
+    csvButton("leaderboard", () => document.getElementById("ranking")),
   );
 }
 
@@ -39,21 +41,17 @@ function boardTitle(board) {
 
 function select(name, label, options) {
   if (!options.some(([value]) => value === state[name])) state[name] = options[0][0];
-  return element("label", {}, element("span", {}, label),
-    element("select", { name, onchange: choose(name) },
-      options.map(([value, text]) => element("option", { value, selected: value === state[name] }, text))));
+  return dropdown(name, label, options, state[name], (value) => change(name, value));
 }
 
-/** A listener that stores a control's value and draws what depends on it. */
-function choose(name) {
-  return (event) => {
-    state[name] = event.target.value;
-    if (name === "group") state.anomaly = "all";
-    if (name === "view") Object.assign(state, { sort: "auc_matched", ascending: false });
-    if (name === "board" || name === "group") {
-      drawFilters();
-      document.querySelector(`#filters [name="${name}"]`).focus();
-    }
-    drawTable();
-  };
+/** Store a control's value and draw what depends on it. */
+function change(name, value) {
+  state[name] = value;
+  if (name === "group") state.anomaly = "all";
+  if (name === "view") Object.assign(state, { sort: LISTS[value].sort ?? "auc_matched", ascending: Boolean(LISTS[value].sort) });
+  if (name === "board" || name === "group") {
+    drawFilters();
+    document.querySelector(`#filters [name="${name}"]`).focus();
+  }
+  drawTable();
 }

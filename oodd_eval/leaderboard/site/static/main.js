@@ -1,34 +1,87 @@
-// Which view an address asks for: `#/[?FILTERS]` the table, `#/detector/ROW[/PLACE/ANOMALY]` a row.
+// Which view an address asks for: `#/[?FILTERS]` the table, `#/detector/ROW[/PLACE/ANOMALY]` a row,
+// `#/compare/ROW/ROW[/PLACE/ANOMALY]` two rows, `#/power`, `#/cost` and `#/heat` the overviews.
+
+const PAGES = {
+  detector: { find: ([id]) => ROWS.get(id), parts: ({ row }) => [row.part], draw: ({ board, row }, [, ...cell]) => detectorPage(board, row, cell), title: ({ row }) => row.label },
+  compare: {
+    find: ([one, other]) => pairOf(one, other), parts: ({ rows }) => rows.map((row) => row.part),
+    draw: ({ board, rows }, [, , ...cell]) => pairPage(board, rows, cell), title: ({ rows }) => rows.map((row) => row.label).join(" and "),
+  },
+  power: { find: () => DATA.power.length ? {} : null, draw: () => powerPage(), title: () => "Weaker anomalies" },
+  cost: { find: () => ({ board: currentBoard() }), draw: ({ board }) => costPage(board), title: () => "Quality and cost" },
+  heat: {
+    find: () => ({ board: currentBoard() }), parts: ({ board }) => [board.parts.auc_matched],
+    draw: ({ board }) => heatPage(board), title: () => "Detectors by cells",
+  },
+};
 
 let shown = null;
+let turn = 0;
 
-function route() {
+async function route() {
+  const own = ++turn;
   const wanted = location.hash.replace(/^#\/?/, "");
-  const [view, id, ...cell] = wanted.split("/").map(decoded);
-  const found = view === "detector" ? ROWS.get(id) : null;
-  const page = document.getElementById("detector");
+  const [view, ...rest] = wanted.split("?")[0].split("/").map(decoded);
+  const page = Object.hasOwn(PAGES, view) ? PAGES[view] : null;
+  const found = page?.find(rest);
+  const place = document.getElementById("detector");
+  markNavigation(found ? view : "");
   document.getElementById("overview").hidden = Boolean(found);
-  page.hidden = !found;
-  document.title = found ? `${found.row.label} \u2013 ${TITLE}` : TITLE;
+  place.hidden = !found;
+  document.title = found ? `${page.title(found)} \u2013 ${TITLE}` : TITLE;
   if (!found) {
-    page.replaceChildren();
+    place.replaceChildren();
     restore(wanted.startsWith("?") ? wanted : "");
     drawFilters();
-    drawTable();
+    await drawTable();
     const link = shown && document.querySelector(`[data-row="${CSS.escape(shown)}"] a`);
     if (link) link.focus();
     shown = null;
     return;
   }
-  state.board = found.board.id;
-  page.replaceChildren(...detectorPage(found.board, found.row, cell).filter(Boolean));
-  if (shown !== id) {
-    window.scrollTo(0, 0);
-    page.querySelector("h1").focus();
-  } else if (cell.length) {
-    page.querySelector(".heat [aria-current]")?.focus({ preventScroll: true });
+  if (found.board) state.board = found.board.id;
+  const parts = page.parts?.(found) ?? [];
+  if (parts.some((name) => !PARTS.has(name))) {
+    place.replaceChildren(element("p", { class: "note", role: "status" }, "Loading \u2026"));
+    try {
+      await Promise.all(parts.map(load));
+    } catch (error) {
+      if (own === turn) place.replaceChildren(notLoaded(error));
+      return;
+    }
+    if (own !== turn) return;
   }
-  shown = id;
+  place.replaceChildren(...[page.draw(found, rest)].flat().filter(Boolean));
+  const id = [view, ...rest.slice(0, view === "compare" ? 2 : 1)].join("/");
+  if (shown !== id && shown !== rest[0]) {
+    window.scrollTo(0, 0);
+    place.querySelector("h1").focus();
+  } else if (rest.length > 1) {
+    place.querySelector(".heat [aria-current]")?.focus({ preventScroll: true });
+  }
+  shown = view === "detector" ? rest[0] : id;
+}
+
+const currentBoard = () => DATA.boards.find((b) => b.id === state.board) ?? DATA.boards[0];
+
+/** The two rows that an address names, where they are of one board. */
+function pairOf(one, other) {
+  const [first, second] = [ROWS.get(one), ROWS.get(other)];
+  if (!first) return null;
+  if (second?.board === first.board) return { board: first.board, rows: [first.row, second.row] };
+  const best = first.board.rows.find((row) => row !== first.row);
+  return best ? { board: first.board, rows: [first.row, best] } : null;
+}
+
+const ALARMS = "?view=guaranteed&sort=alarm_rank&ascending=true";
+
+/** Say in the navigation which page this is. */
+function markNavigation(view) {
+  for (const link of document.querySelectorAll("nav.site a[href^='#']")) {
+    const current = link.getAttribute("href") === `#/${view}`;
+    if (current) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
 }
 
 /** A piece of an address; one that was damaged by hand is left as it is. */
@@ -40,12 +93,39 @@ function decoded(piece) {
   }
 }
 
-const TITLE = document.title;
+/** Light or dark: what was chosen here before, else what the system says. */
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  const other = theme === "dark" ? "light" : "dark";
+  document.getElementById("theme").textContent = other === "dark" ? "Dark" : "Light";
+  document.getElementById("theme").setAttribute("aria-label", `Switch to ${other} colours`);
+}
 
-drawPower();
+function kept(value) {
+  try {
+    if (value) localStorage.setItem("oodd-theme", value);
+    return localStorage.getItem("oodd-theme");
+  } catch {
+    return null; // A page from disk may have no storage.
+  }
+}
+
+const TITLE = document.title;
+const system = window.matchMedia("(prefers-color-scheme: dark)");
+
+setTheme(kept() ?? (system.matches ? "dark" : "light"));
+system.addEventListener("change", () => { if (!kept()) { setTheme(system.matches ? "dark" : "light"); route(); } });
+document.getElementById("theme").addEventListener("click", () => {
+  kept(isDark() ? "light" : "dark");
+  setTheme(isDark() ? "light" : "dark");
+  route();
+});
+if (DATA.project) document.getElementById("project").replaceChildren(element("a", { href: DATA.project, rel: "noopener noreferrer external" }, "Code and documents"));
+if (!DATA.power.length) document.querySelector("nav.site a[href='#/power']").hidden = true;
 if (DATA.boards.length) {
   window.addEventListener("hashchange", route);
   route();
 } else {
+  document.querySelector("nav.site").hidden = true;
   document.getElementById("overview").append(element("p", { class: "note" }, "There are no entries yet."));
 }

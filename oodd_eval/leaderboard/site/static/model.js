@@ -1,8 +1,34 @@
-// The data of the page, and means over the cells that the filters select.
+// The index of the page, parts that are loaded when they are needed, and means over selected cells.
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const ROWS = new Map(DATA.boards.flatMap((board) => board.rows.map((row) => [row.id, { board, row }])));
 const EVERYTHING = { environment: "all", group: "all", anomaly: "all" };
+
+const PARTS = new Map();
+const awaited = new Map();
+
+/** What data files call, with their name and their content as JSON. */
+window.ooddPart = (name, text) => PARTS.set(name, JSON.parse(text));
+
+/** Load one data file from beside the page, once; a promise of its content. */
+function load(name) {
+  if (!awaited.has(name)) {
+    awaited.set(name, new Promise((resolve, reject) => {
+      const source = `data/${name}.js`;
+      const script = element("script", {
+        src: source,
+        onload: () => PARTS.has(name) ? resolve(PARTS.get(name)) : reject(new Error(`${source} is not what it was built as`)),
+        onerror: () => { awaited.delete(name); reject(new Error(`${source} is not there`)); },
+      });
+      document.head.append(script);
+    }));
+  }
+  return awaited.get(name);
+}
+
+/** What stands in place of something whose data did not load. */
+const notLoaded = (error) => element("p", { class: "failure", role: "alert" },
+  `Data of this page is missing: ${error.message}. Keep the directory "data" beside index.html, or build the site again with "oodd-eval leaderboard build".`);
 
 /** Whether a cell is among those selected. */
 function selects(selection, cell) {
@@ -15,39 +41,73 @@ function selects(selection, cell) {
   );
 }
 
-/** Number of different cells, seeds aside. */
-const distinct = (cells) => new Set(cells.map((c) => `${c.environment}/${c.anomaly}`)).size;
+/** Places of a selection's cells in the board's list. */
+const placesOf = (board, selection) => board.cells.flatMap(([environment, anomaly], i) =>
+  selects(selection, { environment, anomaly }) ? [i] : []);
 
-const counted = new Map();
+const places = new Map();
 
-/** Number of different cells of a selection that any row of a board has; counted once. */
+/** The same, worked out once for each selection. */
 function cellsOf(board, selection) {
   const key = [board.id, selection.environment, selection.group, selection.anomaly].join("|");
-  if (!counted.has(key)) {
-    counted.set(key, distinct(board.rows.flatMap((row) => row.cells.filter((c) => selects(selection, c)))));
-  }
-  return counted.get(key);
+  if (!places.has(key)) places.set(key, placesOf(board, selection));
+  return places.get(key);
 }
+
+/** Whether the index has means over a selection: over all environments and one group or both. */
+const isSummary = ({ environment, anomaly }) => environment === "all" && anomaly === "all";
+
+/** The part that a board's metric is in. */
+const partOf = (board, metric) => PARTS.get(board.parts[metric]);
+
+/** Load what means of metrics over a selection need, beyond the index. */
+const loadMetrics = (board, metrics) => Promise.all(metrics.map((metric) => load(board.parts[metric])));
+
+const wholeDigits = (kind) => kind === "steps" ? 10 : 1000;
 
 /**
  * Mean of a metric over the selected cells, detector seeds included.
  *
  * `state` is a failed cell's, and then there is no value; `partial` tells that other rows have
- * cells here that this one lacks. The interval is the precomputed one, or a single cell's own.
+ * cells here that this one lacks. Over all environments and anomalies it is the index's; any other
+ * selection is averaged from the metric's part, where it is loaded.
  */
 function mean(board, row, metric, selection = EVERYTHING) {
-  const cells = row.cells.filter((cell) => selects(selection, cell));
-  const count = distinct(cells);
-  const found = { value: null, low: null, high: null, state: "", cells: count, partial: false };
+  const chosen = cellsOf(board, selection);
+  const missing = chosen.filter((i) => row.missing.includes(i)).length;
+  const count = chosen.length - missing;
+  const found = { value: null, low: null, high: null, state: "", reason: "", cells: count, partial: count > 0 && missing > 0 };
   if (!count) return found;
-  found.partial = count < cellsOf(board, selection);
+  const failed = row.failed.find(([place]) => chosen.includes(place));
+  if (failed) return { ...found, state: failed[1], reason: failed[2] };
+  if (isSummary(selection)) {
+    const [values, lows, highs] = row.means[selection.group] ?? [[], [], []];
+    const unit = wholeDigits(DATA.metrics[metric].kind);
+    const number = (whole) => isNumber(whole) ? whole / unit : null;
+    const place = board.intervals.indexOf(metric);
+    return { ...found, value: number(values[board.metrics.indexOf(metric)]), low: number(lows[place]), high: number(highs[place]) };
+  }
+  const part = partOf(board, metric);
+  if (!part) return found;
+  found.value = meanOf(chosen.map((i) => part.values[row.part][i]));
+  const key = `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
+  [found.low, found.high] = part.intervals[row.part]?.[key] ?? [null, null];
+  return found;
+}
+
+/** The same from a row's own part, which has intervals of single cells, too. */
+function meanOfRow(board, row, metric, selection = EVERYTHING) {
+  if (isSummary(selection)) return mean(board, row, metric, selection);
+  const part = PARTS.get(row.part);
+  const cells = part.cells.filter((cell) => selects(selection, cell));
+  const found = { value: null, low: null, high: null, state: "", cells: cells.length, partial: false };
   const failed = cells.find((cell) => cell.status);
-  if (failed) return { ...found, state: failed.status };
+  if (failed) return { ...found, state: failed.status, reason: failed.reason };
   const index = board.metrics.indexOf(metric);
   found.value = meanOf(cells.map((cell) => cell.values[index]));
   const key = `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
   const place = board.intervals.indexOf(metric);
-  const known = row.intervals[key]?.[place];
+  const known = part.intervals[key]?.[place];
   if (known) [found.low, found.high] = known;
   else if (cells.length === 1 && place >= 0) [found.low, found.high] = [cells[0].low[place], cells[0].high[place]];
   return found;

@@ -154,6 +154,8 @@ function axisOf(values, unit, step, label) {
   return { range, ticks: ticks(...range, 6), label };
 }
 
+let curtains = 0;
+
 function trajectoryFigure(example) {
   const rows = (list) => list.map((_, i) => example.start + i);
   const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
@@ -182,12 +184,14 @@ function trajectoryFigure(example) {
     const found = alarms.find((t) => t >= example.onset);
     return found === undefined ? "none in this window" : found === example.onset ? "at the onset" : `${found - example.onset} step${found === example.onset + 1 ? "" : "s"} after the onset`;
   };
+  const names = [scores, cusum].map((_, i) => `curtain-${++curtains}-${i}`);
+  const controls = player(example, [curtain(scores, names[0]), curtain(cusum, names[1])]);
   const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;
-  return figure([scores.drawing, cusum.drawing],
+  return [controls, figure([scores.drawing, cusum.drawing],
     [[ANOMALOUS, "anomalous trajectory"], [TWIN, "its nominal twin"], ["threshold", `alarm threshold ${DATA.threshold}`]],
     `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
     `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms. ` +
-    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.${bending ? " Where values are very large the upright scale is logarithmic." : ""}`);
+    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.${bending ? " Where values are very large the upright scale is logarithmic." : ""}`)];
 }
 
 /** Marks below a chart, one for each alarm. */

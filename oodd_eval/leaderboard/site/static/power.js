@@ -1,42 +1,43 @@
 // Detection power: what rows find of weaker anomalies, drawn over the strength or over its cost.
 
-const power = { metric: 0, axis: "strength" };
+const power = { metric: 0, axis: "strength", hidden: new Set() };
 
 const POWER_AXES = {
   strength: { title: "strength", place: 0, label: "strength (1: costs 1 % of the return)", bend: Math.log10 },
   lost: { title: "return lost", place: 1, label: "return lost (%)" },
 };
 
-function drawPower() {
-  const place = document.getElementById("power");
-  place.hidden = !DATA.power.length;
-  if (place.hidden) return;
+/** The page of detection thresholds and of power against strength. */
+function powerPage() {
   const metrics = DATA.power[0].metrics.map((metric, i) => [i, metric.title]);
   const axes = Object.entries(POWER_AXES).map(([name, axis]) => [name, `over ${axis.title}`]);
-  place.replaceChildren(
-    element("h2", {}, "Weaker anomalies"),
+  const labels = [...new Set(DATA.power.flatMap((suite) => suite.rows.filter((row) => !row.trivial).map((row) => row.label)))];
+  const again = () => document.getElementById("detector").replaceChildren(...powerPage());
+  const set = (name) => (value) => { power[name] = value; again(); };
+  return [
+    element("h1", { tabindex: "-1" }, "Weaker anomalies"),
+    element("p", { class: "lead" }, "What rows find of anomalies that cost a policy less and less of its return, and the weakest strength that they find: their detection threshold."),
     element("form", { class: "choices", "aria-label": "What to draw", autocomplete: "off" },
-      powerChoice("metric", "Measure", metrics), powerChoice("axis", "Drawn", axes)),
-    ...DATA.power.flatMap(powerOf));
-}
-
-function powerChoice(name, legend, options) {
-  return element("fieldset", { class: "views" }, element("legend", {}, legend), options.map(([value, title]) =>
-    element("label", {}, element("input", {
-      type: "radio", name: `power-${name}`, value, checked: power[name] === value,
-      onchange: () => {
-        power[name] = value;
-        drawPower();
-        document.querySelector(`[name="power-${name}"][value="${value}"]`).focus();
-      },
-    }), element("span", {}, title))));
+      tabs("power-metric", "Measure", metrics, power.metric, set("metric")), tabs("power-axis", "Drawn", axes, power.axis, set("axis")),
+      element("fieldset", { class: "boxes" }, element("legend", {}, "Rows"), labels.map((label) => element("label", {}, element("input", {
+        type: "checkbox", name: "power-row", value: label, checked: !power.hidden.has(label),
+        onchange: (event) => {
+          if (event.target.checked) power.hidden.delete(label);
+          else power.hidden.add(label);
+          again();
+          document.querySelector(`[name="power-row"][value="${CSS.escape(label)}"]`).focus();
+        },
+      }), ` ${label}`)))),
+    element("section", { id: "power", "aria-label": "Detection power" }, DATA.power.flatMap(powerOf)),
+  ];
 }
 
 /** Chart and tables of one split with graded strengths. */
 function powerOf(suite) {
   const axis = POWER_AXES[power.axis];
   const metric = suite.metrics[power.metric];
-  const drawn = suite.rows.map((row) => ({ ...row, points: row.points[power.metric].filter((p) => isNumber(p[axis.place])) }));
+  const drawn = suite.rows.filter((row) => !power.hidden.has(row.label)).map((row) => ({ ...row, points: row.points[power.metric].filter((p) => isNumber(p[axis.place])) }));
+  if (!drawn.length) return [element("p", { class: "note" }, "No row is chosen."), suite.tables.map(powerTable)].flat();
   const xs = drawn.flatMap((row) => row.points.map((p) => p[axis.place]));
   const x = axis.bend
     ? { range: [Math.min(...xs) / 1.2, Math.max(...xs) * 1.2], ticks: [0.001, 0.01, 0.1, 1, 10, 100, 1000], label: axis.label, bend: axis.bend }
@@ -46,9 +47,11 @@ function powerOf(suite) {
   const y = { range: [low, 100], ticks: ticks(low, 100), label: `${metric.title} (%)` };
   const plot = chart(`${metric.title} over ${axis.title}, split ${suite.split}`, x, y, { width: 560, height: 340 });
   const legend = [];
+  const named = suite.rows.filter((row) => !row.trivial).map((row) => row.label);
   for (const row of drawn.filter((r) => r.trivial)) plot.drawing.append(powerLine(plot, row, axis, NULL));
   for (const row of drawn.filter((r) => !r.trivial)) {
-    const kind = `series-${legend.length % 8}${legend.length >= 4 ? " dashed" : ""}`;
+    const i = named.indexOf(row.label); // so that a row keeps its colour when others are left out
+    const kind = `series-${i % 8}${i % 16 >= 8 ? " dashed" : ""}${i >= 16 ? " dotted" : ""}`;
     legend.push([kind, row.label]);
     plot.drawing.append(powerLine(plot, row, axis, kind));
   }
@@ -63,10 +66,12 @@ function powerOf(suite) {
 const powerLine = (plot, row, axis, kind) =>
   line(plot, row.points.map((p) => (axis.bend ? 1 : 100) * p[axis.place]), row.points.map((p) => 100 * p[2]), kind);
 
-function powerTable(table) {
+function powerTable(table, i) {
   const [first, ...others] = table.header;
+  const id = `power-table-${i}`;
   return element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": table.title },
-    element("table", { class: "plain" }, captionOf(`${table.title}. ${table.note}`),
+    csvButton(`thresholds-${i + 1}`, () => document.getElementById(id)),
+    element("table", { class: "plain", id }, captionOf(`${table.title}. ${table.note}`),
       element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, first), others.map((text) => element("th", { scope: "col" }, text)))),
       element("tbody", {}, table.rows.map(([label, ...cells]) =>
         element("tr", {}, element("th", { scope: "row" }, label), cells.map((text) => element("td", {}, text)))))));

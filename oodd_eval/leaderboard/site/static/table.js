@@ -1,10 +1,11 @@
 // The main view: filters, and one sortable table of a board's rows.
 
 const DEFAULTS = {
-  board: DATA.boards[0]?.id, ...EVERYTHING, horizon: "all", inputs: "all", trivial: true,
+  board: DATA.boards[0]?.id, ...EVERYTHING, horizon: "all", inputs: "all", search: "", trivial: true,
   view: "ranking", sort: "auc_matched", ascending: false,
 };
 const state = { ...DEFAULTS };
+const unfolded = new Set();
 
 /** The address of the table as it is: what differs from a first visit. */
 function tableAddress() {
@@ -29,11 +30,35 @@ function restore(text) {
 
 /** Rows that the filters leave. */
 function rowsOf(board) {
+  const sought = state.search.trim().toLowerCase();
   return board.rows.filter((row) =>
     (state.horizon === "all" || String(row.horizon) === state.horizon) &&
     (state.inputs === "all" || row.inputs === state.inputs) &&
-    (state.trivial || !row.trivial));
+    (state.trivial || !row.trivial) &&
+    (!sought || [row.label, row.plugin, row.submitter].some((text) => text.toLowerCase().includes(sought))));
 }
+
+/**
+ * Sorted rows as they stand in the table: each detector's first row, with the others below it where
+ * they are unfolded. First is the primary row, or the best of those that the filters leave.
+ */
+function folded(rows) {
+  const byDetector = Map.groupBy ? Map.groupBy(rows, (row) => row.detector) : groupedBy(rows, (row) => row.detector);
+  const first = new Map([...byDetector].map(([detector, own]) => [own.find((row) => row.primary) ?? own[0], detector]));
+  return rows.filter((row) => first.has(row)).flatMap((row) => {
+    const others = byDetector.get(row.detector).filter((other) => other !== row);
+    const open = unfolded.has(row.detector);
+    return [{ row, others: others.length, open }, ...(open ? others.map((other) => ({ row: other, variant: true })) : [])];
+  });
+}
+
+function groupedBy(items, key) {
+  const found = new Map();
+  for (const item of items) found.set(key(item), [...(found.get(key(item)) ?? []), item]);
+  return found;
+}
+
+const rankOfView = () => LISTS[state.view].rank ?? RANK;
 
 /** Sort by a column, by matched AUC when the view has no such column; what has no value last. By rank
  * and by matched AUC, what was not run again stands below what was. */
@@ -41,13 +66,13 @@ function sorted(board, rows, columns) {
   const label = (a, b) => a.label.localeCompare(b.label);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
   const matched = (row) => mean(board, row, "auc_matched", state).value;
-  const column = [RANK, ...columns].find((c) => c.key === state.sort);
+  const column = [rankOfView(), ...columns].find((c) => c.key === state.sort);
   const value = column ? (row) => column.of(row, state).value : matched;
   const sign = column && state.ascending ? 1 : -1;
   return [...rows].sort((a, b) => {
     const [x, y] = [value(a), value(b)];
     const defined = isNumber(y) - isNumber(x);
-    const below = column && !["rank", "auc_matched"].includes(column.key) ? 0 : a.below - b.below;
+    const below = column && !["rank", "alarm_rank", "auc_matched"].includes(column.key) ? 0 : a.below - b.below;
     return below || defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
   });
 }
@@ -59,26 +84,44 @@ function sortBy(key, better) {
   drawTable();
 }
 
-function drawTable() {
-  const board = DATA.boards.find((b) => b.id === state.board);
+let drawing = 0;
+
+/** Draw the table, once the data that its columns need is there. */
+async function drawTable() {
+  const own = ++drawing;
+  const board = currentBoard();
   const columns = columnsOf(board, state);
+  const place = document.getElementById("table");
+  const needed = [...new Set(columns.flatMap((column) => column.needs?.(state) ?? []))];
+  if (needed.some((metric) => !partOf(board, metric))) {
+    place.setAttribute("aria-busy", "true");
+    try {
+      await loadMetrics(board, needed);
+    } catch (error) {
+      if (own === drawing) place.replaceChildren(notLoaded(error));
+      return;
+    }
+    if (own !== drawing) return;
+  }
+  place.removeAttribute("aria-busy");
+  markNavigation(state.view === "guaranteed" ? ALARMS : "");
   const rows = sorted(board, rowsOf(board), columns);
+  const lines = folded(rows);
   const found = new Map(rows.map((row) => [row, columns.map((column) => column.of(row, state))]));
   const best = columns.map((column, i) => bestOf(column, rows.filter((r) => !r.trivial).map((r) => found.get(r)[i].value)));
   const start = axisStart(board);
-  const focused = document.activeElement?.dataset?.sort;
+  const focused = document.activeElement?.dataset?.key;
   const table = element("table", { id: "ranking", class: "board" },
     captionOf(what(board, rows)),
     element("thead", {}, element("tr", {}, [
-      header({ ...RANK, class: "rank" }),
+      header({ ...rankOfView(), class: "rank" }),
       header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", class: "left", better: "lower" }),
       ...columns.map(header),
     ])),
-    element("tbody", {}, rows.map((row) => tableRow(row, columns, found.get(row), best, start))),
+    element("tbody", {}, lines.map((line) => tableRow(line, columns, found.get(line.row), best, start))),
   );
-  const place = document.getElementById("table");
   place.replaceChildren(columns.length ? table : element("p", { class: "note" }, LISTS[state.view].empty));
-  if (focused) place.querySelector(`[data-sort="${focused}"]`)?.focus();
+  if (focused) place.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   document.getElementById("notes").replaceChildren(...notesOf(board, rows));
   history.replaceState(null, "", tableAddress());
 }
@@ -95,30 +138,44 @@ function header(column) {
   const order = active ? (state.ascending ? "ascending" : "descending") : "none";
   return element("th", { scope: "col", "aria-sort": order, class: column.class },
     element("button", {
-      type: "button", "data-sort": column.key, title: column.hint,
+      type: "button", "data-sort": column.key, "data-key": column.key, title: column.hint,
       onclick: () => sortBy(column.key, column.better),
     }, column.title, element("span", { class: "arrow", "aria-hidden": "true" },
       active ? (state.ascending ? "\u25b2" : "\u25bc") : "\u2195")),
     column.unit && element("span", { class: "unit" }, column.unit));
 }
 
-function tableRow(row, columns, values, best, start) {
-  return element("tr", { class: row.trivial ? "trivial" : null, "data-row": row.id },
-    element("td", { class: "rank" }, row.rank === null ? element("span", { title: row.state }, UNDEFINED) : rankText(row, row.rank),
-      row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
+function tableRow({ row, others, open, variant }, columns, values, best, start) {
+  const rank = rankOfView().of(row).value;
+  return element("tr", { class: [row.trivial && "trivial", variant && "variant"].filter(Boolean).join(" ") || null, "data-row": row.id },
+    element("td", { class: "rank" }, isNumber(rank) ? rankText(row, rank) : element("span", { title: row.state }, UNDEFINED),
+      rankOfView() === RANK && row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
     element("th", { scope: "row" },
       element("a", { href: address("detector", row.id) }, row.label), " ", badges(row),
-      element("span", { class: "under" }, underLabel(row))),
+      element("span", { class: "under" }, underLabel(row)),
+      others ? foldButton(row, others, open) : null),
     columns.map((column, i) => {
       const found = values[i];
       const text = column.text ? column.text(found.value, row) : meanText(found, column.kind);
       const strong = isNumber(found.value) && !row.trivial && found.value === best[i];
-      return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.state ? reasonOf(row) : null },
+      return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.state ? found.reason : null, "data-csv": text },
         column.whisker && whisker(found, start),
         element(strong ? "strong" : "span", { class: "value" }, text),
         column.interval && isNumber(found.low) && element("span", { class: "interval" },
           `[${show(found.low, column.kind)}, ${show(found.high, column.kind)}]`));
     }));
+}
+
+/** The button that shows or hides the other rows of a detector. */
+function foldButton(row, others, open) {
+  const text = `${others} variant${others === 1 ? "" : "s"}`;
+  return element("button", {
+    type: "button", class: "fold", "aria-expanded": String(open), "data-key": `fold-${row.detector}`,
+    onclick: () => {
+      if (!unfolded.delete(row.detector)) unfolded.add(row.detector);
+      drawTable();
+    },
+  }, open ? `\u2212 hide ${text}` : `+ ${text}`);
 }
 
 /** What stands under a label: inputs, horizon, seeds. */
@@ -142,8 +199,6 @@ function badges(row) {
   ];
 }
 
-const reasonOf = (row) => row.cells.find((cell) => cell.status)?.reason ?? "";
-
 /** Where the axis of the small drawings begins: it is the same for all rows and ends at 1. */
 function axisStart(board) {
   const lows = board.rows.map((r) => mean(board, r, "auc_matched", state)).map((m) => m.low ?? m.value);
@@ -153,20 +208,20 @@ function axisStart(board) {
 /** A small drawing of a mean with its interval. */
 function whisker(found, left) {
   if (!isNumber(found.value)) return null;
-  const x = (value) => (4 + 172 * (value - left) / (1 - left)).toFixed(1);
+  const x = (value) => (4 + 112 * (value - left) / (1 - left)).toFixed(1);
   const upright = (name, value, y) => shape("line", { class: name, x1: x(value), x2: x(value), y1: y, y2: 16 - y });
   const bar = isNumber(found.low) && [
     shape("line", { class: "bar", x1: x(found.low), x2: x(found.high), y1: 8, y2: 8 }),
     upright("bar", found.low, 4.5), upright("bar", found.high, 4.5),
   ];
-  return shape("svg", { class: "whisker", viewBox: "0 0 180 16", width: 180, height: 16, "aria-hidden": "true" },
+  return shape("svg", { class: "whisker", viewBox: "0 0 120 16", width: 120, height: 16, "aria-hidden": "true" },
     shape("line", { class: "axis", x1: x(left), x2: x(1), y1: 8, y2: 8 }),
     upright("half", 0.5, 1), bar, shape("circle", { cx: x(found.value), cy: 8, r: 2.8 }));
 }
 
 /** What the table is over, in words. */
 function what(board, rows) {
-  const cells = cellsOf(board, state);
+  const cells = cellsOf(board, state).length;
   const where = state.environment === "all" ? "all environments"
     : { classic: "classic-control environments", bullet: "Bullet environments" }[state.environment]
       ?? DATA.environments[state.environment].title;
@@ -188,13 +243,16 @@ function notesOf(board, rows) {
   if (selectsLess(state)) {
     lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
   }
+  if (!isSummary(state)) {
+    lines.push("Over single environments or anomalies only matched AUC has intervals here; every detector's page has those of single cells.");
+  }
   if (rows.some((r) => r.below)) {
     lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
   }
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
   const captions = new Map();
   for (const row of rows) {
-    const { caption } = row.entry;
+    const { caption } = row;
     if (caption) captions.set(caption, [...(captions.get(caption) ?? []), row.label]);
   }
   for (const [caption, labels] of captions) lines.push(`${labels.join(", ")}: ${caption}`);

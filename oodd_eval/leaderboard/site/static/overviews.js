@@ -1,0 +1,106 @@
+// Pages over all rows of a board: quality against cost, and a map of detectors by cells.
+
+const overview = { columns: "anomaly", cost: "step" };
+
+const COSTS = {
+  step: { title: "scoring", label: "microseconds per scored step" },
+  fit: { title: "fitting", label: "seconds per fit" },
+  peak: { title: "memory", label: "peak memory (MB)" },
+};
+
+/** A row's first line: its name as a link, and whether it is trivial. */
+const rowLink = (row) => element("a", { href: address("detector", row.id) }, row.label);
+
+/** Rows that stand for their detectors: the primary ones, best first. */
+const primaries = (board) => board.rows.filter((row) => row.primary);
+
+const redraw = (draw) => document.getElementById("detector").replaceChildren(...draw.flat().filter(Boolean));
+
+/** Matched AUC against what a detector costs. */
+function costPage(board) {
+  const cost = COSTS[overview.cost];
+  const drawn = primaries(board).map((row) => ({ row, x: row.cost[overview.cost], y: mean(board, row, "auc_matched") }))
+    .filter(({ x, y }) => isNumber(x) && x > 0 && isNumber(y.value));
+  const again = (value) => { overview.cost = value; redraw(costPage(board)); };
+  const xs = drawn.map(({ x }) => x);
+  const ys = drawn.map(({ y }) => 100 * y.value);
+  const range = [Math.min(...xs) / 1.5, Math.max(...xs) * 1.5];
+  const low = Math.floor(Math.min(50, ...ys) / 10) * 10;
+  const plot = chart(`Matched AUC against ${cost.title}`,
+    { range, ticks: [-3, -2, -1, 0, 1, 2, 3, 4, 5].map((p) => 10 ** p).filter((t) => t >= range[0] && t <= range[1]), label: cost.label, bend: Math.log10 },
+    { range: [low, 100], ticks: ticks(low, 100), label: "matched AUC (%)" }, { width: 860, height: 480, class: "wide" });
+  plot.drawing.setAttribute("role", "group");
+  const taken = [];
+  for (const { row, x, y } of drawn) {
+    const [left, top] = [plot.sx(x), plot.sy(100 * y.value)];
+    plot.drawing.append(shape("a", { href: address("detector", row.id), class: row.trivial ? "spot trivial" : "spot", "aria-label": `${row.label}: matched AUC ${show(y.value, "percent")} %, ${costText(x)} ${cost.label}` },
+      shape("circle", { cx: left, cy: top, r: 5 }),
+      shape("text", labelPlace(left, top, row.label, plot, taken), row.label)));
+  }
+  return [
+    element("h1", { tabindex: "-1" }, "Quality and cost"),
+    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 one row a detector. Entries were measured on different machines: compare orders of magnitude.`),
+    element("form", { class: "choices", autocomplete: "off" },
+      tabs("cost-axis", "Cost of", Object.entries(COSTS).map(([key, { title }]) => [key, title]), overview.cost, again),
+      csvButton("quality-and-cost", () => document.getElementById("costs"))),
+    figure([plot.drawing], [], "Up and to the left is better: more is found, for less."),
+    element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Quality and cost as a table" }, element("table", { class: "plain", id: "costs" },
+      captionOf("The same as numbers"),
+      element("thead", {}, element("tr", {}, ["Detector", "Matched AUC (%)", "Score (\u00b5s per step)", "Fit (s)", "Memory (MB)"].map((text, i) =>
+        element("th", { scope: "col", class: i ? null : "left" }, text)))),
+      element("tbody", {}, drawn.map(({ row, y }) => element("tr", {}, element("th", { scope: "row" }, rowLink(row)),
+        element("td", {}, meanText(y, "percent")), ["step", "fit", "peak"].map((name) => element("td", {}, costText(row.cost[name])))))))),
+  ];
+}
+
+/** Where a label stands beside its point without covering one that is there already. */
+function labelPlace(x, y, text, plot, taken) {
+  const wide = 6.6 * text.length;
+  const rings = [4, -10, 18, -24, 32, -38, 46];
+  const sides = rings.flatMap((dy) => [[9, dy, "start"], [-9, dy, "end"]]);
+  const boxes = sides.map(([dx, dy, anchor]) => {
+    const left = x + dx - (anchor === "end" ? wide : anchor === "middle" ? wide / 2 : 0);
+    return { left, right: left + wide, top: y + dy - 10, bottom: y + dy + 2, dx, dy, anchor };
+  });
+  const free = (box) => box.left > plot.left && box.right < plot.right &&
+    taken.every((other) => box.right < other.left || box.left > other.right || box.bottom < other.top || box.top > other.bottom);
+  const chosen = boxes.find(free) ?? boxes[0];
+  taken.push(chosen, { left: x - 5, right: x + 5, top: y - 5, bottom: y + 5 });
+  return { x: x + chosen.dx, y: y + chosen.dy, "text-anchor": chosen.anchor };
+}
+
+/** Matched AUC of every detector by anomaly, environment or cell. */
+function heatPage(board) {
+  const again = (value) => { overview.columns = value; redraw(heatPage(board)); };
+  const columns = {
+    anomaly: board.anomalies.map((anomaly) => ({ title: DATA.anomalies[anomaly].title, selection: { ...EVERYTHING, anomaly } })),
+    environment: board.environments.map((environment) => ({ title: DATA.environments[environment].title, selection: { ...EVERYTHING, environment } })),
+    cell: board.cells.map(([environment, anomaly]) => ({
+      title: `${DATA.environments[environment].title}, ${DATA.anomalies[anomaly].title}`, selection: { environment, group: "all", anomaly }, cell: [environment, anomaly],
+    })),
+  }[overview.columns];
+  const rows = primaries(board);
+  const options = [["anomaly", "Anomalies"], ["environment", "Environments"], ["cell", "Cells"]];
+  return [
+    element("h1", { tabindex: "-1" }, "Detectors by cells"),
+    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 matched AUC (%), one row a detector`),
+    element("form", { class: "choices", autocomplete: "off" }, tabs("heat-columns", "Columns", options, overview.columns, again),
+      csvButton("heatmap", () => document.getElementById("heatmap"))),
+    element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Heat map" },
+      element("table", { class: overview.columns === "cell" ? "heat tight" : "heat", id: "heatmap" },
+        captionOf("The colour of the page is 50, chance; teal is better, orange is worse than chance"),
+        element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Detector"),
+          columns.map(({ title }) => element("th", { scope: "col" }, element("span", {}, title))), element("th", { scope: "col" }, "Mean"))),
+        element("tbody", {}, rows.map((row) => element("tr", { class: row.trivial ? "trivial" : null },
+          element("th", { scope: "row" }, rowLink(row)),
+          columns.map(({ selection, cell }) => heatCell(mean(board, row, "auc_matched", selection), cell && address("detector", row.id, ...cell))),
+          heatCell(mean(board, row, "auc_matched"), null, "total")))))),
+  ];
+}
+
+/** One coloured number, a link where there is an address. */
+function heatCell(found, href, name = null) {
+  const text = meanText(found, "percent");
+  const node = element("td", { class: name, title: found.state ? found.reason : null }, href && text ? element("a", { href }, text) : text);
+  return painted(node, found.value);
+}
