@@ -53,7 +53,7 @@ class Repository:
 @pytest.fixture(autouse=True)
 def small_site(monkeypatch):
     """The site has tests of its own."""
-    monkeypatch.setattr(leaderboard_build.site, "page", lambda *_: "site")
+    monkeypatch.setattr(leaderboard_build.site, "files", lambda *_, **__: {"index.html": "site"})
 
 
 @pytest.fixture

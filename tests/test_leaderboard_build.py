@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import gzip
 import io
 import os
 from pathlib import Path
@@ -125,10 +126,21 @@ def write(root, submitted):
 def small_site(monkeypatch):
     """The site has tests of its own; here it is one file that names the entries."""
 
-    def page(given, _graded):
-        return " ".join(e.meta.id for section in given for e in section.entries)
+    def files(given, _graded, *, project):
+        names = " ".join(e.meta.id for section in given for e in section.entries)
+        return {leaderboard_build.site.PAGE: names}
 
-    monkeypatch.setattr(leaderboard_build.site, "page", page)
+    monkeypatch.setattr(leaderboard_build.site, "files", files)
+
+
+def test_the_site_links_to_the_projects_address(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(leaderboard_build, "repository", lambda: "https://example.org/oodd-eval")
+    monkeypatch.setattr(
+        leaderboard_build.site, "files", lambda *_, project: given.append(project) or {}
+    )
+    leaderboard_build.build(entries()[:1], tmp_path)
+    assert given == ["https://example.org/oodd-eval"]
 
 
 def lines_of(text):
@@ -645,6 +657,16 @@ def test_check_passes_on_what_was_built_and_writes_nothing(tmp_path, capsys):
     assert code == 0
     assert "up to date" in capsys.readouterr().out
     assert files_below(output) == before | {"notes.txt": b"mine"}
+
+
+def test_check_compares_what_compressed_files_say(tmp_path):
+    _, results, output = built(tmp_path, entries())
+    check = ["leaderboard", "build", str(results), "--output", str(output), "--check"]
+    content = gzip.decompress((output / PUBLISHED).read_bytes())
+    (output / PUBLISHED).write_bytes(gzip.compress(content, 1, mtime=1))
+    assert main(check) == 0
+    (output / PUBLISHED).write_bytes(gzip.compress(content[:-2]))
+    assert main(check) == 1
 
 
 def test_check_names_every_file_that_differs(tmp_path, capsys):

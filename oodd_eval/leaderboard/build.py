@@ -21,6 +21,7 @@ from oodd_eval.leaderboard.sections import (
     SuiteSection,
     sections,
 )
+from oodd_eval.plugins.template import repository
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.layout import Table
@@ -51,7 +52,8 @@ def build(
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    files |= {f"{SITE}/{name}": text for name, text in site.files(found, suites).items()}
+    shown = site.files(found, suites, project=repository())
+    files |= {f"{SITE}/{name}": text for name, text in shown.items()}
     for name, text in files.items():
         write_text(output / name, text)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
