@@ -170,6 +170,16 @@ def test_a_row_of_a_published_name_with_other_numbers_takes_its_place(shipped):
     assert places(placed.ranks)["fair[h=5]"][0] == 1
 
 
+def test_an_entry_declares_its_primary_row_here_too(shipped):
+    mine = [*row("mine", 0.7), *row("mine", 0.65, horizon=5)]
+    for primary in ((), ("mine[h=5]",)):
+        placed = place(mine, shipped, primary)
+        own = {
+            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.own
+        }
+        assert own == ({5} if primary else {1})
+
+
 def test_a_row_with_too_few_seeds_shows_the_rank_that_it_would_have(shipped):
     placed = place(row("mine", 0.7, seeds=(0,)), shipped)
     rank, *_, primary, _ = places(placed.ranks)["mine"]
