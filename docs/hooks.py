@@ -2,7 +2,7 @@
 
 MkDocs calls these functions while it builds (``hooks`` in mkdocs.yml). Pages that live beside what
 they describe, such as the detectors' READMEs, become pages of the site. A link to a file that has
-no page becomes its path in the repository: the site belongs to no one host.
+no page leads into the repository, if pyproject.toml says where that is, or becomes its path in it.
 """
 
 import os
@@ -17,6 +17,7 @@ from mkdocs.structure.pages import Page
 
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
+from oodd_eval.plugins.template import repository
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
@@ -45,7 +46,8 @@ def elsewhere() -> list[str]:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Leave results out of the navigation while there are none."""
+    """Link to the repository, if it has an address, and leave out results while there are none."""
+    config.repo_url = config.repo_url or repository() or None
     missing = {path for path in RESULTS if not (ROOT / path).exists()}
     config.nav = _without(config.nav or [], missing)
     return config
@@ -101,6 +103,8 @@ def _link(found: re.Match[str], source: str, uri: str, pages: dict[str, str]) ->
         if page in pages:
             return f"[{text}]({os.path.relpath(pages[page], PurePosixPath(uri).parent)}{anchor})"
     if (ROOT / path).exists():
+        if address := repository():
+            return f"[{text}]({address}/blob/HEAD/{path}{anchor})"
         return text if path in text else f"{text} (`{path}`)"
     return found[0]
 

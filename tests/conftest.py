@@ -40,6 +40,14 @@ def tiny_split(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def wheel(tmp_path_factory):
+    """The wheel of this checkout."""
+    from helpers_wheel import build_wheel
+
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="session")
 def submissions(tmp_path_factory):
     """Valid entries of the leaderboard with their results and split; see `Submissions`."""
     from helpers_submission import make_submissions, remembered_metrics

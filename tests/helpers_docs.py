@@ -32,8 +32,11 @@ class Rule:
 NOT_RUN = [
     Rule(r"^python3\.11 -m venv", "the README's two commands: .ci/run and test_readme"),
     Rule(r"^pip install (?!-e )", "needs an index; what is installed then is what runs here"),
+    Rule(r"^\. \.venv/bin/activate$", "the environment is this one; test_walk makes another"),
     Rule(r"^git ", "changes a repository"),
-    Rule(r"^twine |^python -m (build|twine)", "publishes"),
+    Rule(
+        r"^rm -rf dist$|^python -m build$|^\.ci/check-dist", "test_packaging builds and tries both"
+    ),
     Rule(r"^(mkdir|cp) ", "moves what a command of PARSED_ONLY would have made"),
     Rule(r"^(dask |dask-)", "servers that stay; test_executors starts them"),
     Rule(r"^python docs/figures/make\.py$", "test_figures_are_what_the_script_draws runs it"),
@@ -42,6 +45,7 @@ NOT_RUN = [
 """Commands that no test of this module runs."""
 
 PARSED_ONLY = [
+    Rule(r"leaderboard verify --changed-against", "needs a repository; test_changes makes one"),
     Rule(r"^oodd-eval data build (standard|paper|reduced)\b", "hours of simulation"),
     Rule(r"^oodd-eval data (build ladder|calibrate)\b", "minutes of simulation; test_ladder"),
     Rule(r"--split ladder\b", "takes minutes to build; test_ladder runs over a small one"),

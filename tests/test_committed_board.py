@@ -11,9 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from oodd_eval.data.files import compress, decompress, read_text
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import suite_sections
+from oodd_eval.leaderboard.placing import place
+from oodd_eval.leaderboard.published import PUBLISHED, read_published
+from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.leaderboard.verify import verify
 from oodd_eval.results.tables.board import boards
 
@@ -23,8 +26,8 @@ NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
 
 
 def rendered(board):
-    """Return the names of all files of a board that are made from its entries."""
-    files = [board / "README.md", *(board / "tables").glob("*.csv"), *(board / "site").glob("*")]
+    """Return the names of all committed files of a board that are made from its entries."""
+    files = [board / "README.md", board / PUBLISHED, *(board / "tables").glob("*.csv")]
     return {f.relative_to(board).as_posix() for f in files if f.is_file()}
 
 
@@ -64,7 +67,7 @@ def check_board(board, scratch):
     lines = [f"{name} is missing" for name in sorted(new - old)]
     lines += [f"{name} is of no entry" for name in sorted(old - new)]
     for name in sorted(new & old):
-        texts = ((place / name).read_text(encoding="utf-8") for place in (scratch, board))
+        texts = (read_text(place / name) for place in (scratch, board))
         lines += [f"{name}: {line}" for line in unlike(*texts)]
     return lines
 
@@ -91,6 +94,20 @@ def test_nominal_twins_look_alike_to_every_row_in_every_environment():
 def test_every_committed_entry_is_valid():
     verdicts = verify(BOARD / "results") if (BOARD / "results").is_dir() else []
     assert [p.text for v in verdicts for p in v.findings.problems] == []
+
+
+@pytest.mark.artefacts
+def test_committed_entries_have_their_committed_places_on_the_published_board():
+    (section,) = sections(read_entries(BOARD / "results"))
+    (published,) = read_published(BOARD / PUBLISHED).boards
+
+    def places(ranks):
+        return {s.entry: (s.rank, s.alarm_rank, s.ties, s.below) for s in ranks.standings}
+
+    for one in section.entries:
+        placed = place(one.records, published, one.meta.primary)
+        assert places(placed.ranks) == places(section.ranks), one.meta.id
+        assert placed.published == placed.own
 
 
 # The comparison itself
@@ -135,9 +152,16 @@ def test_a_number_that_was_edited_on_the_page_is_found(board, tmp_path):
     assert line.startswith("README.md: line ")
 
 
-def test_a_number_that_was_edited_on_the_site_is_found(board, tmp_path):
-    edited(board / "site" / "index.html", r"0\.\d{5,}", lambda text: f"{float(text) + 0.01}")
-    assert len(check_board(board, tmp_path / "fresh")) == 1
+def test_a_number_that_was_edited_in_the_published_file_is_found(board, tmp_path):
+    content = decompress((board / PUBLISHED).read_bytes()).replace(b"[[0.", b"[[1.", 1)
+    (board / PUBLISHED).write_bytes(compress(content))
+    (line,) = check_board(board, tmp_path / "fresh")
+    assert line.startswith(f"{PUBLISHED}: line ")
+
+
+def test_the_site_is_built_where_it_is_shown_and_need_not_be_there(board, tmp_path):
+    shutil.rmtree(board / "site")
+    assert check_board(board, tmp_path / "fresh") == []
 
 
 def test_a_record_that_was_changed_afterwards_is_found(board, tmp_path):

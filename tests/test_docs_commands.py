@@ -58,6 +58,13 @@ KNOWN = dict(
                 "oodd-eval leaderboard submit oodd-results --detector persistence",
             ),
         ),
+        page(
+            "docs/how-to/release.md",
+            before=(
+                "oodd-eval run --detector persistence --env cartpole",
+                "oodd-eval leaderboard submit oodd-results",
+            ),
+        ),
         page("docs/metrics.md", before=("oodd-eval run --detector rf --env cartpole --limit 2",)),
         page(
             "docs/regression-checks.md",

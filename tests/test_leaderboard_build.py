@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import gzip
 import io
 import os
 from pathlib import Path
@@ -16,6 +17,7 @@ from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results.identity import Setting
@@ -124,10 +126,21 @@ def write(root, submitted):
 def small_site(monkeypatch):
     """The site has tests of its own; here it is one file that names the entries."""
 
-    def page(given, _graded):
-        return " ".join(e.meta.id for section in given for e in section.entries)
+    def files(given, _graded, *, project):
+        names = " ".join(e.meta.id for section in given for e in section.entries)
+        return {leaderboard_build.site.PAGE: names}
 
-    monkeypatch.setattr(leaderboard_build.site, "page", page)
+    monkeypatch.setattr(leaderboard_build.site, "files", files)
+
+
+def test_the_site_links_to_the_projects_address(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(leaderboard_build, "repository", lambda: "https://example.org/oodd-eval")
+    monkeypatch.setattr(
+        leaderboard_build.site, "files", lambda *_, project: given.append(project) or {}
+    )
+    leaderboard_build.build(entries()[:1], tmp_path)
+    assert given == ["https://example.org/oodd-eval"]
 
 
 def lines_of(text):
@@ -625,7 +638,8 @@ def test_build_writes_page_tables_and_site(tmp_path, capsys):
     assert set(capsys.readouterr().out.split()) == {str(output / name) for name in written}
     text = (output / "README.md").read_text()
     for name in (*written, "results"):
-        assert f"]({name})" in text or name == "README.md"
+        assert f"]({name})" in text or name in ("README.md", "site/index.html", PUBLISHED)
+    assert "open `site/index.html`" in text
 
 
 def test_building_again_gives_the_same_bytes(tmp_path):
@@ -645,6 +659,16 @@ def test_check_passes_on_what_was_built_and_writes_nothing(tmp_path, capsys):
     assert files_below(output) == before | {"notes.txt": b"mine"}
 
 
+def test_check_compares_what_compressed_files_say(tmp_path):
+    _, results, output = built(tmp_path, entries())
+    check = ["leaderboard", "build", str(results), "--output", str(output), "--check"]
+    content = gzip.decompress((output / PUBLISHED).read_bytes())
+    (output / PUBLISHED).write_bytes(gzip.compress(content, 1, mtime=1))
+    assert main(check) == 0
+    (output / PUBLISHED).write_bytes(gzip.compress(content[:-2]))
+    assert main(check) == 1
+
+
 def test_check_names_every_file_that_differs(tmp_path, capsys):
     _, results, output = built(tmp_path, entries())
     name = f"tables/mini-{'ab' * 6}-protocol1"
@@ -657,7 +681,6 @@ def test_check_names_every_file_that_differs(tmp_path, capsys):
     assert code == 1
     said = capsys.readouterr()
     assert said.out.splitlines() == [
-        "site/index.html: differs",
         f"{name}-cells.csv: missing",
         f"{name}-ranking.csv: differs",
         "tables/old.csv: no part of the leaderboard any more",

@@ -1,5 +1,6 @@
 """What `oodd-eval new` writes, and which names it refuses."""
 
+import email.message
 import re
 import shutil
 import subprocess
@@ -9,10 +10,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers_plugins import install
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import OutputError, UsageError
+from oodd_eval.plugins import template
 from oodd_eval.plugins.template import FILES, LONGEST, Project, write_project
 
 LONG = ("abcde-" * 9)[: LONGEST - 1] + "z"
@@ -149,10 +152,55 @@ def test_commands_in_the_projects_readme_exist():
         build_parser().parse_args([*line.split(), *["entry"][: line.endswith("verify")]])
 
 
-def test_the_workflow_runs_what_the_readme_says():
-    rendered = Project("slow").render()
-    runs = re.findall(r"- run: (.*)", rendered[".github/workflows/ci.yml"])
-    assert {'pip install -e ".[test]"', "pytest", "oodd-eval check slow"} <= set(runs)
+def workflow():
+    """Steps of the project's workflow that run something, and the lines that each runs."""
+    (job,) = yaml.safe_load(Project("slow").render()[".github/workflows/ci.yml"])["jobs"].values()
+    return [(step, step["run"].splitlines()) for step in job["steps"] if "run" in step]
+
+
+ADDRESS = "https://example.org/oodd-eval"
+
+
+@pytest.fixture(params=["", ADDRESS], ids=["no address", "address"])
+def address(request, monkeypatch):
+    """The project with and without an address on the web."""
+    monkeypatch.setattr(template, "repository", lambda: request.param)
+    return request.param
+
+
+def test_the_workflow_runs_what_the_readme_says(address):
+    runs = {line for _, lines in workflow() for line in lines}
+    block = re.search(r"```sh\n(.*?)```", Project("slow").render()["README.md"], re.DOTALL)[1]
+    install, *rest = block.splitlines()
+    assert {install, 'pip install -e ".[test]"', "pytest", "oodd-eval check slow"} <= runs
+    assert rest[0] in runs
+    assert install.split(maxsplit=2)[2] == (
+        f'"oodd-eval @ git+{ADDRESS}"' if address else "wheels/oodd_eval-*.whl"
+    )
+
+
+def test_what_needs_oodd_eval_waits_for_its_wheel_until_there_is_an_address(address):
+    *first, (last, lines) = workflow()
+    assert all("if" not in step for step, _ in first)
+    assert not any("oodd-eval" in line for _, own in first for line in own)
+    assert last.get("if", "") == ("" if address else "hashFiles('wheels/oodd_eval-*.whl') != ''")
+    assert len(lines) == 5
+
+
+def test_the_project_links_to_an_address_only_where_there_is_one(address):
+    text = "".join(Project("slow").render().values())
+    links = set(re.findall(r"https?://[^\s)\"]+", text))
+    assert links == ({address} if address else set())
+    assert ("package index" in text) is not bool(address)
+
+
+def test_the_address_is_what_the_distribution_says(monkeypatch):
+    told = email.message.Message()
+    monkeypatch.setattr(template, "metadata", lambda name: told)
+    assert template.repository() == ""
+    told["Project-URL"] = "Documentation, https://example.org/docs"
+    told["Project-URL"] = f"Repository, {ADDRESS}"
+    assert template.repository() == ADDRESS
 
 
 def test_next_commands_are_printed(tmp_path, capsys, monkeypatch):
@@ -164,6 +212,7 @@ def test_next_commands_are_printed(tmp_path, capsys, monkeypatch):
         '  pip install -e "./oodd-slow[test]"',
         "  oodd-eval check slow",
         "  oodd-eval run --detector slow --env all",
+        "  oodd-eval leaderboard place oodd-results",
         "  oodd-eval leaderboard submit oodd-results --detector slow",
     ]
     assert (tmp_path / "oodd-slow" / "pyproject.toml").is_file()

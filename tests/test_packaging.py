@@ -1,5 +1,6 @@
 """What pip installs: the built wheel, and a detector directory lifted out of the project."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -9,24 +10,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from helpers_wheel import pip
 
 pytestmark = pytest.mark.packaging
 
 ROOT = Path(__file__).parents[1]
-PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-
-
-def pip(*arguments, cwd=None):
-    done = subprocess.run([*PIP, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.fixture(scope="session")
-def wheel(tmp_path_factory):
-    target = tmp_path_factory.mktemp("wheel")
-    pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(target), str(ROOT))
-    (built,) = target.glob("*.whl")
-    return built
 
 
 @pytest.fixture(scope="session")
@@ -67,8 +55,23 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_eval/data/shipped/mini/manifest.json",
         "oodd_eval/plugins/template/templates/pyproject.toml.in",
         "oodd_eval/plugins/template/templates/gitignore.in",
+        "oodd_eval/leaderboard/published.jsonl.gz",
     } <= names
     assert "oodd_eval/data/simulate/frozen/ant.npz" in names
+
+
+def test_what_is_handed_out_works_in_environments_of_its_own(tmp_path):
+    """As docs/how-to/release.md says, the source distribution from what git has here."""
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    check = [str(ROOT / ".ci" / "check-dist")]
+    for command in (build, check):
+        files = sorted(map(str, tmp_path.iterdir())) if command is check else []
+        done = subprocess.run(
+            [*command, *files], capture_output=True, text=True, check=False,
+            env={**os.environ, "PYTHON": sys.executable},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("works in an environment of its own") == len(files) == 2
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):
@@ -84,6 +87,12 @@ def test_installed_wheel_lists_detectors_and_runs(installed, tmp_path):
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert len((tmp_path / "out" / "records.jsonl").read_text().splitlines()) == 8
+
+
+def test_installed_wheel_shows_the_published_board(installed, tmp_path):
+    shown = run_installed(installed, tmp_path, "leaderboard", "show", "--split", "mini", "--csv")
+    assert shown.returncode == 0, shown.stderr
+    assert len(shown.stdout.splitlines()) > 30
 
 
 def readme_pyproject():

@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers_docs import parse
 
 from oodd_eval.leaderboard.entry import read_entries
@@ -59,6 +60,16 @@ def test_commands_in_documents_parse(path, capsys):
     blocks = "\n".join(re.findall(r"```(?:sh|console)\n(.*?)```", path.read_text(), re.DOTALL))
     for line in re.findall(r"^(?:\$ )?(oodd-eval [^\n|`]*)$", blocks, re.MULTILINE):
         parse(line)
+
+
+def test_citations_have_the_version():
+    from oodd_eval import __version__
+
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
+    cite = (ROOT / "docs" / "cite.md").read_text()
+    assert f"version = {{{__version__}}}" in cite
+    assert f"oodd-eval {__version__}, split" in cite
+    assert f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "index.md").read_text()
 
 
 def test_the_three_lines_are_the_boards():

@@ -1,4 +1,4 @@
-"""``oodd-eval leaderboard``: build the board, verify, run again and submit entries."""
+"""``oodd-eval leaderboard``: the published board, and its making from entries that are verified."""
 
 import argparse
 import tempfile
@@ -7,17 +7,19 @@ from typing import Final
 
 from rich.console import Console
 
-from oodd_eval.cli import EXPRESSION, NAMES, Parser, rerun, say
+from oodd_eval.cli import EXPRESSION, NAMES, Parser, board, rerun, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
+from oodd_eval.leaderboard.changes import changes_against
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.grants import GRANTS
 from oodd_eval.leaderboard.rerun import read_order
 from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.leaderboard.verify import verify as check
+from oodd_eval.leaderboard.verify import verify_changed as check_changed
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
 from oodd_eval.results.directory import ResultsDirectory
 
@@ -39,17 +41,23 @@ def define(parser: Parser) -> None:
         help=f"directory of the entries (default: {RESULTS})")
     add("--output", default="leaderboard", metavar="DIR",
         help="where to write (default: leaderboard)")
-    add("--check", action="store_true", help="write nothing, exit 1 where something would change")
+    add("--check", action="store_true",
+        help="write nothing, exit 1 where a file beside the site would change")
     add = action("verify", "check entries as data, running none of their code").options(
         verify, "leaderboard verify leaderboard/results/paper-mini"
     )
-    add("paths", nargs="+", metavar="PATH", help="an entry, or a directory of entries")
+    add("paths", nargs="*", metavar="PATH",
+        help=f"an entry, or a directory of entries (default: {RESULTS})")
+    add("--changed-against", default="", metavar="BRANCH",
+        help="check a pull request: the entries that were changed since the branch was left, that "
+             "nothing else was changed with them, and that the board builds")
     add("--split", metavar="PATH", help=SPLIT)
     add("--rerun", metavar="DIR",
         help="results of leaderboard rerun, or of a run of your own, to compare one entry with")
     add("--grant", default="", metavar="NAME",
         help=f"write the trust level that was reached into {GRANTS}, in this name")
     rerun.define(action("rerun", "run an entry's detectors again on seeds drawn now"))
+    board.define(action)
     add = action("submit", "write an entry from a results directory").options(
         submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
     )
@@ -127,9 +135,9 @@ def submit(options: argparse.Namespace) -> int:
             console.print(f"  note: so large an entry is a burden to the repository: {advice}")
         console.print(
             f"\nwritten to {place}, {size / 1e6:.2g} MB; next:\n"
-            f"  oodd-eval leaderboard build {place.parent}\n"
+            f"  oodd-eval leaderboard place {place}\n"
             f"  git add {place}\n"
-            "look at the tables, commit both, and open a pull request (docs/submitting.md)"
+            "commit it alone, and open a pull request (docs/submitting.md)"
         )
     return 0
 
@@ -137,6 +145,14 @@ def submit(options: argparse.Namespace) -> int:
 def verify(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard verify``; 1 when an entry is refused, 5 when there is none."""
     console = make_console()
+    options.paths = options.paths or [RESULTS]
+    if options.changed_against:
+        if options.rerun or options.grant or options.split or len(options.paths) > 1:
+            options_named = "--split, --rerun or --grant"
+            raise UsageError(
+                f"--changed-against is for one directory of entries, without {options_named}"
+            )
+        return verify_pull_request(console, Path(options.paths[0]), options)
     fresh = ResultsDirectory(options.rerun).records() if options.rerun else []
     if options.rerun and not fresh:
         raise UsageError(f"--rerun: {options.rerun!r} has no records")
@@ -161,6 +177,32 @@ def verify(options: argparse.Namespace) -> int:
     if len(verdicts) > 1:
         console.print(f"{len(verdicts) - refused} valid, {refused} refused")
     return int(refused > 0)
+
+
+def verify_pull_request(console: Console, results: Path, options: argparse.Namespace) -> int:
+    """Check what a branch changes; 1 when it may not be merged as the pull request of an entry."""
+    entries, others = changes_against(options.changed_against, results)
+    if not entries:
+        console.print(f"no entry differs from {options.changed_against}: nothing to verify")
+        return 0
+    refused = 0
+    for verdict in check_changed(results, entries):
+        report(console, verdict, options.verbosity)
+        refused += not verdict.ok
+    for path in others[:MOST_SHOWN]:
+        console.print(f"{path}: is changed together with an entry")
+    if others:
+        more = f" (and {len(others) - MOST_SHOWN} more)" if len(others) > MOST_SHOWN else ""
+        return say(
+            f"a pull request of an entry changes {results}/NAME/ and nothing else, but this one "
+            f"changes {len(others)} other files{more}: take them out of it", 1,
+        )  # fmt: skip
+    if refused:
+        return say(f"{refused} of {len(entries)} entries are refused", 1)
+    with tempfile.TemporaryDirectory() as fresh:
+        build_board(read_entries(results), Path(fresh), suite_sections(results.parent))
+    console.print(f"{', '.join(entries)}: may be merged, the board builds with it")
+    return 0
 
 
 def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:

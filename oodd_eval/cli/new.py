@@ -41,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
         print(
             f'\nnext:\n  pip install -e "{place}[test]"\n  oodd-eval check {project.name}\n'
             f"  oodd-eval run --detector {project.name} --env all\n"
+            "  oodd-eval leaderboard place oodd-results\n"
             f"  oodd-eval leaderboard submit oodd-results --detector {project.name}"
         )
     return 0

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.data.facts import GROUPS, SPLITS
-from oodd_eval.data.files import write_text
+from oodd_eval.data.files import GZIP, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
+from oodd_eval.leaderboard.published import PUBLISHED, content
 from oodd_eval.leaderboard.sections import (
     SUITES,
     TABLES,
@@ -20,6 +21,7 @@ from oodd_eval.leaderboard.sections import (
     SuiteSection,
     sections,
 )
+from oodd_eval.plugins.template import repository
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.layout import Table
@@ -39,9 +41,9 @@ WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``com
 def build(
     entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = ()
 ) -> list[str]:
-    """Write page, tables and site, the same bytes for the same entries; return their names.
+    """Write page, tables, site and the published file, the same bytes for the same entries.
 
-    The page is the first. ResultsError: the entries contradict one another.
+    Returns their names, the page first. ResultsError: the entries contradict one another.
     """
     found = sections(entries)
     address = f"{SITE}/{site.PAGE}"
@@ -50,18 +52,23 @@ def build(
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    files |= {f"{SITE}/{name}": text for name, text in site.files(found, suites).items()}
+    shown = site.files(found, suites, project=repository())
+    files |= {f"{SITE}/{name}": text for name, text in shown.items()}
     for name, text in files.items():
         write_text(output / name, text)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
-    return list(files)
+    write_bytes(output / PUBLISHED, content(found, suites))
+    return [*files, PUBLISHED]
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
-    """Return a line for every file of `existing` that a fresh build changes, adds or drops."""
+    """Return a line for every file of `existing` that a fresh build changes, adds or drops.
+
+    The site is no part of this: it is built where it is shown, and not committed.
+    """
     new, old = _files(fresh), _files(existing)
-    changed = {n for n in new & old if (fresh / n).read_bytes() != (existing / n).read_bytes()}
+    changed = {n for n in new & old if _content(fresh / n) != _content(existing / n)}
     parts = ((new - old, "missing"), (old - new, STALE), (changed, "differs"))
     return sorted(f"{name}: {what}" for names, what in parts for name in names)
 
@@ -72,19 +79,25 @@ def stale(output: Path, written: Collection[str]) -> list[str]:
 
 
 def _files(output: Path) -> set[str]:
-    """Return the names of the files that builds write, and of none beside them."""
-    paths = [output / PAGE, *(output / TABLES).glob("*.csv"), *(output / SITE).rglob("*")]
+    """Return the names of the committed files that builds write, and of none beside them."""
+    paths = [output / PAGE, output / PUBLISHED, *(output / TABLES).glob("*.csv")]
     return {path.relative_to(output).as_posix() for path in paths if path.is_file()}
+
+
+def _content(path: Path) -> bytes:
+    """Return what a file says: versions of zlib compress the same content differently."""
+    content = path.read_bytes()
+    return decompress(content) if path.suffix == GZIP else content
 
 
 def page(
     sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
 ) -> str:
-    """Return the whole page, which links to the `site` if there is one."""
+    """Return the whole page, which names the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
     parts = [TEXTS["introduction"]]
     if site:
-        parts.append(f"To sort, filter and see single trajectories: open [{site}]({site}).\n")
+        parts.append(TEXTS["site"].format(site=site))
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
     parts += [_suite(section) for section in suites]

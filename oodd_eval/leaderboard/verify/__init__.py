@@ -8,7 +8,7 @@ records among each other, scores, and last the trajectories of the split, where 
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +16,13 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import GZIP
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, recorded_versions, row_of
+from oodd_eval.leaderboard.entry import (
+    ENTRY,
+    EntryInfo,
+    read_entry,
+    recorded_versions,
+    row_of,
+)
 from oodd_eval.leaderboard.grants import GRANTS, TRUST, digest_of, read_grants
 from oodd_eval.leaderboard.rerun import RerunOrder
 from oodd_eval.leaderboard.verify import scores
@@ -207,6 +213,25 @@ def verify(
             stray.refuse(GRANTS, name, message)
     if stray.count:
         yield EntryVerdict(str(path), stray, {})
+
+
+def verify_changed(root: Path, names: Collection[str]) -> Iterator[EntryVerdict]:
+    """Check some entries of a directory, and that none of them clashes with another one.
+
+    The others are taken as they are. Names without a directory are entries that were removed.
+    """
+    seen, numbers = Seen(), _Numbers()
+    places = sorted(path.parent for path in root.glob(f"*/{ENTRY}"))
+    for entry in (read_entry(place) for place in places if place.name not in names):
+        records = {str(i): record for i, record in enumerate(entry.records)}
+        check_clashes(entry.meta.id, records, seen, Findings())
+        check_copies(entry.meta.id, records, numbers, Findings())
+    for name in sorted(names):
+        if os.path.lexists(root / name):
+            verdict = _guarded(root / name, None)
+            check_clashes(name, verdict.records, seen, verdict.findings)
+            check_copies(name, verdict.records, numbers, verdict.findings)
+            yield verdict
 
 
 def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -> None:

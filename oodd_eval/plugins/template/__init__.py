@@ -6,6 +6,7 @@ this package. ``@NAME@`` and the like stand for the names of the project, in pat
 
 import re
 from dataclasses import dataclass
+from importlib.metadata import metadata
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -26,6 +27,27 @@ FILES: Final = {
 
 LONGEST: Final = 30  # so that lines of the templates stay within their limit
 _RESERVED: Final = ("all", "eval")  # every detector, and this distribution
+
+
+_WHEEL: Final = "wheels/oodd_eval-*.whl"  # where oodd-eval is installed from without an address
+
+_CONDITION: Final = f"""\
+        # oodd-eval is on no package index yet: this step waits for its wheel in wheels/.
+        if: hashFiles('{_WHEEL}') != ''
+"""
+
+_ADVICE: Final = """
+Until a package index has oodd-eval, put its wheel into `wheels/`, from where the first command and
+the CI workflow install it. Where oodd-eval is installed already, leave the first command out.
+"""
+
+
+def repository() -> str:
+    """Return the address of oodd-eval's repository, empty while ``pyproject.toml`` has none."""
+    urls = metadata("oodd-eval").get_all("Project-URL") or []
+    return {name: url for name, _, url in (str(u).partition(", ") for u in urls)}.get(
+        "Repository", ""
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +85,17 @@ class Project:
 
     def render(self) -> dict[str, str]:
         """Return the contents of all files by their paths in the project."""
-        names = {"@NAME@": self.name, "@DISTRIBUTION@": self.distribution,
-                 "@MODULE@": self.module, "@CLASS@": self.class_name}  # fmt: skip
+        address = repository()
+        names = {
+            "@NAME@": self.name, "@DISTRIBUTION@": self.distribution, "@MODULE@": self.module,
+            "@CLASS@": self.class_name, "@PROJECT@": "oodd-eval", "@SOURCE@": _WHEEL,
+            "@CONDITION@": _CONDITION, "@ADVICE@": _ADVICE,
+        }  # fmt: skip
+        if address:
+            names |= {
+                "@PROJECT@": f"[oodd-eval]({address})",
+                "@SOURCE@": f'"oodd-eval @ git+{address}"', "@CONDITION@": "", "@ADVICE@": "",
+            }  # fmt: skip
         templates = files(__name__) / "templates"
 
         def fill(text: str) -> str:

@@ -1,0 +1,154 @@
+"""The published board as one small file, which ``leaderboard build`` writes and the wheel ships.
+
+It holds the records of all entries without what no ranking needs, as lines of JSON, compressed.
+Each record's provenance says which entry it is from, at which level of trust, and whether its row
+is primary; or of which further test suite it is.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from oodd_eval.data.files import compress
+from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
+from oodd_eval.metrics.catalogue import ALARM_RANKING, FOUND_WITHIN, HEADLINE, RANKING
+from oodd_eval.results.directory import read_records
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.ladder import FOUND
+from oodd_eval.results.record import NAN, Metric, Record
+from oodd_eval.results.tables.board import Board, RankedBoard, boards, grouped, ranked
+
+PUBLISHED: Final = "published.jsonl.gz"
+
+ALARMS: Final = tuple(
+    f"{name}_{HEADLINE}" for name in (f"found_within_{FOUND_WITHIN[0]}", "missed", "false_episodes")
+)
+"""Metrics of guaranteed alarms that stand beside the one that ranks."""
+
+RANKED_BY: Final = (RANKING, ALARM_RANKING, *ALARMS)
+"""Metrics that the file has: those of the rankings, and those beside them."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedBoard:
+    """One board: its records, and by row the entry's id and trust; `primary` are primary rows."""
+
+    records: list[Record]
+    entries: dict[Setting, str]
+    trust: dict[Setting, str]
+    primary: set[Setting]
+
+    def ranks(self) -> RankedBoard:
+        """Return the board's rankings, those of the page."""
+        return ranked(self.records, self.primary, self.rerun)
+
+    @property
+    def rerun(self) -> set[Setting]:
+        """The rows that were run again, which alone are ranked where there are any."""
+        return {row for row, trust in self.trust.items() if trust == "re-run"}
+
+    def __str__(self) -> str:
+        """Return what tells boards apart, such as ``mini, digest 7041bd7c9c2b, protocol 2``."""
+        return _conditions(self.records[0])
+
+
+class Published(NamedTuple):
+    """All published boards, and the boards of further suites with several strengths, by name."""
+
+    boards: list[PublishedBoard]
+    suites: dict[str, Board]
+
+
+def content(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> bytes:
+    """Return the bytes of the file: the same ones for the same entries and suites."""
+    lines = [
+        slim(record, RANKED_BY, entry=section.sources[one.entry].meta.id,
+              trust=section.trust[one.entry], primary=one.primary)
+        for section in sections for one in section.ranks.standings for record in one.records
+    ]  # fmt: skip
+    lines += [
+        slim(record, (FOUND,), suite=suite.name)
+        for suite in suites if suite.graded for record in suite.board.records
+    ]  # fmt: skip
+    return compress("".join(record.to_json() + "\n" for record in lines).encode())
+
+
+def published_file() -> Path:
+    """Return the file's place: in the wheel beside this module, in a checkout with the board.
+
+    `ResultsError`: there is none.
+    """
+    here = Path(__file__)
+    found = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
+    for place in found:
+        if place.is_file():
+            return place
+    raise ResultsError(
+        f"this installation has no published board: expected {str(found[0])!r}; install oodd-eval "
+        "from its wheel, or run leaderboard build in its checkout"
+    )
+
+
+def read_published(file: Path | None = None) -> Published:
+    """Read the file, by default the one of this installation."""
+    records = read_records(file or published_file())
+    by_suite = grouped(records, lambda r: str(r.provenance.get("suite", "")))
+    found = []
+    for board in boards(by_suite.pop("", [])):
+        origin = {r.setting: r.provenance for r in board.records}
+        found.append(
+            PublishedBoard(
+                board.records,
+                {row: own["entry"] for row, own in origin.items()},
+                {row: own["trust"] for row, own in origin.items()},
+                {row for row, own in origin.items() if own["primary"]},
+            )
+        )
+    return Published(found, {name: Board(own) for name, own in by_suite.items()})
+
+
+def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:
+    """Return the board that some records of one split can be compared with.
+
+    `UsageError`: there is none with their split digest, protocol and limit.
+    """
+    first, known = records[0], list(among)
+    for board in known:
+        if _key(board.records[0]) == _key(first):
+            return board
+    listed = "; ".join(map(str, known)) or "none"
+    if any(b.records[0].split_digest == first.split_digest for b in known):
+        advice = "run again with this version, without --limit, into another directory"
+    else:
+        name = first.split.partition("@")[0]
+        advice = "run on a published split, such as --split mini"
+        if any(b.records[0].split == name for b in known):
+            advice += f"; a split {name} that was built otherwise is another one"
+    raise UsageError(
+        f"these results cannot be compared with the board: they are of {_conditions(first)}, and "
+        f"published is {listed}; {advice}"
+    )
+
+
+def slim(record: Record, metrics: Iterable[str] = RANKED_BY, **provenance: object) -> Record:
+    """Return a record with the terms of some metrics alone, from which their values follow."""
+    terms = {name: record.per_trajectory[name] for name in metrics if name in record.per_trajectory}
+    return replace(
+        record, parameters={}, plugin_source="", scores="", provenance=provenance, reason="",
+        per_trajectory=terms, metrics={name: Metric(NAN) for name in terms},
+        seconds_fit=NAN, seconds_score=NAN, peak_rss_mb=NAN, steps_scored=None,
+    )  # fmt: skip
+
+
+def _key(record: Record) -> tuple[str, int, int | None]:
+    return record.split_digest, record.protocol, record.limit
+
+
+def _conditions(record: Record) -> str:
+    limit = "" if record.limit is None else f", limit {record.limit}"
+    return (
+        f"split {record.split}, digest {record.split_digest[:12]}, protocol {record.protocol}"
+        f"{limit}"
+    )

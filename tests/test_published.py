@@ -1,0 +1,314 @@
+"""The published file, and a run placed among its rows: the ranks are those of the board."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_records import make_record
+
+from oodd_eval.cli.main import main
+from oodd_eval.data.files import compress, decompress
+from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.leaderboard import published
+from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry
+from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.placing import neighbours, place, rankings
+from oodd_eval.leaderboard.published import board_of, content, read_published
+from oodd_eval.leaderboard.sections import sections
+from oodd_eval.results.identity import Setting
+
+TEST = 10  # test seeds
+PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
+MEANS = {"good": 0.9, "fair": 0.8, "poor": 0.6}
+
+
+def row(detector, mean, *, seeds=(0, 1, 2), places=PLACES, **more):
+    """Records of a row: the higher its mean, the shorter its delays."""
+    made = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, *detector.encode()])
+        for environment, anomaly in places:
+            matched = np.clip(mean + 0.02 * rng.normal(size=TEST), 0, 1)
+            values = {"auc_matched": list(matched), "auc": [0.5] * TEST}
+            one = make_record(
+                detector, environment, anomaly, seed=seed, values=values, deterministic=False,
+                **more,
+            )  # fmt: skip
+            terms = one.per_trajectory | {
+                "delay_censored_at_5pct": ([float(v) for v in 60 * (1 - matched)], [1.0] * TEST),
+                "false_episodes_at_5pct": ([0.0] * TEST, [1.0] * TEST),
+            }
+            metrics = one.metrics | dict.fromkeys(terms, one.metrics["auc"])
+            counts = {"train": 40, "calibration": 40, "test": TEST}
+            made.append(
+                dataclasses.replace(one, per_trajectory=terms, metrics=metrics, counts=counts)
+            )
+    return made
+
+
+def entry(name, records, *, trust="re-run", primary=()):
+    first = records[0]
+    info = EntryInfo(
+        id=name, title=name, detectors=sorted({r.detector for r in records}), submitter="",
+        citation="", url="", split=first.split, split_digest=first.split_digest, plugins=[],
+        protocol=first.protocol, environment={}, created="2026-11-21", caption="",
+        primary=list(primary),
+    )  # fmt: skip
+    grant = None if trust == "reported" else Grant("", trust, "us", "2026-11-22", "fresh seeds")
+    return SubmittedEntry(Path(name), info, records, grant)
+
+
+def entries():
+    rows = [r for name, mean in MEANS.items() for r in row(name, mean)]
+    return [
+        entry("first", [*rows, *row("fair", 0.85, horizon=5)], primary=["fair[h=5]"]),
+        entry("claim", row("claimed", 0.95), trust="reported"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def board():
+    (found,) = sections(entries())
+    return found
+
+
+@pytest.fixture(scope="module")
+def file(board, tmp_path_factory):
+    file = tmp_path_factory.mktemp("published") / published.PUBLISHED
+    file.write_bytes(content([board]))
+    return file
+
+
+@pytest.fixture
+def shipped(file, monkeypatch):
+    """The board that an installation has."""
+    monkeypatch.setattr(published, "published_file", lambda: file)
+    (found,) = read_published().boards
+    return found
+
+
+def places(ranks):
+    return {
+        str(s.entry): (s.rank, s.alarm_rank, s.ties, s.primary, s.below) for s in ranks.standings
+    }
+
+
+def run_of(records, directory):
+    directory.mkdir(exist_ok=True)
+    text = "".join(r.to_json() + "\n" for r in records)
+    (directory / "records.jsonl").write_text(text)
+    return str(directory)
+
+
+# The file
+
+
+def test_the_rankings_of_the_file_are_those_of_the_board(board, shipped):
+    assert places(shipped.ranks()) == places(board.ranks)
+    assert places(board.ranks)["fair[h=5]"][3]  # as its entry declares
+    assert places(board.ranks)["claimed"] == (1, 1, "", True, True)
+    assert shipped.trust == board.trust
+    assert {str(r): e for r, e in shipped.entries.items()} == {
+        "claimed": "claim", "fair": "first", "fair[h=5]": "first", "good": "first", "poor": "first"
+    }  # fmt: skip
+
+
+def test_the_file_has_the_terms_of_the_rankings_and_no_others(file):
+    lines = [json.loads(line) for line in decompress(file.read_bytes()).splitlines()]
+    assert {name for line in lines for name in line["per_trajectory"]} == {
+        "auc_matched", "delay_censored_at_5pct", "false_episodes_at_5pct"
+    }  # fmt: skip
+    assert not any(line["parameters"] or line["scores"] or line["plugin_source"] for line in lines)
+
+
+def test_the_same_entries_give_the_same_bytes(file):
+    assert content(sections(reversed(entries()))) == file.read_bytes()
+
+
+def test_an_installation_without_a_board_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr(published, "__file__", str(tmp_path / "a" / "b" / "published.py"))
+    with pytest.raises(ResultsError, match=r"has no published board: .*from its wheel"):
+        published.published_file()
+
+
+# Placing
+
+
+@pytest.mark.parametrize("name", ["first", "claim"])
+def test_an_entrys_own_records_have_the_places_of_the_board(name, board, shipped):
+    (own,) = [e for e in entries() if e.meta.id == name]
+    placed = place(own.records, shipped, own.meta.primary)
+    assert places(placed.ranks) == places(board.ranks)
+    assert placed.published == placed.own == {r.setting for r in own.records}
+    assert not placed.lacking
+
+
+def test_a_new_row_has_the_rank_that_the_board_would_give_it_when_it_was_run_again(shipped):
+    mine = row("mine", 0.7)
+    placed = place(mine, shipped)
+    (would,) = sections([*entries(), entry("mine", mine)])
+    assert places(placed.ranks) == places(would.ranks)
+    assert places(placed.ranks)["mine"][:2] == (3, 3)
+    assert not placed.published
+    assert not placed.lacking
+
+
+def test_part_of_a_published_row_is_that_row(board, shipped):
+    part = row("poor", 0.6, seeds=(1,), places=PLACES[:1])
+    placed = place([*part, *row("mine", 0.7)], shipped)
+    assert placed.published == {Setting("poor")}
+    assert placed.cells == placed.expected
+
+
+def test_a_row_of_a_published_name_with_other_numbers_takes_its_place(shipped):
+    placed = place(row("good", 0.65), shipped)
+    assert placed.replaced == {Setting("good")}
+    assert places(placed.ranks)["good"][:2] == (2, 2)
+    assert places(placed.ranks)["fair[h=5]"][0] == 1
+
+
+def test_an_entry_declares_its_primary_row_here_too(shipped):
+    mine = [*row("mine", 0.7), *row("mine", 0.65, horizon=5)]
+    for primary in ((), ("mine[h=5]",)):
+        placed = place(mine, shipped, primary)
+        own = {
+            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.own
+        }
+        assert own == ({5} if primary else {1})
+
+
+def test_a_row_with_too_few_seeds_shows_the_rank_that_it_would_have(shipped):
+    placed = place(row("mine", 0.7, seeds=(0,)), shipped)
+    rank, *_, primary, _ = places(placed.ranks)["mine"]
+    assert (rank, primary) == (3, False)
+    assert placed.lacking == {Setting("mine"): "2 of 3 detector seeds"}
+
+
+def test_rows_with_few_cells_are_compared_on_these_and_what_they_lack_is_named(shipped):
+    placed = place(row("mine", 0.7, places=PLACES[:3], seeds=(0, 1)), shipped)
+    assert placed.cells == set(PLACES[:3])
+    assert {r.place for r in placed.ranks.board.records} == set(PLACES[:3])
+    assert placed.lacking == {
+        Setting("mine"): "1 of 4 cells with seed 0 (hopper/gravity) and 1 of 4 cells with seed 1 "
+        "(hopper/gravity) and 1 of 3 detector seeds"
+    }
+    whole = place(row("mine", 0.7, places=PLACES[:2], seeds=(0,)), shipped)
+    assert "2 of 4 cells (hopper)" in whole.lacking[Setting("mine")]
+
+
+def test_rows_without_a_common_cell_are_refused(shipped):
+    apart = [*row("mine", 0.7, places=PLACES[:1]), *row("other", 0.7, places=PLACES[1:2])]
+    with pytest.raises(UsageError, match="no cell of the board in common"):
+        place(apart, shipped)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"split_digest": "cd" * 32}, "digest cdcdcdcdcdcd, .*run on a published split"),
+        ({"protocol": 7}, "protocol 7, .*run again with this version"),
+        ({"limit": 2}, "limit 2, .*without --limit"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(shipped, change, said, tmp_path, capsys):
+    other = [dataclasses.replace(r, **change) for r in row("mine", 0.7)]
+    with pytest.raises(UsageError, match=said):
+        board_of(other, [shipped])
+    assert main(["leaderboard", "place", run_of(other, tmp_path / "out")]) == 4
+    assert "published is split mini" in capsys.readouterr().err
+
+
+def test_records_of_another_version_are_refused(shipped, tmp_path, capsys):
+    directory = run_of(row("mine", 0.7), tmp_path / "out")
+    records = tmp_path / "out" / "records.jsonl"
+    records.write_text(records.read_text().replace('"schema": 3', '"schema": 2'))
+    assert main(["leaderboard", "place", directory]) == 4
+    assert "written by another version" in capsys.readouterr().err
+
+
+# Tables and commands
+
+
+def test_neighbours_are_the_primary_rows_next_to_a_row(shipped):
+    placed = place(row("mine", 0.7), shipped)
+    table = neighbours(placed.ranks, Setting("mine"))
+    assert [[*line[:3], line[4]] for line in table.rows] == [
+        ["matched AUC", "fair[h=5]", "2", "worse"],
+        ["matched AUC", "poor", "4", "better"],
+        ["delay", "fair[h=5]", "2", "worse"],
+        ["delay", "poor", "4", "better"],
+    ]
+    # As the rows were made: .7 against .85 and .6, and sixty times that in steps.
+    first, second, third, fourth = (float(line[3].split()[0]) for line in table.rows)
+    assert first == pytest.approx(-15, abs=1.5)
+    assert second == pytest.approx(10, abs=1.5)
+    assert third == pytest.approx(9, abs=1)
+    assert fourth == pytest.approx(-6, abs=1)
+    for line in table.rows:
+        low, high = map(float, line[3].partition("[")[2].strip("]").split(", "))
+        assert low < float(line[3].split()[0]) < high
+
+
+def test_rankings_mark_own_rows_and_have_an_order_of_their_own(shipped):
+    # As good as the best at separating, and slow to alarm.
+    slow = [
+        dataclasses.replace(
+            r, per_trajectory=r.per_trajectory | {
+                "delay_censored_at_5pct": ([59.0] * TEST, [1.0] * TEST)
+            },
+        )
+        for r in row("slow", 0.9)
+    ]  # fmt: skip
+    placed = place(slow, shipped)
+    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.own)
+    assert {line[1]: line[0] for line in first.rows}["> slow"] == "1 a"
+    assert [line[3] for line in first.rows if line[1] == "> slow"] == ["yours"]
+    assert second.rows[-2][:2] == ["4", "> slow"]
+    assert second.rows[-1][1] == "claimed"  # below those that were run again
+
+
+def test_show_prints_both_rankings(shipped, capsys):
+    assert main(["leaderboard", "show"]) == 0
+    printed = capsys.readouterr().out
+    first, second = printed.split("Ranking by guaranteed alarms at 5 %")
+    assert "Ranking by separability" in first
+    assert "Entry claim: claimed." in second
+    assert main(["leaderboard", "show", "--csv"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("rank,ties,alarm_rank,state,detector,")
+    assert len(lines) == 6
+    assert main(["leaderboard", "show", "--split", "mini", "--markdown"]) == 0
+    assert "### Ranking by separability" in capsys.readouterr().out
+    assert main(["leaderboard", "show", "--split", "minni"]) == 4
+    assert "did you mean 'mini'" in capsys.readouterr().err
+
+
+def test_place_says_where_a_run_stands(shipped, tmp_path, capsys):
+    directory = run_of([*row("mine", 0.7), *row("good", 0.9)], tmp_path / "out")
+    assert main(["leaderboard", "place", directory]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "mine: rank 3 by separability, rank 3 by guaranteed alarms." in printed
+    assert "good: rank 1 by separability, rank 1 by guaranteed alarms. It has the" in printed
+    assert re.search(r" 3 > mine \d", printed)
+    assert "mine and the rows next to it" in printed
+    assert "good and the rows" not in printed
+    assert main(["leaderboard", "place", directory, "--detector", "good", "--csv"]) == 0
+    assert "mine" not in capsys.readouterr().out
+    assert main(["leaderboard", "place", directory, "-q"]) == 0
+    assert "Ranking" not in capsys.readouterr().out
+
+
+def test_an_empty_run_is_refused(shipped, tmp_path, capsys):
+    assert main(["leaderboard", "place", run_of([], tmp_path / "out")]) == 4
+    assert "no records in" in capsys.readouterr().err
+
+
+def test_the_file_is_read_from_a_compressed_copy_alone(shipped, tmp_path, monkeypatch):
+    broken = tmp_path / published.PUBLISHED
+    broken.write_bytes(compress(b'{"schema": 1}\n'))
+    monkeypatch.setattr(published, "published_file", lambda: broken)
+    with pytest.raises(ResultsError, match="has schema 1, expected 3"):
+        read_published()
