@@ -5,6 +5,7 @@ import dataclasses
 import gzip
 import io
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,12 @@ from helpers_records import example, make_record
 from oodd_eval.cli.main import main
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.build import page
+from oodd_eval.leaderboard.build import cells, page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.grants import Grant
 from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.leaderboard.sections import sections
+from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric
@@ -547,7 +549,6 @@ def test_nothing_depends_on_the_order_of_entries_or_records():
     one, other = sections(entries()), sections(turned)
     assert page(one) == page(other)
     for a, b in zip(one, other, strict=True):
-        assert rendering.cells_csv(a.ranks) == rendering.cells_csv(b.ranks)
         assert rendering.ranking_csv(a.ranks, a.trust) == rendering.ranking_csv(b.ranks, b.trust)
 
 
@@ -603,17 +604,28 @@ def test_nothing_that_others_wrote_becomes_markup():
 
 
 def test_csv_of_cells_has_a_line_per_cell_with_stored_metrics():
-    (section, _) = sections(entries())
-    lines = lines_of(rendering.cells_csv(section.ranks))
-    assert len(lines) == len(section.ranks.board.records) == 20
+    found = sections(entries())
+    lines = lines_of(cells(found, []))
+    assert len(lines) == 22
+    assert {line["board"] for line in lines} == {"leaderboard"}
     by_cell = {(r.detector, r.horizon, r.environment, r.anomaly): r for r in board()}
-    for line in lines:
+    for line in (line for line in lines if line["digest"] == found[0].ranks.board.digest):
         one = by_cell[line["detector"], int(line["horizon"]), line["environment"], line["anomaly"]]
         assert line["status"] == one.status
         if one.ok:
             assert float(line["auc_matched"]) == pytest.approx(one.value("auc_matched"), rel=1e-5)
         else:
             assert line["auc_matched"] == ""
+
+
+def test_every_column_of_the_table_of_cells_is_described():
+    page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
+    listed = [name for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+              for name in re.findall(r"`(\w+)`", row)]  # fmt: skip
+    columns = list(lines_of(cells(sections(entries()), []))[0])
+    own = [c for c in columns if re.sub(r"_(low|high)$", "", c) not in catalogue.NAMES]
+    assert sorted(own) == sorted(name for name in listed if not name.startswith("_"))
+    assert len(own) < len(columns)
 
 
 def test_csv_numbers_have_six_digits_and_no_rounding_noise():
@@ -633,12 +645,13 @@ def test_build_writes_page_tables_and_site(tmp_path, capsys):
     assert {n for n in written if n.startswith("tables/")} == {
         f"tables/mini-{digest}-protocol1-{kind}.csv"
         for digest in ("ab" * 6, "cd" * 6)
-        for kind in ("ranking", "cells", "comparisons")
+        for kind in ("ranking", "comparisons")
     }
     assert set(capsys.readouterr().out.split()) == {str(output / name) for name in written}
     text = (output / "README.md").read_text()
     for name in (*written, "results"):
-        assert f"]({name})" in text or name in ("README.md", "site/index.html", PUBLISHED)
+        unlinked = name in ("README.md", PUBLISHED) or name.startswith("site/")
+        assert f"]({name})" in text or unlinked
     assert "open `site/index.html`" in text
 
 
@@ -673,7 +686,7 @@ def test_check_names_every_file_that_differs(tmp_path, capsys):
     _, results, output = built(tmp_path, entries())
     name = f"tables/mini-{'ab' * 6}-protocol1"
     (output / f"{name}-ranking.csv").write_text("rank\n")
-    (output / f"{name}-cells.csv").unlink()
+    (output / f"{name}-comparisons.csv").unlink()
     (output / "tables" / "old.csv").write_text("")
     (output / "site" / "index.html").write_text("")
     capsys.readouterr()
@@ -681,7 +694,7 @@ def test_check_names_every_file_that_differs(tmp_path, capsys):
     assert code == 1
     said = capsys.readouterr()
     assert said.out.splitlines() == [
-        f"{name}-cells.csv: missing",
+        f"{name}-comparisons.csv: missing",
         f"{name}-ranking.csv: differs",
         "tables/old.csv: no part of the leaderboard any more",
     ]

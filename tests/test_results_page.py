@@ -72,14 +72,13 @@ def test_the_table_of_fresh_seeds_is_that_of_the_grants():
 
 
 def test_the_table_by_environment_is_the_boards():
-    (file,) = (ROOT / "leaderboard" / "tables").glob("mini-*-cells.csv")
-    with file.open() as lines:
-        cells = [r for r in csv.DictReader(lines) if (r["horizon"], r["overrides"]) == ("1", "{}")]
+    entries = read_entries(ROOT / "leaderboard" / "results")
+    records = [r for e in entries for r in e.records if r.split == "mini"]
 
     def mean(detector, group, metric):
         wanted = (detector, environment, group)
-        own = [r for r in cells if (r["detector"], r["environment"], r["group"]) == wanted]
-        return 100 * np.mean([float(r[metric]) for r in own])
+        own = [r for r in records if (str(r.setting), r.environment, r.group) == wanted]
+        return 100 * np.mean([r.value(metric) for r in own])
 
     pair = r"([\d.]+), ([\d.]+)"
     rows = re.findall(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.data.facts import GROUPS, SPLITS
-from oodd_eval.data.files import GZIP, decompress, write_bytes, write_text
+from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
@@ -22,14 +22,16 @@ from oodd_eval.leaderboard.sections import (
     sections,
 )
 from oodd_eval.plugins.template import repository
+from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout, rendering
-from oodd_eval.results.tables.board import Board
+from oodd_eval.results.tables.board import Board, primary_settings
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import escape
 from oodd_eval.results.tables.rendering import markdown as table
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
+CELLS: Final = f"{SITE}/cells.csv.gz"
 STALE: Final = "no part of the leaderboard any more"
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
@@ -50,7 +52,6 @@ def build(
     files = {PAGE: page(found, suites, site=address)}
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
-        files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
     shown = site.files(found, suites, project=repository())
     files |= {f"{SITE}/{name}": text for name, text in shown.items()}
@@ -58,8 +59,29 @@ def build(
         write_text(output / name, text)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
+    write_bytes(output / CELLS, compress(cells(found, suites).encode()))
     write_bytes(output / PUBLISHED, content(found, suites))
-    return [*files, PUBLISHED]
+    return [*files, CELLS, PUBLISHED]
+
+
+def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]) -> str:
+    """Return all cells of boards and suites as one table (CSV); empty without any."""
+    lines: list[tuple[dict[str, str], Record]] = []
+    for section in sections:
+        for row in section.ranks.standings:
+            entry, flags = section.sources[row.entry], (row.primary, row.trivial)
+            primary, trivial = (str(flag).lower() for flag in flags)
+            about = {"board": "leaderboard", "entry": entry.meta.id, "trust": entry.trust,
+                     "primary": primary, "trivial": trivial}  # fmt: skip
+            lines += [(about, r) for r in row.records]
+    for suite in suites:
+        first = primary_settings(suite.board.records)
+        for r in suite.board.records:
+            trivial = str(suite.board.is_trivial(r.setting)).lower()
+            about = {"board": suite.name, "entry": "", "trust": "",
+                     "primary": str(r.setting in first).lower(), "trivial": trivial}  # fmt: skip
+            lines.append((about, r))
+    return rendering.cells_csv(lines) if lines else ""
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -130,7 +152,7 @@ def _section(section: LeaderboardSection) -> str:
     ranks, board = section.ranks, section.ranks.board
     about = [entry.meta for entry in section.entries]
     ok = sum(r.ok for r in board.records)
-    kinds = ("ranking", "cells", "comparisons")
+    kinds = ("ranking", "comparisons")
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."

@@ -12,7 +12,7 @@ from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record
 from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import Board, RankedBoard, Value, boards
+from oodd_eval.results.tables.board import Board, RankedBoard, Value, boards, cost_of
 from oodd_eval.results.tables.layout import Table
 
 
@@ -85,15 +85,22 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     return csv_rows(lines)
 
 
-def cells_csv(ranks: RankedBoard) -> str:
-    """Return one line per cell with its stored metrics and their intervals."""
-    names = _metrics(ranks)
+def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]]) -> str:
+    """Return one line per cell with its stored metrics and their intervals.
+
+    Every cell has a mapping with columns that stand before its own, the same ones for all.
+    """
+    names = list(dict.fromkeys(name for _, r in lines for name in r.metrics))
     return csv_rows([
-        {**_setting(one.entry), "seed": r.seed, "environment": r.environment, "group": r.group,
-         "anomaly": r.condition, "status": r.status, "brief": str(r.brief).lower(),
+        {**about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
+         "limit": "" if r.limit is None else r.limit, "detector": r.detector,
+         "version": r.detector_version, "horizon": r.horizon,
+         "overrides": r.setting.overrides_json, "seed": r.seed, "environment": r.environment,
+         "group": r.group, "anomaly": r.anomaly, "strength": r.strength, "status": r.status,
+         "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
+         "microseconds_per_step": number(cost_of([r]).step), "peak_rss_mb": number(r.peak_rss_mb),
          **_ends({name: r.metrics.get(name) for name in names})}
-        for one in ranks.standings
-        for r in one.records
+        for about, r in lines
     ])  # fmt: skip
 
 
