@@ -123,7 +123,7 @@ def test_nothing_else_is_changed_with_an_entry(repository, add, path, capsys):
     assert repository.verify() == 1
     said = capsys.readouterr()
     assert f"{path}: is changed together with an entry" in said.out
-    assert "and nothing else, but this one changes 1 other file" in said.err
+    assert "and nothing else: take the files above out of it" in said.err
 
 
 def test_changes_without_an_entry_are_not_looked_at(repository, capsys):

@@ -192,10 +192,11 @@ def verify_pull_request(console: Console, results: Path, options: argparse.Names
     for path in others[:MOST_SHOWN]:
         console.print(f"{path}: is changed together with an entry")
     if others:
-        more = f" (and {len(others) - MOST_SHOWN} more)" if len(others) > MOST_SHOWN else ""
+        if len(others) > MOST_SHOWN:
+            console.print(f"and {len(others) - MOST_SHOWN} more files")
         return say(
-            f"a pull request of an entry changes {results}/NAME/ and nothing else, but this one "
-            f"changes {len(others)} other files{more}: take them out of it", 1,
+            f"a pull request of an entry changes {results}/NAME/ and nothing else: take the files "
+            "above out of it", 1,
         )  # fmt: skip
     if refused:
         return say(f"{refused} of {len(entries)} entries are refused", 1)
