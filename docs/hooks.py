@@ -17,6 +17,11 @@ from mkdocs.structure.pages import Page
 
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
+from oodd_eval.data.files import compress
+from oodd_eval.leaderboard import site
+from oodd_eval.leaderboard.build import CELLS, cells
+from oodd_eval.leaderboard.entry import read_entries
+from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.plugins.template import repository
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,14 +29,15 @@ DOCS = "docs/"
 
 ELSEWHERE = (
     "CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
-    "leaderboard/README.md", "leaderboard/site/index.html", "leaderboard/reproduction/*/README.md",
+    "leaderboard/README.md", "leaderboard/reproduction/*/README.md",
     "leaderboard/reproduction/*/figures/*", "leaderboard/reproduction/*/*.csv",
     "leaderboard/reproduction/*/tables/*.csv", "training/README.md",
 )  # fmt: skip
 """Files outside docs/ that are part of the site, under the same paths."""
 
-RESULTS = ("leaderboard/README.md", "leaderboard/site/index.html")
-"""Files that `leaderboard build` writes; absent before the first entry."""
+BOARD = "leaderboard/site"
+RESULTS = ("leaderboard/README.md", f"{BOARD}/index.html")
+"""Pages of the leaderboard; absent before the first entry."""
 
 FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
@@ -48,7 +54,7 @@ def elsewhere() -> list[str]:
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Link to the repository, if it has an address, and leave out results while there are none."""
     config.repo_url = config.repo_url or repository() or None
-    missing = {path for path in RESULTS if not (ROOT / path).exists()}
+    missing = set() if (ROOT / RESULTS[0]).exists() else set(RESULTS)
     config.nav = _without(config.nav or [], missing)
     return config
 
@@ -72,7 +78,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that live elsewhere."""
     for path in elsewhere():
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    for path, content in board().items():
+        files.append(File.generated(config, path, content=content))
     return files
+
+
+def board() -> dict[str, str | bytes]:
+    """Return the files of the leaderboard's site, which are not committed."""
+    if not (ROOT / RESULTS[0]).exists():
+        return {}
+    found, suites = (
+        sections(read_entries(ROOT / "leaderboard" / "results")),
+        suite_sections(ROOT / "leaderboard"),
+    )
+    shown = site.files(found, suites, project=repository())
+    # The page of Markdown that it links to is a page of this site.
+    shown[site.PAGE] = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
+    table = {f"{BOARD}/{Path(CELLS).name}": compress(cells(found, suites).encode())}
+    return {f"{BOARD}/{name}": text for name, text in shown.items()} | table
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
