@@ -69,54 +69,79 @@ class _Moments(NamedTuple):
     means: Array
 
 
+class _Group(NamedTuple):
+    """A row and others: the counts of resamples beyond the difference, and not beyond it.
+
+    `rare` are the places of the pairs that need further resamples, whose names and influences are
+    `others` and `effects`.
+    """
+
+    row: str
+    others: Sequence[str]
+    effects: Mapping[str, Floats]
+    observed: Floats
+    counts: NDArray[np.int64]
+    ends: list[tuple[float, float]]
+    rare: NDArray[np.intp]
+
+
 class PairTests:
     """The bootstrap of pairs of rows with R resamples."""
 
     def __init__(self, rows: Mapping[str, Influences], resamples: int) -> None:
         self._rows, self.resamples = rows, resamples
+        self._seeds: dict[tuple[str, int], tuple[Floats, Floats]] = {}
         first = next(iter(rows.values()), Influences({}, np.zeros(0), ""))
         self._sizes = {name: z.size for name, z in first.shared.items()}
         # No p-value is below the chance that all seeds have the signs that they have.
         self._floor = 2.0 ** -sum(self._sizes.values())
 
-    def test(self, row: str, others: Sequence[str], differences: Floats) -> list[Tested]:
-        """Test one row against others.
+    def test(self, groups: Sequence[tuple[str, Sequence[str], Floats]]) -> list[list[Tested]]:
+        """Test rows against others.
 
         Parameters
         ----------
-        row, others
-            Names of rows.
-        differences
-            Of the row's mean to each other's: shape (others,).
+        groups
+            Of a row's name, the names of others, and the differences of its mean to theirs: shape
+            (others,).
         """
+        found = [self._first(*group) for group in groups]
+        self._count_further([group for group in found if group.rare.size])
+        self._seeds.clear()
+        return [self._tested(group) for group in found]
+
+    def _first(self, row: str, others: Sequence[str], differences: Floats) -> _Group:
+        """Return what the first resamples say of a row and others."""
         effects = self._effects(row, others)
-        whole = np.arange(min(FIRST, self.resamples))
-        shifts = np.empty((len(others), whole.size))
+        total = min(FIRST, self.resamples)
+        shifts = np.empty((len(others), total))
         variances = np.empty_like(shifts)
-        for start in range(0, whole.size, _BLOCK):
-            part = slice(start, min(start + _BLOCK, whole.size))
+        for start in range(0, total, _BLOCK):
+            part = slice(start, min(start + _BLOCK, total))
             found = self._moments(row, others, effects, part, np.dtype(np.float64))
             shifts[:, part] = found.shifts
             variances[:, part] = np.maximum(found.squares - found.means, 0.0)
         observed = self._observed(row, others, effects, differences)
-        reached = np.array([
-            _reached(*three) for three in zip(shifts, variances, observed, strict=True)
-        ]).reshape(-1, 2)  # fmt: skip
-        totals = np.full(reached.shape, whole.size)
-        equal = np.abs(differences) <= NOISE
-        reached[equal] = whole.size
-        rare = np.flatnonzero((reached.min(axis=1) < ENOUGH) & ~equal)
-        if rare.size and whole.size < self.resamples:
-            sides = (observed[rare] < 0).astype(int)
-            names = [others[i] for i in rare.tolist()]
-            more = self._further(row, names, effects, rare, observed[rare])
-            reached[rare, sides] += more
-            totals[rare, sides] = self.resamples
-        p = np.maximum((1 + reached) / (totals + 1), self._floor)
+        beyond = _beyond(shifts, variances, observed[:, None])
+        # On the other side of the observed one, or equal to it.
+        reverse = ~_beyond(shifts, variances, observed[:, None], 1 + _ROUNDING)
+        counts = np.stack([beyond.sum(axis=1), reverse.sum(axis=1)])
+        # A difference of 0, or one whose noise nobody knows.
+        counts[:, (np.abs(differences) <= NOISE) | (observed == 0)] = total
+        few = np.flatnonzero(counts[0] < ENOUGH) if total < self.resamples else np.arange(0)
         sizes = list(self._sizes.values())
+        ends = [bounds(d + own, d, sizes) for d, own in zip(differences, shifts, strict=True)]
+        names = [others[i] for i in few.tolist()]
+        own = {e: z[few] for e, z in effects.items()}
+        return _Group(row, names, own, observed, counts, ends, few)
+
+    def _tested(self, group: _Group) -> list[Tested]:
+        totals = np.full(group.counts.shape, min(FIRST, self.resamples))
+        totals[0, group.rare] = self.resamples
+        p = np.maximum((1 + group.counts) / (totals + 1), self._floor)
         return [
-            Tested(*bounds(d + own, d, sizes), *map(float, both))
-            for d, own, both in zip(differences.tolist(), shifts, p, strict=True)
+            Tested(*ends, *(both if side >= 0 else both[::-1]))
+            for ends, both, side in zip(group.ends, p.T.tolist(), group.observed, strict=True)
         ]
 
     def _effects(self, row: str, others: Sequence[str]) -> dict[str, Floats]:
@@ -132,10 +157,11 @@ class PairTests:
         """Return the studentized differences: shape (others,)."""
         variances = np.zeros(len(others))
         for z in effects.values():
-            variances += _of_mean(z.var(axis=1), z.shape[1])
+            n = z.shape[1]
+            variances += z.var(axis=1) * _of_mean(1.0, n) if n > 1 else math.inf
         for i, other in enumerate(others):
             for own in (self._rows[row].own, self._rows[other].own):
-                variances[i] += _of_mean(own.var(), own.size) if own.size else 0.0
+                variances[i] += _of_mean(float(own.var()), own.size) if own.size else 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.divide(differences, np.sqrt(variances)))
 
@@ -159,82 +185,83 @@ class PairTests:
             found.means[...] += mean
             found.squares[...] += (z * z * _of_mean(1 / n, n)).astype(precision) @ drawn
         shift, variance = self._by_seeds(row, part)
-        for i, other in enumerate(others):
-            other_shift, other_variance = self._by_seeds(other, part)
-            found.shifts[i] += shift - other_shift
-            found.squares[i] += variance + other_variance
+        theirs = [self._by_seeds(other, part) for other in others]
+        found.shifts[...] += shift - np.array([own for own, _ in theirs])
+        found.squares[...] += variance + np.array([own for _, own in theirs])
         return found
 
-    def _by_seeds(self, row: str, part: slice) -> tuple[Floats | float, Floats | float]:
+    def _by_seeds(self, row: str, part: slice) -> tuple[Floats, Floats]:
         """Return shifts by a row's detector seeds, and the variances of its mean over them."""
-        z = self._rows[row].own
-        if not z.size:
-            return 0.0, 0.0
-        drawn = _draws(self._rows[row].key, z.size, self.resamples)[:, part].astype(np.float64)
-        mean = (z / z.size) @ drawn
-        square = (z * z / z.size) @ drawn
-        return mean, _of_mean(1.0, z.size) * np.maximum(square - mean * mean, 0.0)
+        if (row, part.start) not in self._seeds:
+            z = self._rows[row].own
+            found = np.zeros(part.stop - part.start), np.zeros(part.stop - part.start)
+            if z.size:
+                drawn = _draws(self._rows[row].key, z.size, self.resamples)[:, part]
+                found = _mean_and_variance(z, drawn.astype(np.float64))
+            self._seeds[row, part.start] = found
+        return self._seeds[row, part.start]
 
-    def _further(
-        self, row: str, others: Sequence[str], effects: Mapping[str, Floats],
-        chosen: NDArray[np.intp], observed: Floats,
-    ) -> NDArray[np.int64]:  # fmt: skip
-        """Count the resamples after the first that reach the differences: shape (others,).
+    def _count_further(self, groups: Sequence[_Group]) -> None:
+        """Add the resamples after the first that reach the differences to the counts.
 
         What may reach them is sought in single precision, and then computed in double precision.
         """
-        own = {e: z[chosen] for e, z in effects.items()}
-        counts = np.zeros(len(others), dtype=np.int64)
-        # Of equal seeds no resample deviates.
-        finite = np.isfinite(observed)
-        limit = np.where(finite, observed**2, 0.0).astype(np.float32)[:, None]
-        signs = np.where(finite, np.sign(observed), 0.0).astype(np.float32)[:, None]
         single = np.dtype(np.float32)
         for start in range(FIRST, self.resamples, _BLOCK):
             part = slice(start, min(start + _BLOCK, self.resamples))
-            shifts, squares, means = self._moments(row, others, own, part, single)
-            near = shifts * signs > 0
-            shifts *= shifts
-            squares *= np.float32(1 - _SINGLE)
-            squares -= means
-            squares *= limit
-            near &= shifts >= squares
-            pairs, places = np.nonzero(near)
-            for i in np.unique(pairs):
-                exact = self._one(row, others[i], own, i, part, places[pairs == i])
-                counts[i] += _reached(*exact, observed[i])[int(observed[i] < 0)]
-        return counts
+            self._seeds.clear()  # of other resamples
+            for row, others, effects, all_observed, all_counts, _, rare in groups:
+                observed = np.where(np.isfinite(all_observed), all_observed, 0.0)[rare]
+                shifts, squares, means = self._moments(row, others, effects, part, single)
+                signs = np.sign(observed).astype(single)[:, None]
+                near = shifts * signs > 0
+                shifts *= shifts
+                squares *= np.float32(1 - _SINGLE)
+                squares -= means
+                squares *= (observed**2).astype(single)[:, None]
+                near &= shifts >= squares
+                pairs, places = np.nonzero(near)
+                if pairs.size:
+                    exact = self._chosen(row, others, effects, part, pairs, places)
+                    reached = pairs[_beyond(*exact, observed[pairs])]
+                    all_counts[0, rare] += np.bincount(reached, minlength=len(others))
 
-    def _one(
-        self, row: str, other: str, effects: Mapping[str, Floats], i: int, part: slice,
-        places: NDArray[np.intp],
+    def _chosen(
+        self, row: str, others: Sequence[str], effects: Mapping[str, Floats], part: slice,
+        pairs: NDArray[np.intp], places: NDArray[np.intp],
     ) -> tuple[Floats, Floats]:  # fmt: skip
-        """Return one pair's shifts and variances in some resamples of a part."""
-        shifts, variances = np.zeros(places.size), np.zeros(places.size)
+        """Return shifts and variances of pairs at places of a part, as many of both."""
+        shifts, variances = (x[places] for x in self._by_seeds(row, part))
+        theirs = np.array([self._by_seeds(other, part) for other in others])
+        shifts = shifts - theirs[pairs, 0, places]
+        variances = variances + theirs[pairs, 1, places]
         for environment, z in effects.items():
-            n = z.shape[1]
-            drawn = _draws(environment, n, self.resamples)[:, part][:, places].astype(np.float64)
-            mean, square = (z[i] / n) @ drawn, (z[i] ** 2 / n) @ drawn
+            drawn = _draws(environment, z.shape[1], self.resamples)[:, part][:, places]
+            mean, variance = _mean_and_variance(z[pairs], drawn.T.astype(np.float64), "kn,kn->k")
             shifts += mean
-            variances += _of_mean(1.0, n) * np.maximum(square - mean * mean, 0.0)
-        for sign, name in ((1, row), (-1, other)):
-            shift, variance = self._by_seeds(name, part)
-            if isinstance(shift, np.ndarray) and isinstance(variance, np.ndarray):
-                shifts += sign * shift[places]
-                variances += variance[places]
+            variances += variance
         return shifts, variances
 
 
-def _reached(shifts: Floats, variances: Floats, observed: float) -> tuple[int, int]:
-    """Count the resamples whose studentized shift is at least, and at most, the observed one."""
+def _mean_and_variance(z: Floats, drawn: Floats, product: str = "n,nr->r") -> tuple[Floats, Floats]:
+    """Return the mean of z in each resample, and the variance of that mean."""
+    n = z.shape[-1]
+    mean = np.einsum(product, z, drawn) / n
+    square = np.einsum(product, z * z, drawn) / n
+    return mean, np.maximum(square - mean * mean, 0.0) * _of_mean(1.0, n)
+
+
+def _beyond(
+    shifts: Floats, variances: Floats, observed: Floats, factor: float = 1 - _ROUNDING
+) -> NDArray[np.bool_]:
+    """Tell which studentized shifts reach a multiple of an observed one on its own side of 0."""
     with np.errstate(invalid="ignore", divide="ignore"):
         # Where all seeds agree to the last digit, no shift over no spread is no shift.
         studentized = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
-    slack = _ROUNDING * abs(observed) if math.isfinite(observed) else 0.0
-    above = np.count_nonzero(studentized >= observed - slack)
-    return int(above), int(np.count_nonzero(studentized <= observed + slack))
+        beyond = studentized * np.sign(observed) >= np.abs(observed) * factor
+    return np.asarray(beyond)
 
 
-def _of_mean(spread: float | Floats, n: int) -> float | Floats:
+def _of_mean(spread: float, n: int) -> float:
     """Return the variance of a mean of n from their variance (ddof 0); one says nothing of it."""
-    return spread / (n - 1) if n > 1 else spread + math.inf
+    return spread / (n - 1) if n > 1 else math.inf

@@ -122,20 +122,23 @@ def rank(
     engine = PairTests(influences, count)
     means = {name: _mean(rows[name]) for name in names}
 
-    def tests(one: str, others: Sequence[str]) -> list[PairTest]:
-        differences = np.array([means[one] - means[other] for other in others])
-        found = []
-        for other, d, t in zip(
-            others, differences.tolist(), engine.test(one, others, differences), strict=True
-        ):
-            found.append(PairTest(one, other, d, t.low, t.high, t.p, math.nan))
-            found.append(PairTest(other, one, -d, -t.high, -t.low, t.p_reverse, math.nan))
+    def tests(of: Sequence[tuple[str, Sequence[str]]]) -> list[list[PairTest]]:
+        apart = [np.array([means[one] - means[other] for other in others]) for one, others in of]
+        groups = [(*names, own) for names, own in zip(of, apart, strict=True)]
+        found: list[list[PairTest]] = []
+        for (one, others, differences), tested in zip(groups, engine.test(groups), strict=True):
+            found.append([])
+            for other, d, t in zip(others, differences.tolist(), tested, strict=True):
+                found[-1].append(PairTest(one, other, d, t.low, t.high, t.p, math.nan))
+                found[-1].append(PairTest(other, one, -d, -t.high, -t.low, t.p_reverse, math.nan))
         return found
 
-    among = [test for i, one in enumerate(first[:-1]) for test in tests(one, first[i + 1 :])]
+    primaries = [(name, first[i + 1 :]) for i, name in enumerate(first[:-1])]
+    found = tests([*primaries, *((name, first) for name in variants if first)])
+    among = [test for own in found[: len(primaries)] for test in own]
     comparisons = _corrected(among, [])
-    for variant in variants:
-        comparisons += _corrected(tests(variant, first) if first else [], among)
+    for own in found[len(primaries) :]:
+        comparisons += _corrected(own, among)
     better = {(c.first, c.second) for c in comparisons if c.better}
     ranks = {name: 1 + sum((other, name) in better for other in first) for name in names}
     order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
