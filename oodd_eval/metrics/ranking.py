@@ -12,14 +12,14 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import Weights, bootstrap_weights, bounds
+from oodd_eval.metrics.pairs import NOISE, Influences, PairTests
 
 ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
@@ -27,12 +27,10 @@ ALPHA: Final = 0.05
 MIN_RESAMPLES: Final = 10_000  # least number of bootstrap resamples
 RESAMPLES_PER_PAIR: Final = 50  # no p-value is below 1 / (R + 1): R has to grow with the pairs
 OWN_SEEDS: Final = "detector seeds"  # source of noise that a row's own detector seeds are
-NOISE: Final = 1e-12  # larger differences are no rounding: equal rows are equal anywhere
 
 Floats = NDArray[np.float64]
 Place = tuple[str, str]  # environment and anomaly; cells of one environment share their resamples
 Row = Mapping[int, Mapping[Place, Contribution]]  # by detector seed and cell
-Influences = dict[str, Floats]  # by source of noise: shifts of a mean by each seed, centred on 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,37 +113,32 @@ def rank(
     sources of noise are added.
     """
     names = sorted(rows)
-    shape = _shape(rows)
+    _check_shape(rows)
     first = [name for name in names if primary is None or name in primary]
     variants = [name for name in names if name not in first]
-    pairs = list(itertools.combinations(first, 2))
-    most = len(pairs) + (len(first) if variants else 0)
+    most = math.comb(len(first), 2) + (len(first) if variants else 0)
     count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * most)
-    draws = {e: bootstrap_weights(n, key=e, resamples=count) for e, n in shape.items()}
-    for name in names:
-        own = f"{OWN_SEEDS} of {name}"
-        draws[own] = bootstrap_weights(len(rows[name]), key=own, resamples=count)
     influences = {name: _influences(name, rows[name]) for name in names}
-    floor = 2.0 ** -sum(shape.values())
+    engine = PairTests(influences, count)
     means = {name: _mean(rows[name]) for name in names}
 
-    def tests(of: Iterable[tuple[str, str]]) -> list[PairTest]:
-        found = []
-        for a, b in of:
-            effect = _difference(influences[a], influences[b])
-            difference = means[a] - means[b]
-            shifts, exceeding, falling = _test(difference, effect, draws)
-            low, high = bounds(difference + shifts, difference, list(shape.values()))
-            for one, other, sign, k in ((a, b, 1, exceeding), (b, a, -1, falling)):
-                ends = (low, high) if sign > 0 else (-high, -low)
-                p = max((1 + k) / (count + 1), floor)
-                found.append(PairTest(one, other, sign * difference, *ends, p, math.nan))
+    def tests(of: Sequence[tuple[str, Sequence[str]]]) -> list[list[PairTest]]:
+        apart = [np.array([means[one] - means[other] for other in others]) for one, others in of]
+        groups = [(*names, own) for names, own in zip(of, apart, strict=True)]
+        found: list[list[PairTest]] = []
+        for (one, others, differences), tested in zip(groups, engine.test(groups), strict=True):
+            found.append([])
+            for other, d, t in zip(others, differences.tolist(), tested, strict=True):
+                found[-1].append(PairTest(one, other, d, t.low, t.high, t.p, math.nan))
+                found[-1].append(PairTest(other, one, -d, -t.high, -t.low, t.p_reverse, math.nan))
         return found
 
-    among = tests(pairs)
+    primaries = [(name, first[i + 1 :]) for i, name in enumerate(first[:-1])]
+    found = tests([*primaries, *((name, first) for name in variants if first)])
+    among = [test for own in found[: len(primaries)] for test in own]
     comparisons = _corrected(among, [])
-    for variant in variants:
-        comparisons += _corrected(tests((variant, name) for name in first), among)
+    for own in found[len(primaries) :]:
+        comparisons += _corrected(own, among)
     better = {(c.first, c.second) for c in comparisons if c.better}
     ranks = {name: 1 + sum((other, name) in better for other in first) for name in names}
     order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
@@ -217,8 +210,8 @@ def win_rates(values: Mapping[str, Mapping[Place, float]]) -> dict[tuple[str, st
     return rates
 
 
-def _shape(rows: Mapping[str, Row]) -> dict[str, int]:
-    """Return test seeds by environment; refuse rows that cannot be compared."""
+def _check_shape(rows: Mapping[str, Row]) -> None:
+    """Refuse rows that cannot be compared."""
     sizes: dict[str, int] = {}
     expected = {cell for row in rows.values() for cells in row.values() for cell in cells}
     for name, row in rows.items():
@@ -237,7 +230,6 @@ def _shape(rows: Mapping[str, Row]) -> dict[str, int]:
                     )
                 if math.isnan(contribution.value):
                     raise ResultsError(f"{name} has no value in {where}, so it has no rank")
-    return {environment: sizes[environment] for environment in sorted(sizes)}
 
 
 def _mean(row: Row) -> float:
@@ -246,58 +238,26 @@ def _mean(row: Row) -> float:
 
 
 def _influences(name: str, row: Row) -> Influences:
-    """Return what every drawn thing adds to the row's mean, centred, by source of noise.
+    """Return what every drawn thing adds to the row's mean, centred.
 
     A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
     """
     seeds, cells = sorted(row), sorted(row[min(row)])
-    found: Influences = {}
+    shared = {}
     for environment, members in itertools.groupby(cells, key=lambda cell: cell[0]):
         parts = [_influence(row[seed][cell]) for cell in members for seed in seeds]
-        found[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
+        shared[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
+    own = np.zeros(0)
     if len(seeds) > 1:
         means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
-        found[f"{OWN_SEEDS} of {name}"] = means - means.mean()
-    return found
+        own = means - means.mean()
+        own = np.where(np.abs(own) > NOISE, own, 0.0)
+    return Influences(shared, own, f"{OWN_SEEDS} of {name}")
 
 
 def _influence(contribution: Contribution) -> Floats:
     residuals = contribution.numerator - contribution.value * contribution.denominator
     return residuals * len(residuals) / float(contribution.denominator.sum())
-
-
-def _difference(first: Influences, second: Influences) -> Influences:
-    """Return the influences on the difference of two means."""
-    found = {source: first.get(source, 0.0) - second.get(source, 0.0) for source in first | second}
-    # Rounding alone must not look like a difference between seeds.
-    return {source: np.where(np.abs(z) > NOISE, z, 0.0) for source, z in found.items()}
-
-
-def _test(
-    difference: float, effect: Influences, draws: Mapping[str, Weights]
-) -> tuple[Floats, int, int]:
-    """Return shifts d* - d, and in how many resamples the studentized one reaches d's, each way."""
-    variance = sum(_variance(z.var(), z.size) for z in effect.values())
-    resamples = len(next(iter(draws.values())))
-    shifts, variances = np.zeros(resamples), np.zeros(resamples)
-    for source, z in effect.items():
-        mean = np.einsum("rn,n->r", draws[source], z) / z.size
-        square = np.einsum("rn,n->r", draws[source], z * z) / z.size
-        shifts += mean
-        variances += _variance(np.maximum(square - mean * mean, 0.0), z.size)
-    if abs(difference) <= NOISE:
-        return shifts, resamples, resamples
-    with np.errstate(invalid="ignore", divide="ignore"):
-        observed = np.divide(difference, np.sqrt(variance))
-        # Where all seeds agree to the last digit, no shift over no spread is no shift.
-        studentized = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
-    exceeding, falling = studentized >= observed, studentized <= observed
-    return shifts, int(exceeding.sum()), int(falling.sum())
-
-
-def _variance(spread: Any, n: int) -> Any:
-    """Return the variance of a mean of n from their variance (ddof 0); one says nothing of it."""
-    return spread / (n - 1) if n > 1 else spread + math.inf
 
 
 def _letter(index: int) -> str:

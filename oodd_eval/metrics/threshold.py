@@ -109,7 +109,11 @@ class DetectionThreshold:
             )
         drawn_found, drawn_total = (_drawn(environment, terms) for terms in (found, counted))
         empty = drawn_total == 0
-        shares = isotonic(drawn_found, np.where(empty, _NOTHING, drawn_total))
+        totals = np.where(empty, _NOTHING, drawn_total)
+        shares = drawn_found / totals
+        # Most resamples rise by themselves, and stay what they are.
+        falling = empty.any(axis=0) | (shares[1:] < shares[:-1]).any(axis=0)
+        shares[:, falling] = isotonic(drawn_found[:, falling], totals[:, falling])
         logs = crossing(shares, ends)
         if empty[:, 0].all():
             logs[0] = np.nan

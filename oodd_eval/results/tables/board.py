@@ -50,6 +50,8 @@ class Board:
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         self._contributions: dict[tuple[int, str], Contribution] = {}
+        self._means: dict[tuple[object, ...], Value] = {}
+        self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
         for (setting, _, _), own in self._cells.items():
             self._plugins.setdefault(setting, own[0].plugin)
@@ -81,10 +83,18 @@ class Board:
         """Return an entry's mean of a metric over cells, seeds included.
 
         The interval resamples test trajectories, the same ones for all cells of an environment,
-        and detector seeds where there are several.
+        and detector seeds where there are several. A mean is computed once: tables share many.
         """
-        places = itertools.product(environments, anomalies)
-        wanted = [p for p in places if any((x, *p) in self._cells for x in self.entries)]
+        key = entry, tuple(environments), tuple(anomalies), metric, intervals
+        if key not in self._means:
+            self._means[key] = self._computed(*key)
+        return self._means[key]
+
+    def _computed(
+        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str,
+        intervals: bool,
+    ) -> Value:  # fmt: skip
+        wanted = [p for p in itertools.product(environments, anomalies) if p in self._places]
         cells = [self._cells[entry, *p] for p in wanted if (entry, *p) in self._cells]
         records = [record for cell in cells for record in cell]
         partial = 0 < len(cells) < len(wanted)
