@@ -23,6 +23,8 @@ from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
 from oodd_eval.results.directory import ResultsDirectory
 
+pytestmark = pytest.mark.slow
+
 THEIRS = '''
 """Forecasters and detectors of a user."""
 import random

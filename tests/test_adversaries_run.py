@@ -16,6 +16,8 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
+pytestmark = pytest.mark.slow
+
 ENVIRONMENT = "hopper"
 INVALID = {
     "sly-neighbour", "sly-look-ahead", "sly-look-ahead-far", "sly-look-ahead-farther",

@@ -6,6 +6,8 @@ import torch
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.testing import run_checks
 
+pytestmark = pytest.mark.slow
+
 PLUGINS = discover()
 
 ADAPTERS = [

@@ -14,6 +14,8 @@ from PIL import Image
 from oodd_eval import load_split
 from oodd_eval.live import Watchdog
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("gymnasium", reason="needs the extra sim")
 EXAMPLE = Path(__file__).parents[1] / "examples" / "live_alarm.py"
 

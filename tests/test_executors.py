@@ -22,6 +22,8 @@ from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
+pytestmark = pytest.mark.slow
+
 remote = pytest.importorskip("oodd_eval.scoring.executors.dask", reason="needs the extra dask")
 
 VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}

@@ -20,6 +20,8 @@ from oodd_eval.data.simulate.record import Setup, record_anomalous, record_seed
 from oodd_eval.data.simulate.values import VALUES, bound_of, spread_of, unit_of
 from oodd_eval.data.split import load_split
 
+pytestmark = pytest.mark.slow
+
 CHEAP = ("cartpole", "hopper")
 PLAIN = [kind for kind in ANOMALIES if not kind.endswith("-intermittent")]
 SENSOR = [kind for kind in PLAIN if ANOMALIES[kind].group == "sensor"]

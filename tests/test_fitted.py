@@ -14,6 +14,8 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
+pytestmark = pytest.mark.slow
+
 PLUGIN = """
 import json, os
 from pathlib import Path

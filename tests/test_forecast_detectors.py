@@ -31,6 +31,8 @@ from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
 from oodd_eval.plugins.forecasting import FeatureScale
 
+pytestmark = pytest.mark.slow
+
 FACTORIES = {"riqn": riqn, "riqn-ms": riqn_ms, "riqn-r": riqn_r, "n-riqn": n_riqn, "npn": npn}
 SMALL = {"members": 2, "updates": 15, "batch": 8}
 

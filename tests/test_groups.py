@@ -22,6 +22,8 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
+pytestmark = pytest.mark.slow
+
 PLUGIN = '''
 import hashlib, os, signal, subprocess, sys, threading, time
 from concurrent.futures import ThreadPoolExecutor

@@ -18,7 +18,10 @@ from helpers_plugins import install
 from oodd_eval.plugins.discovery import LONGEST_REASON, discover
 from oodd_eval.results.record import STATUSES
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and states of Linux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="signals and states of Linux"),
+]
 
 HEADER = """
 import builtins, ctypes, os, shutil, signal, subprocess, sys, threading, time

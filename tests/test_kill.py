@@ -12,6 +12,8 @@ from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.fits import FitStore
 
+pytestmark = pytest.mark.slow
+
 POINTS = (
     "fit:1", "score:5", "save:1", "move:1", "moved:1", "load:1", "cell:1", "move:4",
     "finished:1",

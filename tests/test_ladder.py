@@ -21,6 +21,8 @@ from oodd_eval.data.simulate.values import bound_of, unit_of
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SplitError, UnknownNameError
 
+pytestmark = pytest.mark.slow
+
 FEW = {"environments": ["cartpole"]}
 STRENGTHS = {
     "cartpole": {

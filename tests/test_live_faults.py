@@ -11,6 +11,8 @@ from oodd_eval.errors import UsageError
 from oodd_eval.live import Watchdog
 from oodd_eval.live.stream import Stream, StreamLimits
 
+pytestmark = pytest.mark.slow
+
 TRAIN = [walk(seed, contact=True) for seed in range(20)]
 
 

@@ -13,6 +13,8 @@ from oodd_eval.live import Reading, Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
 
+pytestmark = pytest.mark.slow
+
 TRAIN = [walk(seed) for seed in range(30)]
 WIDE = [*TRAIN, Trajectory(np.linspace(-100, 100, 120)[:, None].repeat(3, 1), np.zeros((119, 1)))]
 CALIBRATION = [walk(seed) for seed in range(100, 140)]

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_packaging import wheel  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.packaging
 
@@ -35,7 +34,7 @@ def records(directory):
 
 
 @pytest.mark.skipif(interpreter() is None, reason="no newer Python on this machine")
-def test_a_newer_python_gives_the_same_results(wheel, tmp_path):  # noqa: F811
+def test_a_newer_python_gives_the_same_results(wheel, tmp_path):
     environment = tmp_path / "venv"
     subprocess.run([interpreter(), "-m", "venv", environment], check=True)
     python = environment / "bin" / "python"

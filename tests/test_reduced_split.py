@@ -10,6 +10,8 @@ from oodd_eval.data.facts import SPLITS, SplitDefinition
 from oodd_eval.data.simulate.build import build_split
 from oodd_eval.data.split import load_split
 
+pytestmark = pytest.mark.slow
+
 WHOLE = SplitDefinition("whole", 4, 3, 3, 80, 951)
 PART = replace(WHOLE, name="part", train=4, calibration=2, test=1)
 ENVIRONMENTS = ["acrobot", "cartpole"]

@@ -22,6 +22,8 @@ from oodd_eval.paper.experiments import Grid
 from oodd_eval.paper.pictures import Dots, Panel, Picture, draw, drawing_key
 from oodd_eval.results.directory import ResultsDirectory
 
+pytestmark = pytest.mark.slow
+
 ONLY = "delays"
 """Five units in each environment, riqn at three horizons."""
 

@@ -18,6 +18,8 @@ from oodd_eval.leaderboard.verify import verify_entry
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
 
+pytestmark = pytest.mark.slow
+
 NAMES = ["acrobot", "cartpole", "hopper"]
 
 

@@ -20,6 +20,8 @@ from oodd_eval.data.simulate.record import TwinTooShortError, record_nominal, re
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError, UnknownNameError
 
+pytestmark = pytest.mark.slow
+
 CAP = 120
 
 

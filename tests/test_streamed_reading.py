@@ -27,6 +27,8 @@ from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.isolation.worker import TrajectoryFile
 from oodd_eval.results.directory import ResultsDirectory
 
+pytestmark = pytest.mark.slow
+
 MEGABYTE = 10**6
 ALLOWED = 8 * MEGABYTE
 """What reading may cost beside the program itself, with smaller blocks than usual."""

@@ -15,6 +15,8 @@ from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.submit import with_curves
 from oodd_eval.results.directory import ResultsDirectory
 
+pytestmark = pytest.mark.slow
+
 # Its results are made once, not once a worker.
 
 

@@ -6,6 +6,8 @@ from oodd_training.replay import Replay
 
 from oodd_eval.data.simulate.policies import IQNPolicy
 
+pytestmark = pytest.mark.slow
+
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 iqn = pytest.importorskip("oodd_training.iqn")

@@ -8,6 +8,8 @@ import pytest
 
 from oodd_eval.data.simulate.policies import TD3Policy
 
+pytestmark = pytest.mark.slow
+
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 td3 = pytest.importorskip("oodd_training.td3")

@@ -5,6 +5,8 @@ import re
 import pytest
 from helpers_docs import ROOT, Session, commands
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("gymnasium", reason="needs the extra sim")
 PAGE = (ROOT / "docs" / "how-to" / "own-environment.md").read_text()
 

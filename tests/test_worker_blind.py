@@ -25,7 +25,10 @@ from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.scoring.unit import groups
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="looks into /proc"),
+]
 
 SEED = 424242
 # Names that no docstring in the worker has, nor the package's metadata, in which the README is, nor

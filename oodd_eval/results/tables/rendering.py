@@ -10,7 +10,7 @@ from tabulate import tabulate
 from oodd_eval.data.facts import GROUPS
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import NAN, Metric, Record
+from oodd_eval.results.record import Metric, Record
 from oodd_eval.results.tables import ladder, layout
 from oodd_eval.results.tables.board import Board, RankedBoard, Value, boards, cost_of
 from oodd_eval.results.tables.layout import Table
@@ -141,8 +141,8 @@ def _ends(values: Mapping[str, Value | Metric | None]) -> dict[str, str]:
     """Return the texts of values and of the ends of their intervals, by column."""
     found: dict[str, str] = {}
     for name, v in values.items():
-        ends = (v.value, v.low, v.high) if v else (NAN, NAN, NAN)
-        found |= dict(zip((name, f"{name}_low", f"{name}_high"), map(number, ends), strict=True))
+        texts = [number(v.value), number(v.low), number(v.high)] if v else ["", "", ""]
+        found[name], found[f"{name}_low"], found[f"{name}_high"] = texts
     return found
 
 
