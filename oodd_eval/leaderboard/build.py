@@ -3,7 +3,7 @@
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -37,19 +37,25 @@ WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``com
 
 
 def build(
-    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = ()
-) -> list[str]:
+    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = (), *,
+    on_part: Callable[[str], object] = str,
+) -> list[str]:  # fmt: skip
     """Write page, tables and site, the same bytes for the same entries; return their names.
 
-    The page is the first. ResultsError: the entries contradict one another.
+    The page is the first. `on_part` is called with the name of each part before it is made.
+    ResultsError: the entries contradict one another.
     """
+    on_part("ranking")
     found = sections(entries)
+    on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files = {PAGE: page(found, suites, site=address)}
+    on_part("tables")
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("cells")] = rendering.cells_csv(section.ranks)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
+    on_part("site")
     files[address] = site.page(found, suites)
     for name, text in files.items():
         write_text(output / name, text)
