@@ -2,6 +2,8 @@
 
 import argparse
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -91,26 +93,39 @@ def define(parser: Parser) -> None:
 
 def build(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
-    entries = read_entries(options.results)
-    if not entries:
-        return say(f"no entries in {options.results}", 5)
     output = Path(options.output)
-    suites = suite_sections(output)
+    with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
+        show("entries")
+        entries = read_entries(options.results)
+        if not entries:
+            return say(f"no entries in {options.results}", 5)
+        show("suites")
+        suites = suite_sections(output)
+        target = Path(fresh) if options.check else output
+        written = build_board(entries, target, suites, on_part=show)
+        lines = differences(target, output) if options.check else []
     if not options.check:
-        written = build_board(entries, output, suites)
         if options.verbosity >= 0:
             print("\n".join(str(output / name) for name in written))
         for name in stale(output, written):
             say(f"{output / name} is {STALE}: delete it", 0)
         return 0
-    with tempfile.TemporaryDirectory() as fresh:
-        build_board(entries, Path(fresh), suites)
-        lines = differences(Path(fresh), output)
     print("\n".join(lines) if lines else f"{output} is up to date")
     if not lines:
         return 0
     advice = "run leaderboard build, delete what is no part of it, and commit"
     return say(f"{output} is not what its entries say: {advice}", 1)
+
+
+@contextmanager
+def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
+    """Show the part of a build that is being made; nothing where standard error is no terminal."""
+    console = Console(stderr=True, quiet=quiet)
+    if quiet or not console.is_terminal:
+        yield str
+        return
+    with console.status("leaderboard") as status:
+        yield lambda part: status.update(f"leaderboard: {part}")
 
 
 def submit(options: argparse.Namespace) -> int:

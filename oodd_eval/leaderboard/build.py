@@ -3,7 +3,7 @@
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -41,25 +41,33 @@ WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``com
 
 
 def build(
-    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = ()
-) -> list[str]:
+    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = (), *,
+    on_part: Callable[[str], object] = str,
+) -> list[str]:  # fmt: skip
     """Write page, tables, site and the published file, the same bytes for the same entries.
 
-    Returns their names, the page first. ResultsError: the entries contradict one another.
+    Returns their names, the page first. `on_part` is called with the name of each part before it
+    is made. ResultsError: the entries contradict one another.
     """
+    on_part("ranking")
     found = sections(entries)
+    on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files = {PAGE: page(found, suites, site=address)}
+    on_part("tables")
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
+    on_part("site")
     shown = site.files(found, suites, project=repository())
     files |= {f"{SITE}/{name}": text for name, text in shown.items()}
     for name, text in files.items():
         write_text(output / name, text)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
+    on_part("table of all cells")
     write_bytes(output / CELLS, compress(cells(found, suites).encode()))
+    on_part("published board")
     write_bytes(output / PUBLISHED, content(found, suites))
     return [*files, CELLS, PUBLISHED]
 

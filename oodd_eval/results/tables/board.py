@@ -50,6 +50,7 @@ class Board:
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         self._contributions: dict[tuple[int, str], Contribution] = {}
+        self._values: dict[tuple[int, str], float] = {}
         self._means: dict[tuple[object, ...], Value] = {}
         self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
@@ -119,12 +120,17 @@ class Board:
 
     def _mean(self, records: Iterable[Record], metric: str) -> float:
         """Return the mean over the cells where a metric is defined."""
-        return mean_over_cells(
+        return mean_over_cells((r.seed, self._value(r, metric)) for r in records)
+
+    def _value(self, record: Record, metric: str) -> float:
+        """Return a record's value, made once."""
+        key = id(record), metric
+        if key not in self._values:
             # Thresholds are no ratios of sums.
-            (r.seed, self._contribution(r, metric).value if metric in r.per_trajectory
-             else r.value(metric))
-            for r in records
-        )  # fmt: skip
+            several = metric in record.per_trajectory
+            value = self._contribution(record, metric).value if several else record.value(metric)
+            self._values[key] = value
+        return self._values[key]
 
     def _contribution(self, record: Record, metric: str) -> Contribution:
         """Return a record's contribution, made once."""
