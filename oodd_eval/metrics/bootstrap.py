@@ -288,7 +288,7 @@ def _mean_of_cells(cells: Sequence[DrawnCell]) -> Samples:
     for cell in cells:
         parts.setdefault((cell.environment, len(cell.contribution.numerator)), []).append(cell)
     sums = [
-        np.einsum("rn,n->r", own[0].weights, sum(c.contribution.numerator for c in own) / n)
+        np.einsum("rn,n->r", own[0].weights, sum(c.contribution.numerator for c in own)) / n
         for (_, n), own in parts.items()
     ]
     return np.asarray(np.sum(sums, axis=0) / len(cells))
