@@ -94,12 +94,6 @@ class DrawnCell:
         """The metric in every resample."""
         return resampled(self.contribution, self.weights)
 
-    @functools.cached_property
-    def whole(self) -> bool:
-        """True for a mean over all trajectories: sums of such cells can be resampled as one."""
-        own = self.contribution
-        return not own.median and bool((own.denominator == 1).all())
-
 
 def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCell:
     """Resample a cell of a detector seed, with the weights that its environment shares."""
@@ -273,22 +267,7 @@ def sample_cells(cells: Sequence[DrawnCell]) -> Samples:
     seeds where there are several. Differences, sums and `mean_samples` of what this returns for
     several detectors or anomalies are paired.
     """
-    by_seed: dict[int, list[DrawnCell]] = {}
+    by_seed: dict[int, list[Samples]] = {}
     for cell in cells:
-        by_seed.setdefault(cell.seed, []).append(cell)
-    return mean_over_seeds([_mean_of_cells(by_seed[seed]) for seed in sorted(by_seed)])
-
-
-def _mean_of_cells(cells: Sequence[DrawnCell]) -> Samples:
-    """Return the mean over cells of one seed in every resample."""
-    if not all(cell.whole for cell in cells):
-        return mean_samples([cell.samples for cell in cells])
-    # Cells of an environment share their weights: they are added before they are resampled.
-    parts: dict[tuple[str, int], list[DrawnCell]] = {}
-    for cell in cells:
-        parts.setdefault((cell.environment, len(cell.contribution.numerator)), []).append(cell)
-    sums = [
-        np.einsum("rn,n->r", own[0].weights, sum(c.contribution.numerator for c in own) / n)
-        for (_, n), own in parts.items()
-    ]
-    return np.asarray(np.sum(sums, axis=0) / len(cells))
+        by_seed.setdefault(cell.seed, []).append(cell.samples)
+    return mean_over_seeds([mean_samples(by_seed[seed]) for seed in sorted(by_seed)])
