@@ -105,9 +105,15 @@ class Browser:
         body = {"actions": [{"type": "key", "id": "keyboard", "actions": actions}]}
         self._call("POST", f"{self._session}/actions", body)
 
-    def resize(self, width, height):
-        body = {"width": width, "height": height}
-        self._call("POST", f"{self._session}/window/rect", body)
+    @contextlib.contextmanager
+    def narrow(self, width, height=900):
+        """Let pages have a width, also one below the least of a window, as telephones have."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self._command("Emulation.setDeviceMetricsOverride", size)
+        try:
+            yield
+        finally:
+            self._command("Emulation.clearDeviceMetricsOverride")
 
     def console(self):
         """Messages of the console since the last call."""
@@ -129,8 +135,8 @@ class Browser:
         (seconds,) = [metric["value"] for metric in found if metric["name"] == "ProcessTime"]
         return seconds
 
-    def _command(self, name):
-        body = {"cmd": name, "params": {}}
+    def _command(self, name, parameters=None):
+        body = {"cmd": name, "params": parameters or {}}
         return self._call("POST", f"{self._session}/goog/cdp/execute", body)
 
     def screenshot(self, path):

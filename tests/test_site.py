@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 
 import helpers_site
+import numpy as np
 import pytest
 
 from oodd_eval import __version__
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
+from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
@@ -25,6 +27,7 @@ from oodd_eval.leaderboard.site.data import (
     selections,
     site_data,
 )
+from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.results.curve_file import read_curves
 
@@ -482,6 +485,32 @@ def test_numbers_for_a_logarithmic_scale_stay_as_they_are():
 def test_an_example_without_defined_scores_is_kept():
     found = gridded({"scores": [None], "twin": [], "cusum": [], "twin_cusum": []})
     assert (found["scores"], found["score_step"]) == ([None], 0.002)
+
+
+# -- sensors --------------------------------------------------------------------------------------
+
+
+def test_sensors_of_shown_episodes_are_the_splits():
+    split = load_split("mini")
+    assert shipped_split(split.digest).path == split.path
+    found = shown_episodes(split, "hopper", [("gravity", 1), ("gravity", 1)])
+    data = split.environment("hopper")
+    own, twin = data.anomalous("gravity")[1].observations, data.twins[1].observations
+    names = [sensor.name for sensor in data.sensors]
+    (sensors,) = found.values()
+    assert list(found) == ["gravity/1"]
+    assert len({sensor["name"] for sensor in sensors}) == 3
+    for sensor in sensors:
+        d = next(i for i, name in enumerate(names) if sensor["name"].startswith(name))
+        for values, whole in ((own, sensor["own"]), (twin, sensor["twin"])):
+            shown = np.array(whole) * sensor["step"]
+            assert np.abs(shown - values[:, d]).max() <= sensor["step"] / 2 + 1e-9
+        assert np.ptp(np.concatenate([own, twin])[:, d]) / sensor["step"] > 200
+
+
+def test_no_sensors_of_a_split_that_is_not_in_the_package(page):
+    assert shipped_split("ab" * 32) is None
+    assert embedded(page)["boards"][0]["episodes"] == {}
 
 
 # -- size -----------------------------------------------------------------------------------------
