@@ -122,6 +122,7 @@ WITH_PYTHON = [path for path in PAGES if python_blocks(path.read_text())]
 
 FRAGMENTS = {
     "README.md": "test_live_wrappers runs it and reads what it prints",
+    "docs/board-data.md": "test_the_pages_program_reads_the_table builds a board for it",
     "docs/tutorial.md": "a piece of the test file that `new` writes, which test_new runs",
     "detectors/README.md": "the plug-in that the commands of the page run",
 }

@@ -628,6 +628,16 @@ def test_every_column_of_the_table_of_cells_is_described():
     assert len(own) < len(columns)
 
 
+def test_the_pages_program_reads_the_table(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pandas")
+    page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    built(tmp_path, entries(), "leaderboard")
+    monkeypatch.chdir(tmp_path)
+    exec(program, {})  # noqa: S102  the document's own
+    assert re.search(r"^riqn +0\.\d+$", capsys.readouterr().out, re.MULTILINE)
+
+
 def test_csv_numbers_have_six_digits_and_no_rounding_noise():
     assert [rendering.number(v) for v in (1 / 3, 123456.7, -1e-17, float("nan"))] == [
         "0.333333", "123457", "0", ""

@@ -6,6 +6,8 @@ const DEFAULTS = {
 };
 const state = { ...DEFAULTS };
 const unfolded = new Set();
+const FIRST = 100; // detectors that a table shows before it is asked for all
+let whole = false;
 
 /** The address of the table as it is: what differs from a first visit. */
 function tableAddress() {
@@ -45,7 +47,7 @@ function rowsOf(board) {
 function folded(rows) {
   const byDetector = Map.groupBy ? Map.groupBy(rows, (row) => row.detector) : groupedBy(rows, (row) => row.detector);
   const first = new Map([...byDetector].map(([detector, own]) => [own.find((row) => row.primary) ?? own[0], detector]));
-  return rows.filter((row) => first.has(row)).flatMap((row) => {
+  return rows.filter((row) => first.has(row)).slice(0, whole ? Infinity : FIRST).flatMap((row) => {
     const others = byDetector.get(row.detector).filter((other) => other !== row);
     const open = unfolded.has(row.detector);
     return [{ row, others: others.length, open }, ...(open ? others.map((other) => ({ row: other, variant: true })) : [])];
@@ -118,7 +120,7 @@ async function drawTable() {
   const rows = sorted(board, rowsOf(board), columns);
   const lines = folded(rows);
   const { sort, ascending, ...shown } = state;
-  const key = JSON.stringify([shown, [...unfolded]]);
+  const key = JSON.stringify([shown, [...unfolded], whole || lines.map(({ row }) => row.id)]);
   if (body?.key !== key) body = { key, lines: linesOf(board, rows, lines, columns) };
   const focused = document.activeElement?.dataset?.key;
   const table = element("table", { id: "ranking", class: "board" },
@@ -130,7 +132,11 @@ async function drawTable() {
     ])),
     element("tbody", {}, lines.map(({ row }) => body.lines.get(row))),
   );
+  const detectors = new Set(rows.map((row) => row.detector)).size;
   place.replaceChildren(columns.length ? table : element("p", { class: "note" }, LISTS[state.view].empty));
+  if (detectors > FIRST && !whole) {
+    place.append(element("button", { type: "button", class: "action", id: "all", onclick: () => { whole = true; drawTable(); } }, `Show all ${detectors} detectors`));
+  }
   if (focused) place.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   document.getElementById("notes").replaceChildren(...notesOf(board, rows));
   history.replaceState(null, "", tableAddress());
