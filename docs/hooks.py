@@ -15,14 +15,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from oodd_eval._version import repository
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
-from oodd_eval.data.files import compress
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import CELLS, cells
+from oodd_eval.leaderboard.build import site_files
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections, suite_sections
-from oodd_eval.plugins.template import repository
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
@@ -87,15 +86,11 @@ def board() -> dict[str, str | bytes]:
     """Return the files of the leaderboard's site, which are not committed."""
     if not (ROOT / RESULTS[0]).exists():
         return {}
-    found, suites = (
-        sections(read_entries(ROOT / "leaderboard" / "results")),
-        suite_sections(ROOT / "leaderboard"),
-    )
-    shown = site.files(found, suites, project=repository())
+    entries = read_entries(ROOT / "leaderboard" / "results")
+    shown = site_files(sections(entries), suite_sections(ROOT / "leaderboard"))
     # The page of Markdown that it links to is a page of this site.
-    shown[site.PAGE] = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
-    table = {f"{BOARD}/{Path(CELLS).name}": compress(cells(found, suites).encode())}
-    return {f"{BOARD}/{name}": text for name, text in shown.items()} | table
+    page = str(shown[site.PAGE]).replace('href="../README.md"', 'href="../index.html"')
+    return {f"{BOARD}/{name}": content for name, content in (shown | {site.PAGE: page}).items()}
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -1,6 +1,7 @@
 """What `oodd-eval new` writes, and which names it refuses."""
 
 import email.message
+import importlib.metadata
 import re
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import yaml
 from helpers_plugins import install
 
+from oodd_eval._version import repository
 from oodd_eval.cli.main import main
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.plugins import template
@@ -196,11 +198,11 @@ def test_the_project_links_to_an_address_only_where_there_is_one(address):
 
 def test_the_address_is_what_the_distribution_says(monkeypatch):
     told = email.message.Message()
-    monkeypatch.setattr(template, "metadata", lambda name: told)
-    assert template.repository() == ""
+    monkeypatch.setattr(importlib.metadata, "metadata", lambda name: told)
+    assert repository() == ""
     told["Project-URL"] = "Documentation, https://example.org/docs"
     told["Project-URL"] = f"Repository, {ADDRESS}"
-    assert template.repository() == ADDRESS
+    assert repository() == ADDRESS
 
 
 def test_next_commands_are_printed(tmp_path, capsys, monkeypatch):

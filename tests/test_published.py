@@ -16,7 +16,7 @@ from oodd_eval.leaderboard import published
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry
 from oodd_eval.leaderboard.grants import Grant
 from oodd_eval.leaderboard.placing import neighbours, place, rankings
-from oodd_eval.leaderboard.published import board_of, content, read_published
+from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.results.identity import Setting
 
@@ -78,7 +78,7 @@ def board():
 @pytest.fixture(scope="module")
 def file(board, tmp_path_factory):
     file = tmp_path_factory.mktemp("published") / published.PUBLISHED
-    file.write_bytes(content([board]))
+    file.write_bytes(published_bytes([board]))
     return file
 
 
@@ -125,7 +125,7 @@ def test_the_file_has_the_terms_of_the_rankings_and_no_others(file):
 
 
 def test_the_same_entries_give_the_same_bytes(file):
-    assert content(sections(reversed(entries()))) == file.read_bytes()
+    assert published_bytes(sections(reversed(entries()))) == file.read_bytes()
 
 
 def test_an_installation_without_a_board_says_so(monkeypatch, tmp_path):

@@ -82,7 +82,10 @@ def graded(tmp_path_factory):
 
 
 def test_page_is_the_golden_file(page):
+    """All but scripts and styles, which have files of their own."""
     text = page.replace(f"Made by oodd-eval {__version__}.", "Made by oodd-eval 0.0.0.")
+    text = re.sub("(<script>|<style>).*?(?=</)", r"\1", text, flags=re.DOTALL)
+    text = re.sub("sha256-[^']*", "sha256-", text)
     if "OODD_EVAL_WRITE_GOLDEN" in os.environ:
         GOLDEN.write_text(text, encoding="utf-8")
     assert text == GOLDEN.read_text(encoding="utf-8")

@@ -17,6 +17,7 @@ from oodd_eval.leaderboard.published import PublishedBoard, board_of, read_publi
 from oodd_eval.names import check_known, select
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import ladder, layout, rendering
 from oodd_eval.results.tables.board import RankedBoard, boards, grouped
@@ -63,7 +64,7 @@ def show(options: argparse.Namespace) -> int:
         return 0
     for name, suite in published.suites.items():
         output.heading(f"Suite {name}, digest {suite.digest[:12]}")
-        output.table(ladder.tables(suite)[0])
+        output.table(ladder.overview(suite, thresholds(suite.records)))
     return 0
 
 

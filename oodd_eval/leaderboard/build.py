@@ -8,12 +8,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
+from oodd_eval._version import repository
 from oodd_eval.data.facts import GROUPS, SPLITS
 from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.published import PUBLISHED, content
+from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
 from oodd_eval.leaderboard.sections import (
     SUITES,
     TABLES,
@@ -21,7 +22,6 @@ from oodd_eval.leaderboard.sections import (
     SuiteSection,
     sections,
 )
-from oodd_eval.plugins.template import repository
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board, primary_settings
@@ -53,23 +53,32 @@ def build(
     found = sections(entries)
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
-    files = {PAGE: page(found, suites, site=address)}
+    files: dict[str, str | bytes] = {PAGE: page(found, suites, site=address)}
     on_part("tables")
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
     on_part("site")
-    shown = site.files(found, suites, project=repository())
-    files |= {f"{SITE}/{name}": text for name, text in shown.items()}
-    for name, text in files.items():
-        write_text(output / name, text)
+    shown = site_files(found, suites)
+    on_part("published board")
+    files |= {f"{SITE}/{name}": content for name, content in shown.items()}
+    files[PUBLISHED] = published_bytes(found, suites)
+    for name, content in files.items():
+        if isinstance(content, bytes):
+            write_bytes(output / name, content)
+        else:
+            write_text(output / name, content)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
-    on_part("table of all cells")
-    write_bytes(output / CELLS, compress(cells(found, suites).encode()))
-    on_part("published board")
-    write_bytes(output / PUBLISHED, content(found, suites))
-    return [*files, CELLS, PUBLISHED]
+    return list(files)
+
+
+def site_files(
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
+) -> dict[str, str | bytes]:
+    """Return the files of the site by name: page, data files, and the table of all cells."""
+    shown = site.files(sections, suites, project=repository())
+    return {**shown, Path(CELLS).name: compress(cells(sections, suites).encode())}
 
 
 def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]) -> str:

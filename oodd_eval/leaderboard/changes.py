@@ -1,4 +1,4 @@
-"""What a pull request changes, as git tells it: entries, and whatever lies beside them."""
+"""Ask git what a pull request changes: which entries, and which other files."""
 
 import os
 import subprocess

@@ -23,6 +23,7 @@ from oodd_eval.results.tables.board import (
     RankedBoard,
     Standing,
     grouped,
+    has_few_seeds,
     primary_settings,
     ranked,
 )
@@ -76,7 +77,7 @@ def place(
     chosen = {row.detector: row for row in primary_settings(free)}
     chosen |= {row.detector: row for row in new if str(row) in primary and row.detector in chosen}
     # With too few seeds a primary row has no rank. A variant has the one that it would have.
-    first = first | {row for row in chosen.values() if not _few_seeds(new[row])}
+    first = first | {row for row in chosen.values() if not has_few_seeds(new[row])}
     used = [r for own in (theirs | new).values() for r in own if r.place in cells]
     found = {row: _lacking(own, expected) for row, own in new.items()}
     return Placement(
@@ -96,10 +97,6 @@ def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:
     return all(known.get((r.place, r.seed)) == (r.status, r.per_trajectory) for r in own)
 
 
-def _few_seeds(records: Sequence[Record]) -> bool:
-    return len({r.seed for r in records}) < SEEDS and not all(r.deterministic for r in records)
-
-
 def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
     """Return what a row has to have besides for a rank on the board; empty if nothing."""
     found = grouped(records, lambda r: r.seed)
@@ -115,7 +112,7 @@ def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
             count = sum(map(len, missing.values()))
             of = f" with seed {seed}" if len(found) > 1 else ""
             parts.append(f"{count} of {len(expected)} cells{of} ({', '.join(named)})")
-    if _few_seeds(records):
+    if has_few_seeds(records):
         parts.append(f"{SEEDS - len(found)} of {SEEDS} detector seeds")
     return " and ".join(parts)
 

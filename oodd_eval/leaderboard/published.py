@@ -61,7 +61,9 @@ class Published(NamedTuple):
     suites: dict[str, Board]
 
 
-def content(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> bytes:
+def published_bytes(
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
+) -> bytes:
     """Return the bytes of the file: the same ones for the same entries and suites."""
     lines = [
         slim(record, RANKED_BY, entry=section.sources[one.entry].meta.id,

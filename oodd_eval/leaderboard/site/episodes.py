@@ -1,7 +1,7 @@
-"""What sensors read in the episodes that the site shows, where the package has their split.
+"""Read the sensors of the episodes that the site shows, from splits that come with the package.
 
-Entries hold scores, not observations. Of other splits nothing is shown, so that the files of a site
-do not depend on what is on a machine.
+Entries hold scores, not observations. The site shows no sensors of other splits, so that its files
+do not depend on which splits a machine has.
 """
 
 from collections.abc import Iterable

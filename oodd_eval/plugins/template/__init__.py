@@ -6,11 +6,11 @@ this package. ``@NAME@`` and the like stand for the names of the project, in pat
 
 import re
 from dataclasses import dataclass
-from importlib.metadata import metadata
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
+from oodd_eval._version import repository
 from oodd_eval.errors import OutputError, UsageError
 
 FILES: Final = {
@@ -40,14 +40,6 @@ _ADVICE: Final = """
 Until a package index has oodd-eval, put its wheel into `wheels/`, from where the first command and
 the CI workflow install it. Where oodd-eval is installed already, leave the first command out.
 """
-
-
-def repository() -> str:
-    """Return the address of oodd-eval's repository, empty while ``pyproject.toml`` has none."""
-    urls = metadata("oodd-eval").get_all("Project-URL") or []
-    return {name: url for name, _, url in (str(u).partition(", ") for u in urls)}.get(
-        "Repository", ""
-    )
 
 
 @dataclass(frozen=True, slots=True)

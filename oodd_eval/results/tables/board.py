@@ -233,7 +233,7 @@ def primary_settings(
     by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
-        cells, few = {r.place for r in by_row[row]}, _few_seeds(by_row[row])
+        cells, few = {r.place for r in by_row[row]}, has_few_seeds(by_row[row])
         return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
 
     found: dict[str, Setting] = {}
@@ -339,12 +339,12 @@ def _state(records: Sequence[Record], cells: int, metric: str, primary: bool) ->
     defined = sum(not math.isnan(c.value) for c in stored)
     if undefined := sum(r.ok for r in records) - defined:
         reasons.append(f"undefined in {undefined} of {expected} cells")
-    if primary and _few_seeds(records):
+    if primary and has_few_seeds(records):
         reasons.append(f"{seeds} of {SEEDS} detector seeds")
     return ", ".join(reasons)
 
 
-def _few_seeds(records: Sequence[Record]) -> bool:
+def has_few_seeds(records: Sequence[Record]) -> bool:
     """Tell whether a row has fewer detector seeds than a primary row needs."""
     seeds = {r.seed for r in records}
     return len(seeds) < SEEDS and not all(r.deterministic for r in records)

@@ -54,7 +54,7 @@ def tables(board: Board, *, intervals: bool = False, places: bool = False) -> li
         return made
     own = [by_place(board, e, found, intervals=intervals) for e in board.entries if found.get(e)]
     by_kind = _by_kind(board, found, intervals=intervals)
-    return [_overview(board, found), *made, by_kind, *(own if places else ())]
+    return [overview(board, found), *made, by_kind, *(own if places else ())]
 
 
 def by_place(
@@ -72,8 +72,11 @@ def by_place(
     return Table(title, ["Environment", *kinds], rows, note=note)
 
 
-def _overview(board: Board, found: Thresholds) -> Table:
-    """Return relative thresholds and shares found by rung, the lowest threshold first."""
+def overview(board: Board, found: Thresholds) -> Table:
+    """Return relative thresholds and shares found by rung, the lowest threshold first.
+
+    `found` are the thresholds of the board's records.
+    """
     reference = found.get(REFERENCE, {})
     means = {entry: _mean(own, reference) for entry, own in found.items()}
     values = {entry: mean.value if mean else math.inf for entry, mean in means.items()}

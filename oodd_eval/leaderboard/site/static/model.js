@@ -41,16 +41,18 @@ function selects(selection, cell) {
   );
 }
 
-/** Places of a selection's cells in the board's list. */
-const placesOf = (board, selection) => board.cells.flatMap(([environment, anomaly], i) =>
-  selects(selection, { environment, anomaly }) ? [i] : []);
+/** The name of a selection's mean where a part of the data has its interval. */
+const keyOf = ({ environment, group, anomaly }) => `${environment}|${anomaly !== "all" ? anomaly : group}`;
 
 const places = new Map();
 
-/** The same, worked out once for each selection. */
+/** Places of a selection's cells in the board's list, worked out once. */
 function cellsOf(board, selection) {
   const key = [board.id, selection.environment, selection.group, selection.anomaly].join("|");
-  if (!places.has(key)) places.set(key, placesOf(board, selection));
+  if (!places.has(key)) {
+    places.set(key, board.cells.flatMap(([environment, anomaly], i) =>
+      selects(selection, { environment, anomaly }) ? [i] : []));
+  }
   return places.get(key);
 }
 
@@ -90,8 +92,7 @@ function mean(board, row, metric, selection = EVERYTHING) {
   const part = partOf(board, metric);
   if (!part) return found;
   found.value = meanOf(chosen.map((i) => part.values[row.part][i]));
-  const key = chosen.length === 1 ? board.cells[chosen[0]].join("|")
-    : `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
+  const key = chosen.length === 1 ? board.cells[chosen[0]].join("|") : keyOf(selection);
   [found.low, found.high] = part.intervals[row.part]?.[key] ?? [null, null];
   return found;
 }
@@ -106,9 +107,8 @@ function meanOfRow(board, row, metric, selection = EVERYTHING) {
   if (failed) return { ...found, state: failed.status, reason: failed.reason };
   const index = board.metrics.indexOf(metric);
   found.value = meanOf(cells.map((cell) => cell.values[index]));
-  const key = `${selection.environment}|${selection.anomaly !== "all" ? selection.anomaly : selection.group}`;
   const place = board.intervals.indexOf(metric);
-  const known = part.intervals[key]?.[place];
+  const known = part.intervals[keyOf(selection)]?.[place];
   if (known) [found.low, found.high] = known;
   else if (cells.length === 1 && place >= 0) [found.low, found.high] = [cells[0].low[place], cells[0].high[place]];
   return found;

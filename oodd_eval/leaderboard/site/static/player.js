@@ -2,8 +2,11 @@
 
 const PACE = 40; // milliseconds a step
 
-/** A drawing's part up to a time: `reveal(t)` shows that much of the lines given to it. */
-function curtain(plot, name) {
+let clips = 0;
+
+/** Returns a function of a time that shows the lines of a drawing up to then. */
+function revealer(plot) {
+  const name = `clip-${++clips}`;
   const box = shape("rect", { x: plot.left, y: 0, width: plot.right - plot.left, height: 2000 });
   plot.drawing.prepend(shape("defs", {}, shape("clipPath", { id: name }, box)));
   const cursor = shape("line", { class: "cursor", x1: plot.right, x2: plot.right, y1: plot.top, y2: plot.bottom });

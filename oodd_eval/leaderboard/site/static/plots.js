@@ -154,8 +154,6 @@ function axisOf(values, unit, step, label) {
   return { range, ticks: ticks(...range, 6), label };
 }
 
-let curtains = 0;
-
 /** Drawings of sensors, the twin's dashed, over the same time as an example. */
 function sensorCharts(sensors, example, x, wide, onset) {
   return sensors.map(({ name, step, own, twin }) => {
@@ -199,14 +197,13 @@ function trajectoryFigure(example, sensors = null) {
     const found = alarms.find((t) => t >= example.onset);
     return found === undefined ? "none in this window" : found === example.onset ? "at the onset" : `${found - example.onset} step${found === example.onset + 1 ? "" : "s"} after the onset`;
   };
-  const names = [scores, cusum].map((_, i) => `curtain-${++curtains}-${i}`);
-  const reveals = [curtain(scores, names[0]), curtain(cusum, names[1])];
+  const reveals = [revealer(scores), revealer(cusum)];
   const controls = player(example, reveals);
   const above = sensors && element("figure", {});
   sensors?.then((found) => {
     for (const plot of sensorCharts(found ?? [], example, x, wide, onset)) {
       above.append(scroller(plot.drawing));
-      reveals.push(curtain(plot, `curtain-${++curtains}`));
+      reveals.push(revealer(plot));
     }
   }, (error) => above.append(notLoaded(error)));
   const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;

@@ -45,7 +45,7 @@ function rowsOf(board) {
  * they are unfolded. First is the primary row, or the best of those that the filters leave.
  */
 function folded(rows) {
-  const byDetector = Map.groupBy ? Map.groupBy(rows, (row) => row.detector) : groupedBy(rows, (row) => row.detector);
+  const byDetector = groupedBy(rows, (row) => row.detector);
   const first = new Map([...byDetector].map(([detector, own]) => [own.find((row) => row.primary) ?? own[0], detector]));
   return rows.filter((row) => first.has(row)).slice(0, whole ? Infinity : FIRST).flatMap((row) => {
     const others = byDetector.get(row.detector).filter((other) => other !== row);
@@ -56,7 +56,10 @@ function folded(rows) {
 
 function groupedBy(items, key) {
   const found = new Map();
-  for (const item of items) found.set(key(item), [...(found.get(key(item)) ?? []), item]);
+  for (const item of items) {
+    if (!found.has(key(item))) found.set(key(item), []);
+    found.get(key(item)).push(item);
+  }
   return found;
 }
 
@@ -274,12 +277,9 @@ function notesOf(board, rows) {
     lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
   }
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
-  const captions = new Map();
-  for (const row of rows) {
-    const { caption } = row;
-    if (caption) captions.set(caption, [...(captions.get(caption) ?? []), row.label]);
+  for (const [caption, own] of groupedBy(rows.filter((row) => row.caption), (row) => row.caption)) {
+    lines.push(`${own.map((row) => row.label).join(", ")}: ${caption}`);
   }
-  for (const [caption, labels] of captions) lines.push(`${labels.join(", ")}: ${caption}`);
   if (rows.some((row) => mean(board, row, "auc_matched", state).partial)) {
     lines.push("* A mean over fewer cells than other rows have.");
   }
