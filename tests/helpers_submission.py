@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import lzma
 import shutil
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import pytest
 from helpers_split import make_split
 
 from oodd_eval.api import evaluate
-from oodd_eval.data.files import compress as pack
+from oodd_eval.data import files
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import records, verify_entry
 from oodd_eval.metrics.auc import Contribution
@@ -102,14 +103,15 @@ class Draft:
                     facts["bytes"] = len(content)
         self.file("entry.json").write_text(json.dumps(self.entry))
 
-    def packed(self, name, content=None):
+    def packed(self, name, content=None, ending=".gz"):
         """Replace a file by its packed form, or by other bytes under that name."""
         file = self.file(name)
+        pack = {".gz": files.compress, ".xz": lzma.compress}[ending]
         content = pack(file.read_bytes()) if content is None else content
         file.unlink()
-        file.with_name(f"{name}.gz").write_bytes(content)
+        file.with_name(name + ending).write_bytes(content)
         del self.entry["files"][name]
-        self.entry["files"][f"{name}.gz"] = {}
+        self.entry["files"][name + ending] = {}
         self.seal()
 
     def consistent(self, index, name):

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import pairs
 from oodd_eval.metrics.auc import Contribution, mean_of
-from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
+from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
 
 CELLS = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid")]
@@ -309,20 +308,25 @@ def test_rare_differences_have_all_resamples_and_others_the_first(monkeypatch):
         assert one.p == (other.p if small else pytest.approx(other.p, rel=0.3))
 
 
-def test_a_ranking_of_many_rows_takes_time_by_the_pair(monkeypatch):
+def test_pairs_share_draws(monkeypatch):
+    pairs._draws.cache_clear()
+    drawn = []
+
+    def weights(n, *, key, resamples):
+        drawn.append(key)
+        return bootstrap_weights(n, key=key, resamples=resamples)
+
+    monkeypatch.setattr(pairs, "bootstrap_weights", weights)
     monkeypatch.setattr(pairs, "FIRST", 2_000)
     cells = [(f"e{i}", "iid") for i in range(7)]
     rng = np.random.default_rng(6)
-
-    def seconds(n):
-        rows = {
-            f"r{i}": {0: {c: mean_of(0.01 * i + 0.02 * rng.normal(size=10)) for c in cells}}
-            for i in range(n)
+    rows = {
+        f"r{i}": {
+            seed: {c: mean_of(0.01 * i + 0.02 * rng.normal(size=10)) for c in cells}
+            for seed in range(3)
         }
-        start = time.process_time()
-        rank(rows, resamples=1_000 * n)
-        return time.process_time() - start
-
-    seconds(6)  # what is kept between calls
-    # 22 times the pairs and 4.5 times the resamples: 100 times the work, if each were one by one.
-    assert seconds(27) < 60 * seconds(6)
+        for i in range(12)
+    }
+    rank(rows, resamples=6_000)
+    # Rows with as many seeds have draws of their own: their seeds are not paired.
+    assert len(drawn) == len(set(drawn)) == len(cells) + len(rows)

@@ -1,5 +1,6 @@
 """Tampered ``entry.json`` and files: each is refused with a message that names field or file."""
 
+import lzma
 import os
 
 import pytest
@@ -195,15 +196,19 @@ def removed(name):
     return change
 
 
-def packed(content, name="records.jsonl"):
+def packed(content, name="records.jsonl", ending=".gz"):
     def change(d):
         d.write()
         if name == "entry.json":
-            d.file(name).rename(d.file(f"{name}.gz"))
+            d.file(name).rename(d.file(name + ending))
         else:
-            d.packed(name, content() if callable(content) else content)
+            d.packed(name, content() if callable(content) else content, ending)
 
     return change
+
+
+def by_xz(content):
+    return packed(content, ending=".xz")
 
 
 def both(first, second):
@@ -272,6 +277,19 @@ FILES = {
     "packed-with-a-tail": (packed(pack(b"{}\n") + b"x"), "records.jsonl.gz"),
     "packed-twice-in-a-row": (packed(pack(b"{}\n") * 2), "records.jsonl.gz"),
     "packed-otherwise": (packed(b"\xfd7zXZ\x00"), "records.jsonl.gz"),
+    "xz-and-gzip": (
+        both(packed(None), extra("records.jsonl.xz", lzma.compress(b"{}"))), "records.jsonl.gz"
+    ),
+    "xz-bomb": (by_xz(lambda: lzma.compress(b" " * 64_000_001)), "records.jsonl.xz"),
+    "xz-large": (by_xz(lambda: b"x" * 8_000_001), "records.jsonl.xz"),
+    "xz-cut-off": (by_xz(lzma.compress(b"{}\n")[:-3]), "records.jsonl.xz"),
+    "xz-with-a-tail": (by_xz(lzma.compress(b"{}\n") + b"x"), "records.jsonl.xz"),
+    "xz-twice-in-a-row": (by_xz(lzma.compress(b"{}\n") * 2), "records.jsonl.xz"),
+    "xz-for-much-memory": (
+        by_xz(lzma.compress(b"{}\n", filters=[{"id": lzma.FILTER_LZMA2, "dict_size": 2**29}])),
+        "records.jsonl.xz",
+    ),
+    "xz-entry": (packed(None, "entry.json", ".xz"), "entry.json.xz"),
     "packed-nonsense": (packed(pack(b"hello\n")), "records.jsonl.gz:1"),
     "packed-not-utf8": (packed(pack(b"\xff\n")), "records.jsonl.gz"),
     "packed-entry": (packed(None, "entry.json"), "entry.json.gz"),

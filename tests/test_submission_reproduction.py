@@ -115,9 +115,9 @@ def test_large_files_are_packed_and_read_like_plain_ones(many, tmp_path, monkeyp
     assert submit(many, tmp_path / "packed", *options) == 0
     ((plain,), (small,)) = (read_entries(tmp_path / name) for name in ("plain", "packed"))
     assert {p.name for p in small.path.iterdir()} == {
-        "entry.json", "records.jsonl.gz", "curves.json.gz"
+        "entry.json", "records.jsonl.xz", "curves.json.xz"
     }  # fmt: skip
-    assert small.meta.files.keys() == {"records.jsonl.gz", "curves.json.gz"}
+    assert small.meta.files.keys() == {"records.jsonl.xz", "curves.json.xz"}
     assert [r.to_json() for r in small.records] == [r.to_json() for r in plain.records]
     assert packed.read_text(small.curves) == plain.curves.read_text()
     boards = [tmp_path / f"board-{name}" for name in ("plain", "packed")]

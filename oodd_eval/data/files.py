@@ -1,8 +1,9 @@
-"""Files that are whole or absent: atomic replacement, a lock per directory, gzip within bounds."""
+"""Files that are whole or absent: atomic replacement, a lock per directory, bounded compression."""
 
 import contextlib
 import gzip
 import hashlib
+import lzma
 import os
 import re
 import shutil
@@ -17,8 +18,13 @@ import psutil
 from oodd_eval.errors import OutputError, ResultsError
 
 GZIP: Final = ".gz"
+XZ: Final = ".xz"
+PACKED: Final = (XZ, GZIP)
+"""Endings of compressed files. New ones are by xz, which takes half of the place; both are read."""
+
 COMPRESSED_FROM: Final = 10**6  # bytes; smaller files stay readable in a pull request
 MAX_BYTES: Final = 64 * 10**6  # most bytes that a compressed file may decompress to
+_MEMORY: Final = 128 * 2**20  # bytes that decompressing may need: twice what xz -9 asks for
 
 
 @contextlib.contextmanager
@@ -116,39 +122,52 @@ def compress(content: bytes) -> bytes:
 
 
 def decompress(content: bytes, most: int = MAX_BYTES) -> bytes:
-    """Undo `compress`, never holding more than `most` bytes; anything else is a `ResultsError`."""
-    decompressor = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+    """Undo gzip or xz, never holding more than `most` bytes; anything else is a `ResultsError`."""
+    by_xz = content.startswith(b"\xfd7zXZ\0")
+    decompressor = (
+        lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MEMORY) if by_xz
+        else zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+    )  # fmt: skip
     try:
         plain = decompressor.decompress(content, most + 1)
-    except zlib.error as error:
-        raise ResultsError(f"is damaged or not compressed by gzip: {error}") from None
+    except (zlib.error, lzma.LZMAError) as error:
+        raise ResultsError(f"is damaged or not compressed by gzip or xz: {error}") from None
     if len(plain) > most:
         raise ResultsError(f"decompresses to more than {most} bytes")
     if not decompressor.eof:
-        raise ResultsError("is compressed by gzip, but cut off")
+        raise ResultsError("is compressed, but cut off")
     if decompressor.unused_data:
         raise ResultsError("has something behind its compressed content")
     return plain
 
 
 def compress_large(path: Path) -> Path:
-    """Compress a large file into ``NAME.gz`` and return the path that the content has then."""
+    """Compress a large file into ``NAME.xz`` and return the path that the content has then."""
     if path.stat().st_size <= COMPRESSED_FROM:
         return path
-    target = path.with_name(path.name + GZIP)
-    write_bytes(target, compress(path.read_bytes()))
+    target = path.with_name(path.name + XZ)
+    write_bytes(target, lzma.compress(path.read_bytes()))
     path.unlink()
     return target
 
 
+def forms(name: str) -> tuple[str, ...]:
+    """Return the names that a file may have: plain, and compressed.
+
+    >>> forms("curves.json")
+    ('curves.json', 'curves.json.xz', 'curves.json.gz')
+    """
+    return name, *(name + ending for ending in PACKED)
+
+
 def find_file(path: Path) -> Path | None:
     """Return the file or its compressed form, whichever exists."""
-    return next((p for p in (path, path.with_name(path.name + GZIP)) if p.is_file()), None)
+    return next((p for p in map(path.with_name, forms(path.name)) if p.is_file()), None)
 
 
 def read_text(path: Path) -> str:
-    """Read UTF-8 text, decompressed if the name ends in ``.gz``."""
-    if path.suffix != GZIP:
+    """Read UTF-8 text, decompressed if the name ends in ``.xz`` or ``.gz``."""
+    if path.suffix not in PACKED:
         return path.read_text(encoding="utf-8")
     try:
         return decompress(path.read_bytes()).decode()

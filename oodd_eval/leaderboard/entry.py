@@ -7,7 +7,7 @@
     curves.json      illustrations computed from the scores (optional)
     scores/*.h5      every score, as in a results directory (optional)
 
-Records or curves of more than a megabyte are compressed: ``records.jsonl.gz``, ``curves.json.gz``.
+Records or curves of more than a megabyte are compressed: ``records.jsonl.xz``, ``curves.json.xz``.
 
 Entries are read here after they were verified (`oodd_eval.leaderboard.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.

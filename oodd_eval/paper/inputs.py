@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from pydantic import TypeAdapter
 
 from oodd_eval.data.facts import TABLE1, split_condition
-from oodd_eval.data.files import GZIP, write_bytes
+from oodd_eval.data.files import forms, write_bytes
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.paper.experiments import EXPERIMENTS, Tier, settings_of
@@ -160,7 +160,7 @@ def load_records(reproduction: Reproduction, places: Iterable[Path]) -> list[Rec
     directories: set[Path] = set()
     for place in places:
         # Large entries of the leaderboard keep their records compressed.
-        below = [file.parent for name in (RECORDS, RECORDS + GZIP) for file in place.rglob(name)]
+        below = [file.parent for name in forms(RECORDS) for file in place.rglob(name)]
         if not below:
             raise ResultsError(f"no results in {str(place)!r}, expected {RECORDS} in or below it")
         directories.update([place] if place in below else below)

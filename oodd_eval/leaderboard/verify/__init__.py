@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.data.facts import SPLITS
-from oodd_eval.data.files import GZIP
+from oodd_eval.data.files import forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import (
@@ -192,7 +192,7 @@ def verify(
     path = Path(path)
     if not path.is_dir():
         raise ResultsError(f"{str(path)!r} is no directory: expected an entry, or one of entries")
-    if any(os.path.lexists(path / name) for name in (ENTRY, RECORDS, RECORDS + GZIP)):
+    if any(os.path.lexists(path / name) for name in (ENTRY, *forms(RECORDS))):
         yield verify_entry(path, split=split, rerun=rerun, order=order)
         return
     if rerun:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data import files as stored_files
-from oodd_eval.data.files import GZIP
+from oodd_eval.data.files import PACKED, forms
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES
 from oodd_eval.results.directory import RECORDS
@@ -25,7 +25,9 @@ from oodd_eval.results.directory import RECORDS
 MB: Final = 10**6
 MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
 
-MOST_BYTES: Final = {ENTRY: MB // 4, **MOST_PLAIN, **{n + GZIP: 8 * MB for n in MOST_PLAIN}}
+MOST_BYTES: Final = (
+    {ENTRY: MB // 4} | MOST_PLAIN | {name + end: 8 * MB for end in PACKED for name in MOST_PLAIN}
+)
 """Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""
 
 MOST_SCORE_BYTES: Final = 64 * MB
@@ -114,10 +116,11 @@ def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
         else:
             sizes[name] = status.st_size
     for name in MOST_PLAIN:
-        if {name, name + GZIP} <= listed.keys():
-            findings.refuse(name + GZIP, "", f"is there beside {name}: expected one of the two")
+        first, *others = [form for form in forms(name) if form in listed] or [name]
+        for other in others:
+            findings.refuse(other, "", f"is there beside {first}: expected one of the two")
     for name in (ENTRY, RECORDS):
-        if not {name, name + GZIP} & listed.keys():
+        if listed.keys().isdisjoint(forms(name)):
             findings.refuse(name, "", "is missing")
     if (total := sum(sizes.values())) > MOST_TOTAL_BYTES:
         message = f"is {total} bytes, expected at most {MOST_TOTAL_BYTES}"
@@ -172,12 +175,12 @@ def _read(path: Path, most: int) -> bytes:
 
 
 def find_text(contents: Mapping[str, bytes], name: str, findings: Findings) -> tuple[str, str]:
-    """Return a text file's name, which may end in ``.gz``, and its text; both empty without it."""
-    for stored in (name, name + GZIP):
+    """Return a text file's name, compressed or not, and its text; both empty without it."""
+    for stored in forms(name):
         if stored in contents:
             content = contents[stored]
             with findings.reading(stored):
-                if stored.endswith(GZIP):
+                if stored != name:
                     content = stored_files.decompress(content, MOST_PLAIN[name])
                 return stored, content.decode()
     return "", ""
