@@ -1,4 +1,4 @@
-"""What the distribution says of itself: its version, which the build reads, and its address."""
+"""The distribution's version, which the build reads, and the address of its repository."""
 
 __version__ = "0.1.0"
 
