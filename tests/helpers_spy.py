@@ -5,6 +5,7 @@ memory, its objects, the frames that called it and what the system says of its p
 The test, outside, searches them.
 """
 
+import itertools
 import json
 from pathlib import Path
 
@@ -164,7 +165,7 @@ class Findings:
         lines = (self._directory / f"arrived.{when}").read_text().splitlines()
         return [json.loads(line) for line in lines]
 
-    def places_of(self, texts=(), numbers=(), patterns=()):
+    def places_of(self, texts=(), numbers=(), patterns=(), public=()):
         """Return where secrets were seen: ``{place: {secret, ...}}``.
 
         Parameters
@@ -175,8 +176,10 @@ class Findings:
             Sought for among numbers.
         patterns
             Bytes, by name, sought for in memory.
+        public
+            Lines that memory may hold, whatever they name.
         """
-        found = {}
+        found, encodings = {}, ("utf-8", "utf-16-le", "utf-32-le")
         for path in self.looks:
             seen = json.loads(path.read_text())
             for place, content in seen.items():
@@ -189,7 +192,8 @@ class Findings:
             memory = path.with_suffix(".memory").read_bytes()
             here = {name for name, value in dict(patterns).items() if value in memory}
             memory = memory.lower()
-            encodings = "utf-8", "utf-16-le", "utf-32-le"
+            for line, encoding in itertools.product(public, encodings):
+                memory = memory.replace(line.lower().encode(encoding), b"\0")
             here |= {t for t in texts if any(t.lower().encode(e) in memory for e in encodings)}
             found.setdefault("memory", set()).update(here)
         return {place: secrets for place, secrets in found.items() if secrets}
