@@ -5,7 +5,6 @@ memory, its objects, the frames that called it and what the system says of its p
 The test, outside, searches them.
 """
 
-import itertools
 import json
 from pathlib import Path
 
@@ -165,7 +164,7 @@ class Findings:
         lines = (self._directory / f"arrived.{when}").read_text().splitlines()
         return [json.loads(line) for line in lines]
 
-    def places_of(self, texts=(), numbers=(), patterns=(), public=()):
+    def places_of(self, texts=(), numbers=(), patterns=()):
         """Return where secrets were seen: ``{place: {secret, ...}}``.
 
         Parameters
@@ -176,10 +175,8 @@ class Findings:
             Sought for among numbers.
         patterns
             Bytes, by name, sought for in memory.
-        public
-            Lines that memory may hold, whatever they name.
         """
-        found, encodings = {}, ("utf-8", "utf-16-le", "utf-32-le")
+        found = {}
         for path in self.looks:
             seen = json.loads(path.read_text())
             for place, content in seen.items():
@@ -192,8 +189,7 @@ class Findings:
             memory = path.with_suffix(".memory").read_bytes()
             here = {name for name, value in dict(patterns).items() if value in memory}
             memory = memory.lower()
-            for line, encoding in itertools.product(public, encodings):
-                memory = memory.replace(line.lower().encode(encoding), b"\0")
+            encodings = "utf-8", "utf-16-le", "utf-32-le"
             here |= {t for t in texts if any(t.lower().encode(e) in memory for e in encodings)}
             found.setdefault("memory", set()).update(here)
         return {place: secrets for place, secrets in found.items() if secrets}

@@ -4,6 +4,7 @@ That the spy would find it is shown by a harness that leaks on purpose, in every
 """
 
 import hashlib
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -34,10 +35,6 @@ SEED = 424242
 # Names that no docstring in the worker has, nor Python (its easter egg is "antigravity").
 CHOSEN = "wind-l2r,wind-r2l"
 ENVIRONMENT = "lunarlander"
-# The package's metadata holds the README. A worker reads that for the package's name, so that lines
-# of its tables stay in freed memory now and then.
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-PUBLIC = [line for line in README.splitlines() if ENVIRONMENT in line.lower()]
 
 
 class Secrets:
@@ -69,7 +66,7 @@ class Secrets:
         self.twin = data.twins[0].observations
 
     def seen_in(self, findings):
-        return findings.places_of(self.texts, self.numbers, self.patterns, PUBLIC)
+        return findings.places_of(self.texts, self.numbers, self.patterns)
 
 
 @pytest.fixture(scope="module")
@@ -92,12 +89,28 @@ def spying(monkeypatch, tmp_path):
     return spy_in(tmp_path, monkeypatch)
 
 
+def metadata_without_readme(place):
+    """Put the package's metadata where it is found first; its README names every environment.
+
+    A worker reads the metadata to find plug-ins, and parts of it stay in freed memory.
+    """
+    installed = importlib.metadata.distribution("oodd-eval")
+    shown = place / "oodd_eval-0.dist-info"
+    shown.mkdir()
+    for name, text in (
+        ("METADATA", installed.read_text("METADATA").partition("\n\n")[0]),
+        ("entry_points.txt", installed.read_text("entry_points.txt")),
+    ):
+        (shown / name).write_text(text, encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def findings(secrets, tmp_path_factory):
     """What is seen in two runs of the command line: in the second, the kept fit is loaded."""
     place = tmp_path_factory.mktemp("spied")
     with pytest.MonkeyPatch.context() as patch:
         seen = spy_in(place, patch)
+        metadata_without_readme(place / "plugin")
         for anomalies in (CHOSEN.partition(",")[0], CHOSEN):
             subprocess.run(
                 [sys.executable, "-m", "oodd_eval", "run", "--detector", "spy", "--env",
@@ -180,15 +193,6 @@ def test_the_spy_finds_arrays_of_secrets_in_memory(secrets, monkeypatch, tmp_pat
     found = secrets.seen_in(Findings(seen))
     assert found["memory"] >= {"onsets as int64", "seeds as int64", "rewards as float32"}
     assert found["objects"] == {871_600_000, 871_600_001, *(n for n in secrets.onsets if n > 1000)}
-
-
-def test_lines_of_the_readme_are_no_secret_in_memory(secrets, tmp_path):
-    for encoding in ("utf-8", "utf-16-le"):
-        (tmp_path / "0-fit.json").write_text("{}")
-        (tmp_path / "0-fit.memory").write_bytes(README.encode(encoding))
-        assert secrets.seen_in(Findings(tmp_path)) == {}
-        (tmp_path / "0-fit.memory").write_bytes(f"{README} {ENVIRONMENT}.h5".encode(encoding))
-        assert secrets.seen_in(Findings(tmp_path)) == {"memory": {ENVIRONMENT}}
 
 
 # In which order, and of what length
