@@ -9,6 +9,7 @@ from helpers_forecast import Walker, one_step, slow_errors
 from helpers_saved import assert_zero_scales_are_refused
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms, riqn_r
+from oodd_torch import forecast
 from oodd_torch.forecast import Forecaster, arrange, quantile_levels, rollouts
 from oodd_torch.gru import Sequence
 from oodd_torch.network import GRID, Architecture, Ensemble
@@ -16,10 +17,11 @@ from oodd_torch.training import (
     SAMPLED,
     Schedule,
     batches,
+    corrections,
     descend,
     feed_back,
+    hidden,
     linear_forecast,
-    predict,
     quantile_huber,
     quantile_huber_slope,
     train,
@@ -120,7 +122,7 @@ def test_learned_quantiles_cover_within_two_points(learned, level):
     rows = arrange(heteroscedastic(200, 100, seed=2), 1)[None]
     x, y = rows[:, :-1], rows[:, 1:]
     heads = learned.heads_at(torch.full((1, 1), level))
-    change, _ = predict(learned, x, learned.start(200), heads)
+    change = corrections(learned, hidden(learned, x, learned.start(200))[0], heads)
     below = y <= learned.linear(x) + learned.unit * change[..., 0, :]
     assert below.float().mean().item() == pytest.approx(level, abs=0.02)
 
@@ -174,6 +176,22 @@ def test_rollouts_equal_a_slow_loop_sample_for_sample(architecture, mean_samplin
     fast = Forecaster(made, **options).errors(rows)
     for found, episode in zip(fast, rows, strict=True):
         assert np.allclose(found, slow_errors(made, episode, **options), atol=1e-5)
+
+
+@pytest.mark.parametrize("architecture", [{}, {"recurrent": False}, {"per_feature": True}])
+def test_forecasts_are_the_same_whether_output_layers_are_kept(monkeypatch, architecture):
+    made = network(2, features=2, random_head=True, units=8, cosines=5, **architecture)
+    rows = [w.observations for w in waves(3, 20, 2)]
+
+    def found(longest):
+        monkeypatch.setattr(forecast, "LONGEST", longest)
+        monkeypatch.setattr(forecast, "ROWS", 6)  # Chunks of two times: some cross the last kept.
+        forecaster = Forecaster(made, horizon=1, samples=3, mean_sampling=False, seed=7)
+        assert len(forecaster.kept) == longest
+        return np.array(forecaster.errors(rows))
+
+    assert np.array_equal(found(1000), found(0))
+    assert np.array_equal(found(1000), found(9))
 
 
 @pytest.mark.parametrize("horizon", [1, 3])
@@ -273,8 +291,8 @@ def test_memory_is_forgotten_where_an_episode_begins():
     kept = torch.ones(2, 20, 1)
     kept[:, 8] = 0
     heads = made.heads_at(torch.full((2, 1), 0.5))
-    both, _ = predict(made, x, made.start(1), heads, kept)
-    alone, _ = predict(made, x[:, 8:], made.start(1), heads)
+    both = corrections(made, hidden(made, x, made.start(1), kept)[0], heads)
+    alone = corrections(made, hidden(made, x[:, 8:], made.start(1))[0], heads)
     assert torch.allclose(both[:, 8:], alone, atol=1e-6)
 
 

@@ -18,7 +18,7 @@ from oodd_common.windows import windows
 from torch import Tensor
 
 from oodd_torch.network import GRID, Ensemble
-from oodd_torch.training import predict
+from oodd_torch.training import corrections, hidden
 
 ROWS = 256
 """Forecasts of one network that are computed together at horizon 1.
@@ -28,6 +28,16 @@ Each group is scored in a new process. There, arrays that fit the processor's ca
 
 ROLLOUTS = 1024
 """The same at larger horizons, where arrays that fit the processor's cache are quicker."""
+
+KEPT = 2**27
+"""Bytes of output layers that are kept at horizon 1.
+
+The levels of a time are the same in every episode, and so are the output layers at them. What is
+made before the first episode is shared by all processes that score.
+"""
+
+LONGEST = 1000
+"""Times beyond the benchmark's longest episode are not kept."""
 
 
 def arrange(rows: Sequence[NDArray[np.float32]], window: int) -> Tensor:
@@ -62,6 +72,7 @@ class Forecaster:
         alone = mean_sampling or horizon == 1 or self.table is None
         self.width = 1 if alone else samples
         """Rollouts of every time, R."""
+        self.kept = self._kept() if horizon == 1 and self.table is not None else None
 
     @torch.no_grad()
     def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
@@ -101,7 +112,8 @@ class Forecaster:
         absolute distance to their median divided by the scale: (C, B, D) in double precision.
         """
         if self.scale is None:
-            return (truth[:, :, None] - samples).abs().mean((0, 3), dtype=torch.float64)
+            far = (truth[:, :, None] - samples).abs_().double()
+            return far.sum(0).sum(2) / (len(samples) * samples.shape[3])
         middle = samples.movedim(0, -1).transpose(2, 3).flatten(3).median(-1).values
         return ((truth - middle).abs() / self.scale).double()
 
@@ -112,17 +124,42 @@ class Forecaster:
         From inputs (E, C, B, W * D) and the memory before them, (K, B, H), to samples
         (E, C, B, M, D) and the memory after them.
         """
-        levels = self._levels(times)
         network = self.network
         if self.horizon > 1:
+            levels = self._levels(times)
             return rollouts(
                 network, x, memory, levels, self.table, horizon=self.horizon, width=self.width
             )
-        heads = None
-        if levels is not None and self.table is not None:
-            heads = network.heads_from(levels[0], self.table)
-        change, memory = predict(network, x, memory, heads)
+        z, memory = hidden(network, x, memory)
+        if self.kept is not None and times.stop <= 1 + len(self.kept):
+            heads = self.kept[times.start - 1 : times.stop - 1]
+            outputs = torch.matmul(z.transpose(0, 1), heads).transpose(0, 1).contiguous()
+            outputs = outputs.reshape(*outputs.shape[:3], -1, network.architecture.outputs)
+            change = network.gather(outputs + network.out_bias[:, None, None])
+        else:
+            change = corrections(network, z, self._heads(times))
         return network.linear(x)[..., None, :] + network.unit * change, memory
+
+    def _heads(self, times: range) -> Tensor | None:
+        """Output layers at the levels of C times, (K, C, H, N * P); None without quantiles."""
+        levels = self._levels(times)
+        if levels is None or self.table is None:
+            return None
+        return self.network.heads_from(levels[0], self.table)
+
+    def _kept(self) -> Tensor:
+        """Output layers of the first times, as many as `KEPT` holds: (C, K, H, N * P)."""
+        a, k = self.network.architecture, len(self.network.first)
+        width = self.samples * a.outputs
+        count = min(LONGEST, KEPT // (4 * k * width * a.units))
+        # As `heads_from` lays them out: other layouts round otherwise.
+        kept = torch.empty(count, k, width, a.units, device=self.network.device).transpose(2, 3)
+        for start in range(0, count, 32):
+            part = kept[start : start + 32]
+            heads = self._heads(range(1 + start, 1 + start + len(part)))
+            if heads is not None:
+                part.copy_(heads.transpose(0, 1))
+        return kept
 
     def _levels(self, times: range) -> Tensor | None:
         """Levels of shape (h, E, C, M, D), or None without quantiles."""

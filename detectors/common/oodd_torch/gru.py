@@ -48,22 +48,27 @@ class Sequence(torch.autograd.Function):
     ) -> Tensor:
         """Return the memories; see the class."""
         k, steps, b, h = *projected.shape[:3], memory.shape[2]
-        opened = projected.new_empty(k, steps, b, 2 * h)
-        before, old, candidate, after = (projected.new_empty(k, steps, b, h) for _ in range(4))
+        after = projected.new_empty(k, steps, b, h)
+        learns = any(ctx.needs_input_grad)  # Scoring needs nothing of what a step back looks at.
+        if learns:
+            opened = projected.new_empty(k, steps, b, 2 * h)
+            before, old, candidate = (torch.empty_like(after) for _ in range(3))
         for t in range(steps):
             if kept is not None:
                 memory = memory * kept[:, t]
-            before[:, t] = memory
+            if learns:
+                before[:, t] = memory
             recurrent = torch.baddbmm(bias, memory, weights)  # (K, B, 3H)
-            gates = projected[:, t, :, : 2 * h] + recurrent[..., : 2 * h]
-            opened[:, t] = gates.sigmoid_()
-            old[:, t] = recurrent[..., 2 * h :]
-            new = torch.addcmul(projected[:, t, :, 2 * h :], gates[..., :h], old[:, t]).tanh_()
-            candidate[:, t] = new
+            gates = (projected[:, t, :, : 2 * h] + recurrent[..., : 2 * h]).sigmoid_()
+            inner = recurrent[..., 2 * h :]
+            new = torch.addcmul(projected[:, t, :, 2 * h :], gates[..., :h], inner).tanh_()
+            if learns:
+                opened[:, t], old[:, t], candidate[:, t] = gates, inner, new
             memory = torch.lerp(new, memory, gates[..., h:])
             after[:, t] = memory
-        ctx.save_for_backward(before, opened, old, candidate, weights)
-        ctx.kept = kept
+        if learns:
+            ctx.save_for_backward(before, opened, old, candidate, weights)
+            ctx.kept = kept
         return after
 
     @staticmethod

@@ -161,41 +161,43 @@ def quantile_huber(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> T
     return torch.abs(tau - (error < 0).to(error.dtype)) * huber / kappa
 
 
-def predict(
-    network: Ensemble, x: Tensor, memory: Tensor, heads: Tensor | None, kept: Tensor | None = None
+def hidden(
+    network: Ensemble, x: Tensor, memory: Tensor, kept: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """One pass over a chunk: corrections (E, T, B, N, D), and the last memory.
+    """One pass over a chunk: last hidden layer (K, T, B, H), and the last memory.
 
     Parameters
     ----------
     x : (E, T, B, W * D)
     memory : (K, B, H)
-    heads : (K, G, H, N * P)
-        Output layers at N levels, see `Ensemble.heads_at`: G = T for levels of every step, G = 1
-        for levels that all steps share. None without quantiles.
     kept : (E, T, B)
         0 where an episode begins and the memory is to be forgotten, else 1.
-
-    Returns
-    -------
-    Corrections in the network's units: the prediction is ``linear(x) + unit * correction``.
     """
     e, t, b, _ = x.shape
-    a = network.architecture
     f = network.inputs(x.reshape(e, t * b, -1))
     k, _, h = f.shape
     g = f
-    if a.recurrent:
+    if network.architecture.recurrent:
         forget = None if kept is None else network.spread(kept)[..., None]
         g, memory = network.run(f.reshape(k, t, b, h), memory, forget)
         g = g.reshape(k, t * b, h)
-    z = network.trunk(f, g)  # (K, T * B, H)
+    return network.trunk(f, g).reshape(k, t, b, h), memory
+
+
+def corrections(network: Ensemble, z: Tensor, heads: Tensor | None) -> Tensor:
+    """Corrections (E, T, B, N, D) by the last hidden layer, (K, T, B, H), in the network's units.
+
+    The prediction is ``linear(x) + unit * correction``. `heads`, (K, G, H, N * P), are output
+    layers at N levels, see `Ensemble.heads_at`: G = T for levels of every step, G = 1 for levels
+    that all steps share. None without quantiles.
+    """
+    k, t, b, h = z.shape
     if heads is None:
-        change = torch.bmm(z, network.out)
+        change = torch.bmm(z.reshape(k, t * b, h), network.out)
     else:
         change = torch.matmul(z.reshape(k, heads.shape[1], -1, h), heads)
-    change = change.reshape(k, t, b, -1, a.outputs) + network.out_bias[:, None, None]
-    return network.gather(change), memory
+    p = network.architecture.outputs
+    return network.gather(change.reshape(k, t, b, -1, p) + network.out_bias[:, None, None])
 
 
 def quantile_huber_slope(error: Tensor, tau: Tensor, kappa: Tensor | float = 1.0) -> Tensor:
@@ -227,7 +229,8 @@ def descend(
     only needed when it is looked at.
     """
     heads = None if tau is None else network.heads_at(tau)
-    change, memory = predict(network, x, memory, heads, kept)
+    z, memory = hidden(network, x, memory, kept)
+    change = corrections(network, z, heads)
     with torch.no_grad():
         slope = _error(network, x, y, change)
         if tau is not None:
@@ -268,7 +271,8 @@ def evaluate(
         x = feed_back(network, x, starts, memory, share, rngs)
     tau = ((torch.arange(levels, device=network.device) + 0.5) / levels).expand(members, -1)
     heads = network.heads_at(tau) if a.quantiles else None
-    change, _ = predict(network, x, memory, heads, (~starts).to(x.dtype))
+    z, _ = hidden(network, x, memory, (~starts).to(x.dtype))
+    change = corrections(network, z, heads)
     error = _error(network, x, y, change)
     if a.quantiles:
         each = quantile_huber(error, tau[:, None, None, :, None], _wide(kappa))
