@@ -136,15 +136,22 @@ def test_verdicts_are_counted_rightly():
         assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
 
 
-def test_the_table_at_the_papers_losses_is_that_of_both_reproductions():
+@pytest.mark.parametrize(
+    ("heading", "table1", "paper"),
+    [
+        ("At the paper's losses", "mini", "mini-paper"),
+        ("At the paper's losses, on whole episodes", "standard", "reduced-paper"),
+    ],
+)
+def test_the_table_at_the_papers_losses_is_that_of_both_reproductions(heading, table1, paper):
     def means(split):
         file = ROOT / "leaderboard" / "reproduction" / split / "tables" / "table-5.csv"
         with file.open() as lines:
             own = [r for r in csv.DictReader(lines) if r["environment"] == "mean"]
         return {(r["series"], r["anomalies"]): r for r in own if r["metric"] == "auc"}
 
-    ours, same = means("mini"), means("mini-paper")
-    section = PAGE.split("### At the paper's losses")[1].split("\n## ")[0]
+    ours, same = means(table1), means(paper)
+    section = re.split(r"\n##+ ", PAGE.split(f"### {heading}\n")[1])[0]
     rows = re.findall(r"^\| ([A-Z+]+) \| ([\d. |]+) \|$", section, re.MULTILINE)
     assert [r[0] for r in rows] == ["RIQN", "RIQN+MS", "NPN", "RF", "AVG"]
     for name, found in rows:
