@@ -13,6 +13,7 @@ import pytest
 from helpers_records import example, make_record
 
 from oodd_eval.cli.main import main
+from oodd_eval.data.facts import SPLITS
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import cells, page
@@ -491,7 +492,7 @@ def test_other_splits_follow_from_the_most_data_to_the_least():
 
 
 def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone(monkeypatch):
-    digests = {name: f"{i:02d}" * 32 for i, name in enumerate(("mini", "reduced", "standard"))}
+    digests = {name: f"{i:02d}" * 32 for i, name in enumerate(SPLITS)}
     monkeypatch.setattr(leaderboard_build, "published_digests", lambda: digests)
 
     def words(split, digest):
@@ -509,6 +510,8 @@ def test_a_page_says_which_tier_a_split_is_and_never_by_its_name_alone(monkeypat
     assert "episodes of at most 300 steps" in mini
     standard = words("standard", digests["standard"])
     assert "own split.** Per environment 500 training and 200 calibration trajectories" in standard
+    for suite in ("ladder", "mini-paper", "reduced-paper", "noisy-1", "noisy-5"):
+        assert "**A further test suite.** Per environment " in words(suite, digests[suite])
     assert "**Not a published split.**" in words("standard", digests["mini"])
     assert "**Not a published split.** mini@12345678 was" in words("mini@12345678", "12" * 32)
 

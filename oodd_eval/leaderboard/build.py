@@ -217,7 +217,8 @@ def about_split(board: Board) -> str:
     name = board.split
     if name not in SPLITS or published_digests().get(name) != board.digest:
         return str(TEXTS["unpublished"].format(name=escape(name)))
-    split, tier = SPLITS[name], TEXTS["tiers"][name]
+    split, tiers = SPLITS[name], TEXTS["tiers"]
+    tier = tiers.get(name, tiers["further"])
     cap = split.episode_cap
     episodes = "whole episodes" if cap is None else f"episodes of at most {cap} steps"
     return str(TEXTS["published"].format(**asdict(split), **tier, episodes=episodes))
