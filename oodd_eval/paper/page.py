@@ -227,8 +227,8 @@ def returns_tables(returns: Returns, other: Other | None = None) -> tuple[Table,
             ours.append(_printed(e))
             theirs.append(f"{digits:.1f}")
         rows += [ours, theirs]
-        if other:
-            its = (_printed(mean_return(other.returns or {}, environment, k)) for k in KINDS)
+        if other and other.returns:
+            its = (_printed(mean_return(other.returns, environment, k)) for k in KINDS)
             rows.append(["", "", other.name, *its])
     return Table("Mean return", header, rows, labels=3), lines
 
