@@ -162,6 +162,48 @@ def test_the_table_at_the_papers_losses_is_that_of_both_reproductions(heading, t
         )
 
 
+def verdicts(reproduction):
+    """Verdicts by the paper's measures of a committed reproduction, by claim."""
+    with (ROOT / "leaderboard" / "reproduction" / reproduction / "claims.csv").open() as lines:
+        return {r["claim"]: r["verdict"] for r in csv.DictReader(lines) if r["kind"] == "paper"}
+
+
+def test_claims_on_standard_are_counted_rightly():
+    settled = {"by definition", "by construction"}
+    found = {c: v for c, v in verdicts("standard").items() if v not in settled}
+    run = {claim: verdict for claim, verdict in found.items() if verdict != "not run"}
+    mini = verdicts("mini")
+    differ = [claim for claim, verdict in run.items() if verdict != mini[claim]]
+    text = " ".join(PAGE.split())
+    assert f"[{len(run)} of {len(found)}](../leaderboard/reproduction/standard/README.md)" in text
+    assert sorted(differ) == ["delay-riqn-npn", "delay-riqn-rf", "memory-1-7"]
+    assert "Three of them differ" in text
+
+
+def test_losses_on_whole_episodes_are_those_of_table_2():
+    file = ROOT / "leaderboard" / "reproduction" / "reduced-paper" / "tables" / "table-2.csv"
+    kept = {}
+    with file.open() as lines:
+        for r in csv.DictReader(lines):
+            if r["environment"] in ENVIRONMENTS:
+                kept.setdefault(r["environment"], {})[r["kind"]] = float(r["value"])
+    lost = {
+        e: {k: (own["nominal"] - v) / abs(own["nominal"]) for k, v in own.items() if k != "nominal"}
+        for e, own in kept.items()
+    }
+    mean = {ENVIRONMENTS[e].title: round(100 * np.mean([*own.values()])) for e, own in lost.items()}
+    text = " ".join(PAGE.split())
+    robots = re.search(
+        r"they lose (\d+) \((\w+)\), (\d+) \((\w+)\), (\d+) \((\w+)\) and (\d+) % \((\w+)\)", text
+    )
+    found = robots.groups()
+    assert dict(zip(found[1::2], map(int, found[::2]), strict=True)) == {
+        title: mean[title] for title in ("HalfCheetah", "Walker2D", "Ant", "Hopper")
+    }
+    for environment in ("ant", "halfcheetah", "hopper", "walker2d"):
+        assert max(lost[environment], key=lost[environment].get) == "drift"
+
+
 SUITES = ROOT / "leaderboard" / "suites"
 
 
