@@ -5,7 +5,7 @@
 prints, per environment, how many rungs keep a share inside their 95 % interval, and the rungs that
 do not. Each interval is widened by 1.96 standard errors of the fresh mean, so that fewer than one
 in twenty are outside by chance. Rungs of a kind share their seeds: those outside come in groups.
-The exit code is 1 where fewer than nine in ten are inside.
+The exit code is 1 where fewer than nine in ten are inside. `--rung paper-whole` measures that rung.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.ladder import FRACTIONS, rungs_of
+from oodd_eval.data.ladder import RUNGS, WHOLE, all_rungs_of
 from oodd_eval.data.simulate.calibrate import kept_shares, measure, twins_of
 from oodd_eval.data.simulate.record import return_of
 from oodd_eval.names import select
@@ -25,8 +25,9 @@ FIRST_SEED = 970_000_000  # the calibration's begin at 950 000 000
 
 def fresh(task):
     environment, kind, name, strength, count = task
-    nominal = np.array([return_of(twin) for twin in twins_of(environment, FIRST_SEED, count)])
-    returns = np.array(measure(environment, kind, strength, FIRST_SEED, count))
+    given = {"first": FIRST_SEED, "count": count, "whole": name == WHOLE}
+    nominal = np.array([return_of(twin) for twin in twins_of(environment, **given)])
+    returns = np.array(measure(environment, kind, strength, **given))
     # The standard error of a fresh mean: the noise of the check itself is not the ladder's.
     error = (returns - nominal).std(ddof=1) / np.sqrt(count) / abs(nominal.mean())
     return environment, kind, name, float(kept_shares(returns, nominal)), float(error)
@@ -36,20 +37,22 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="all")
     parser.add_argument("--anomaly", default="all")
+    parser.add_argument("--rung", default="kept*")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
     inside, outside = {}, []
+    names = select("rung", options.rung, [*RUNGS, WHOLE])
     tasks = [
         (e, kind, name, rung.strength, options.episodes)
         for e in select("environment", options.env, ENVIRONMENTS)
         for kind in select("anomaly", options.anomaly, ANOMALIES)
-        for name, rung in rungs_of(e, kind).items()
-        if name not in FRACTIONS
+        for name, rung in all_rungs_of(e, kind).items()
+        if name in names
     ]
     with ProcessPoolExecutor(options.jobs) as pool:
         for environment, kind, name, kept, error in pool.map(fresh, tasks):
-            rung = rungs_of(environment, kind)[name]
+            rung = all_rungs_of(environment, kind)[name]
             low, high = rung.kept_low - 1.96 * error, rung.kept_high + 1.96 * error
             inside.setdefault(environment, []).append(low <= kept <= high)
             if not low <= kept <= high:

@@ -14,7 +14,16 @@ pytest.importorskip("gymnasium")
 from oodd_eval.cli.main import main
 from oodd_eval.data import ladder
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
-from oodd_eval.data.ladder import FRACTIONS, LEVELS, RUNGS, conditions_of, rungs_of, strength_of
+from oodd_eval.data.ladder import (
+    FRACTIONS,
+    LEVELS,
+    RUNGS,
+    WHOLE,
+    all_rungs_of,
+    conditions_of,
+    rungs_of,
+    strength_of,
+)
 from oodd_eval.data.simulate import build, calibrate
 from oodd_eval.data.simulate.build import build_split
 from oodd_eval.data.simulate.values import bound_of, unit_of
@@ -110,6 +119,31 @@ def test_every_kind_has_strengths_in_every_environment():
             assert strength_of(environment, anomaly, "paper") > 0
 
 
+def test_only_robots_have_strengths_for_whole_episodes_and_splits_without_a_cap_take_them():
+    for environment, info in ENVIRONMENTS.items():
+        capped, whole = (conditions_of("paper", environment, cap) for cap in (300, None))
+        for kind in ANOMALIES:
+            own = WHOLE in all_rungs_of(environment, kind)
+            assert own == (kind in TABLE1 and not info.discrete), (environment, kind)
+        for kind in TABLE1:
+            expected = "paper" if info.discrete else WHOLE
+            assert whole[f"{kind}@paper"] == strength_of(environment, kind, expected)
+            assert capped[f"{kind}@paper"] == strength_of(environment, kind, "paper")
+
+
+def test_what_robots_keep_of_whole_episodes_is_what_the_papers_policies_keep():
+    off = []
+    for environment in (e for e, info in ENVIRONMENTS.items() if not info.discrete):
+        for kind in TABLE1:
+            rung = all_rungs_of(environment, kind)[WHOLE]
+            assert rung.kept_low <= rung.kept <= rung.kept_high
+            if rung.reached:
+                off.append(abs(rung.kept - calibrate.levels_of(environment, kind)["paper"]))
+    assert len(off) > 24
+    assert np.median(off) < 0.02
+    assert max(off) < 0.1
+
+
 def test_unknown_rungs_and_what_is_not_calibrated_are_refused(own_ladder):
     assert strength_of("cartpole", "iid", "4th") == 0.5
     with pytest.raises(UnknownNameError, match="rung of iid in cartpole"):
@@ -137,11 +171,11 @@ def measured(monkeypatch, tmp_path):
     calls = []
     noise = np.random.default_rng(0).normal(size=32)
 
-    def measure(environment, kind, strength, *_):
+    def measure(environment, kind, strength, *_, whole=False):
         calls.append((kind, strength))
         if kind == "bias":
             return [100.0 if strength < STEP else 40.0] * 32
-        returns = curve(strength, 0.2) if kind != "stuck" else 100.0
+        returns = curve(strength, 0.05 if whole else 0.2) if kind != "stuck" else 100.0
         return list(returns + noise * strength)
 
     class Pool:
@@ -154,23 +188,23 @@ def measured(monkeypatch, tmp_path):
         def __exit__(self, *_):
             return False
 
-        def submit(self, function, *given):
+        def submit(self, function, *given, **named):
             from concurrent.futures import Future
 
             done = Future()
-            done.set_result(function(*given))
+            done.set_result(function(*given, **named))
             return done
 
     monkeypatch.setattr(calibrate, "measure", measure)
     monkeypatch.setattr(calibrate, "workers", Pool)
     monkeypatch.setattr(calibrate, "return_of", lambda _: 100.0)
-    monkeypatch.setattr(calibrate, "twins_of", lambda *_: [None] * 32)
+    monkeypatch.setattr(calibrate, "twins_of", lambda *_, **__: [None] * 32)
 
-    def go(kinds=("iid",), work=None):
-        work = work or tmp_path / "work.jsonl"
+    def go(kinds=("iid",), environments=("hopper",), **options):
         found = calibrate.calibrate(
-            tmp_path / "ladder.json", work, environments=["hopper"], kinds=kinds
-        )
+            tmp_path / "ladder.json", tmp_path / "work.jsonl", environments=environments,
+            kinds=kinds, **options,
+        )  # fmt: skip
         return found["hopper"]
 
     return go, calls, tmp_path
@@ -235,6 +269,20 @@ def test_entries_of_other_kinds_are_kept(measured):
     found = go(kinds=["drift"])
     assert [*found] == ["iid", "drift"]
     assert json.loads((place / "ladder.json").read_text())["hopper"].keys() == {"iid", "drift"}
+
+
+def test_on_whole_episodes_one_rung_of_the_papers_kinds_is_found_and_added(measured):
+    go, calls, _ = measured
+    capped = go(["iid", "delay"])
+    calls.clear()
+    both = go(["iid", "delay"], ["cartpole", "hopper"], whole=True)
+    assert {kind for kind, _ in calls} == {"iid"}
+    assert len(calls) < 12
+    assert both == capped | {"iid": capped["iid"] | {WHOLE: both["iid"][WHOLE]}}
+    found, level = both["iid"][WHOLE], calibrate.levels_of("hopper", "iid", whole=True)[WHOLE]
+    assert found["strength"] == pytest.approx(0.05 * (1 / level - 1), rel=0.12)
+    assert found["strength"] < 0.5 * both["iid"]["paper"]["strength"]
+    assert go(["iid", "delay"]) == both  # and a further calibration of the others keeps it
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=12))

@@ -1,7 +1,7 @@
 """``oodd-eval data``: build, import, verify, fetch and export splits, and describe them."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -88,14 +88,7 @@ def define(parser: Parser) -> None:
     add("place", metavar="FILE|DIR|URL", help="a split's directory, or a tar or zip archive of it")
     add("--digest", metavar="SHA256", help="the split's digest; another one is refused")
     add("--output", type=Path, metavar="DIR", help=place)
-    add = action("calibrate", "find the strengths of the ladder (extra sim)").options(
-        calibrate, "data calibrate --env cartpole --output ladder.json"
-    )
-    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
-    add("--anomaly", default="all", metavar="NAMES", help="kinds of anomalies (default: all)")
-    add("--output", required=True, type=Path, metavar="FILE", help="strengths, as JSON")
-    add("--work", type=Path, metavar="FILE", help="measured returns (default: OUTPUT.work)")
-    add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
+    _define_calibrate(action)
     add = action("export", "write a split in another project's format").options(
         export, "data export mini --format minari --output datasets"
     )
@@ -109,6 +102,22 @@ def define(parser: Parser) -> None:
     add("directory", type=Path, metavar="DIR", help="directory of the documents")
     add("--env", default="all", metavar="NAMES", help="environments to draw (default: all)")
     action("info", "describe a split").options(info, "data info mini")("name", help=split)
+    # fmt: on
+
+
+def _define_calibrate(action: Callable[[str, str], Parser]) -> None:
+    # fmt: off
+    add = action("calibrate", "find the strengths of the ladder (extra sim)").options(
+        calibrate, "data calibrate --env cartpole --output ladder.json"
+    )
+    add("--env", default="all", metavar="NAMES", help="environments (default: all)")
+    add("--anomaly", default="all", metavar="NAMES", help="kinds of anomalies (default: all)")
+    add("--whole", action="store_true",
+        help="robots on whole episodes, at the losses of the paper's Table 2 alone (default: at "
+        "most 300 steps, all rungs)")
+    add("--output", required=True, type=Path, metavar="FILE", help="strengths, as JSON")
+    add("--work", type=Path, metavar="FILE", help="measured returns (default: OUTPUT.work)")
+    add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")
     # fmt: on
 
 
@@ -234,8 +243,8 @@ def calibrate(options: argparse.Namespace) -> int:
     work = options.work or options.output.with_name(options.output.name + ".work")
     found = find_strengths(
         options.output, work, environments=select("environment", options.env, ENVIRONMENTS),
-        kinds=select("anomaly", options.anomaly, ANOMALIES), jobs=options.jobs,
-        progress=notes.print,
+        kinds=select("anomaly", options.anomaly, ANOMALIES), whole=options.whole,
+        jobs=options.jobs, progress=notes.print,
     )  # fmt: skip
     count = sum(map(len, found.values()))
     make_console().print(

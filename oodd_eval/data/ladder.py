@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, TABLE1, Suite, join_condition
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite, join_condition
 from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
@@ -28,6 +28,10 @@ FRACTIONS: Final = MappingProxyType({"64th": 1 / 64, "16th": 1 / 16, "4th": 1 / 
 """Parts of the strength of ``kept99``, by rung, weakest first."""
 
 PAPER: Final = "paper"  # the rung at which the return's ratio is that of the paper's Table 2
+WHOLE: Final = "paper-whole"  # the same for robots, measured on whole episodes
+
+ROBOTS_CAP: Final = 300
+"""Longest episode of a robot at all other rungs, as in mini; other episodes run to their end."""
 
 RUNGS: Final = (*FRACTIONS, *LEVELS, PAPER)
 """Names of all strengths, weakest first, and the paper's."""
@@ -86,20 +90,34 @@ def rungs_of(environment: str, kind: str) -> dict[str, Rung]:
     return {name: Rung(**rung) for name, rung in _entry(environment, kind)["rungs"].items()}
 
 
-def strength_of(environment: str, kind: str, rung: str) -> float:
-    """Return the strength of a rung, ``"paper"`` among them; `UnknownNameError` for another."""
+def all_rungs_of(environment: str, kind: str) -> dict[str, Rung]:
+    """Return the rungs of a kind, and those of the paper's losses behind them."""
     entry = _entry(environment, kind)
-    known = entry["rungs"] | ({PAPER: entry[PAPER]} if PAPER in entry else {})
+    papers = {name: Rung(**entry[name]) for name in (PAPER, WHOLE) if name in entry}
+    return rungs_of(environment, kind) | papers
+
+
+def strength_of(environment: str, kind: str, rung: str) -> float:
+    """Return the strength of a rung, the paper's among them; `UnknownNameError` for another."""
+    known = all_rungs_of(environment, kind)
     check_known(f"rung of {kind} in {environment}", known, rung)
-    return float(known[rung]["strength"])
+    return known[rung].strength
 
 
-def conditions_of(suite: Suite, environment: str) -> dict[str, float | None]:
-    """Return the strength of each condition of a suite; None stands for the values of Table 1."""
+def conditions_of(
+    suite: Suite, environment: str, episode_cap: int | None = None
+) -> dict[str, float | None]:
+    """Return the strength of each condition of a suite; None stands for the values of Table 1.
+
+    What an anomaly costs a robot depends on the length of episodes: without `episode_cap` the
+    suite ``paper`` takes the strengths that were measured on whole ones.
+    """
     if suite == "table1":
         return dict.fromkeys(TABLE1)
     if suite == "paper":
-        return {join_condition(a, PAPER): strength_of(environment, a, PAPER) for a in TABLE1}
+        whole = episode_cap is None and not ENVIRONMENTS[environment].discrete
+        rung = WHOLE if whole else PAPER
+        return {join_condition(a, PAPER): strength_of(environment, a, rung) for a in TABLE1}
     kinds = [kind for kind in ANOMALIES if kind in read_ladder().get(environment, {})]
     if not kinds:
         _entry(environment, next(iter(ANOMALIES)))

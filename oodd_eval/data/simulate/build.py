@@ -233,7 +233,8 @@ def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
     """Return the strength of each condition of a suite, as an entry of the manifest."""
     if definition.suite == "table1":
         return {}
-    return {"strengths": conditions_of(definition.suite, environment)}
+    suite, cap = definition.suite, definition.episode_cap
+    return {"strengths": conditions_of(suite, environment, cap)}
 
 
 def _base(
@@ -251,8 +252,8 @@ def _base(
 
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
-    strengths = definition.strengths or conditions_of(definition.suite, environment)
-    conditions = tuple(strengths.items())
+    suite, cap = definition.suite, definition.episode_cap
+    conditions = tuple((definition.strengths or conditions_of(suite, environment, cap)).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
         own = conditions if part == "test" else ()

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
-from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER
+from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
 from oodd_eval.data.monotone import isotonic
 from oodd_eval.data.simulate.build import workers
 from oodd_eval.data.simulate.policies import load_policy
@@ -37,7 +37,6 @@ from oodd_eval.data.simulate.record import (
 from oodd_eval.data.simulate.values import bound_of, unit_of
 
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
-ROBOTS_CAP: Final = 300  # as in mini; the others run to their end
 STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass
 SMALLEST: Final = 4.0**-7  # of the bound; weaker strengths are not tried
 FINEST: Final = 1.1  # ratio of neighbours between which nothing is measured any more
@@ -49,9 +48,9 @@ Curve = dict[float, list[float]]
 """Returns of the seeds, in their order, by strength."""
 
 
-def setup_of(environment: str) -> Setup:
-    """Return policy and cap with which returns are measured."""
-    cap = None if ENVIRONMENTS[environment].discrete else ROBOTS_CAP
+def setup_of(environment: str, *, whole: bool = False) -> Setup:
+    """Return policy and cap with which returns are measured, `whole` without a cap."""
+    cap = None if whole or ENVIRONMENTS[environment].discrete else ROBOTS_CAP
     return Setup(environment, load_policy(environment), cap)
 
 
@@ -61,20 +60,23 @@ def episodes_of(environment: str) -> int:
 
 
 @functools.cache
-def twins_of(environment: str, first: int = FIRST_SEED, count: int = 0) -> list[Episode]:
+def twins_of(
+    environment: str, first: int = FIRST_SEED, count: int = 0, *, whole: bool = False
+) -> list[Episode]:
     """Return the nominal episodes of some seeds, by default of all that are measured on."""
-    setup, count = setup_of(environment), count or episodes_of(environment)
+    setup, count = setup_of(environment, whole=whole), count or episodes_of(environment)
     return [setup.record(first + i) for i in range(count)]
 
 
 def measure(
-    environment: str, kind: str, strength: float, first: int = FIRST_SEED, count: int = 0
-) -> list[float]:
+    environment: str, kind: str, strength: float, first: int = FIRST_SEED, count: int = 0,
+    *, whole: bool = False,
+) -> list[float]:  # fmt: skip
     """Return the returns of the seeds under an anomaly of a strength."""
-    setup = setup_of(environment)
+    setup = setup_of(environment, whole=whole)
     episodes = (
         record_anomalous(setup, f"{kind}@{strength}", strength, twin, redraws=0)
-        for twin in twins_of(environment, first, count)
+        for twin in twins_of(environment, first, count, whole=whole)
     )
     return [return_of(episode) for episode in episodes]
 
@@ -119,30 +121,36 @@ def nearest(curve: Floats, level: float) -> int:
     return before if abs(curve[before] - level) < abs(curve[i] - level) else i
 
 
-def levels_of(environment: str, kind: str) -> dict[str, float]:
-    """Return the shares to find, by rung; for a kind of the paper that of its Table 2, too."""
-    found = dict(LEVELS)
+def levels_of(environment: str, kind: str, *, whole: bool = False) -> dict[str, float]:
+    """Return the shares to find, by rung; for a kind of the paper that of its Table 2, too.
+
+    On `whole` episodes only the latter is found.
+    """
+    found = {} if whole else dict(LEVELS)
     if kind in TABLE1:
         table = paper_tables()["table2_policy_return"][environment]
         nominal, changed = float(table["nominal"]), float(table[kind])
-        found[PAPER] = 1 - (nominal - changed) / abs(nominal)
+        found[WHOLE if whole else PAPER] = 1 - (nominal - changed) / abs(nominal)
     return found
 
 
-def next_strength(environment: str, kind: str, curve: Curve, nominal: Sequence[float]) -> float:
+def next_strength(
+    environment: str, kind: str, curve: Curve, nominal: Sequence[float], *, whole: bool = False
+) -> float:
     """Return the strength to measure next; 0 when all levels are found."""
     bound = bound_of(environment, kind)
+    levels = levels_of(environment, kind, whole=whole).values()
     if not curve:
         return bound
     strengths, returns, base = _arrays(curve, nominal)
     kept = kept_shares(returns, base)
-    # Down from the bound, until the policy keeps all but nothing.
+    # Down from the bound, until the policy keeps nearly all, or more than any of the levels.
     weakest = float(strengths[0])
-    if kept[0] < 0.995 and weakest > SMALLEST * bound * 1.01:
+    if kept[0] < min(0.995, max(levels) + 0.02) and weakest > SMALLEST * bound * 1.01:
         return _rounded(weakest / STEP)
     fitted = falling(kept)
     errors = (returns - base).std(axis=1, ddof=1) / math.sqrt(len(base)) / abs(base.mean())
-    for level in levels_of(environment, kind).values():
+    for level in levels:
         i = int((fitted <= level).argmax()) if (fitted <= level).any() else 0
         if not i or (ratio := strengths[i] / strengths[i - 1]) <= FINEST:
             continue
@@ -163,9 +171,12 @@ def _arrays(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats, Flo
 
 
 def find_rungs(
-    environment: str, kind: str, curve: Curve, nominal: Sequence[float]
+    environment: str, kind: str, curve: Curve, nominal: Sequence[float], *, whole: bool = False
 ) -> dict[str, Any]:
-    """Return the entry of a kind in ``ladder.json`` from measured returns."""
+    """Return the entry of a kind in ``ladder.json`` from measured returns.
+
+    From those of `whole` episodes it is one rung, to be added to the entry.
+    """
     bound = bound_of(environment, kind)
     strengths, returns, base = _arrays(curve, nominal)
     kept = kept_shares(returns, base)
@@ -186,7 +197,9 @@ def find_rungs(
             "reached": bool(fitted[-1] <= level),
         }  # fmt: skip
 
-    levels = levels_of(environment, kind)
+    levels = levels_of(environment, kind, whole=whole)
+    if whole:
+        return {WHOLE: rung(levels[WHOLE])}
     rungs: dict[str, dict[str, Any]] = {}
     for name in LEVELS:
         found = rung(levels[name])
@@ -205,16 +218,24 @@ def _rounded(value: float) -> float:
 
 def calibrate(
     output: Path, work: Path, *, environments: Iterable[str], kinds: Sequence[str],
-    jobs: int | None = None, progress: Callable[[str], None] = lambda _text: None,
+    whole: bool = False, jobs: int | None = None,
+    progress: Callable[[str], None] = lambda _text: None,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Measure and find the rungs of some environments and kinds; return all that `output` has.
 
-    Returns that `work` holds are not measured again. Entries of other environments and kinds in
-    `output` are kept.
+    `whole` finds the rung of robots for whole episodes, and of the paper's kinds alone. Returns
+    that `work` holds are not measured again. Other entries and rungs in `output` are kept.
     """
-    places = [(e, kind) for e in environments for kind in kinds]
+    places = [
+        (e, kind)
+        for e in environments for kind in kinds
+        if not whole or (kind in TABLE1 and not ENVIRONMENTS[e].discrete)
+    ]  # fmt: skip
     measured, broken = _read_work(work)
-    key = {e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e)] for e, _ in places}
+    caps = [WHOLE] if whole else []
+    key = {
+        e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps] for e, _ in places
+    }
     work.parent.mkdir(parents=True, exist_ok=True)
     with workers(jobs) as pool, work.open("a", encoding="utf-8") as lines:
         lines.write("\n" * broken)
@@ -231,12 +252,14 @@ def calibrate(
         pending: dict[Future[list[float]], tuple[str, str, float]] = {}
 
         def go_on(e: str, kind: str) -> None:
-            if strength := next_strength(e, kind, curve(e, kind), curve(e, "")[0.0]):
-                pending[pool.submit(measure, e, kind, strength)] = e, kind, strength
+            nominal = curve(e, "")[0.0]
+            if strength := next_strength(e, kind, curve(e, kind), nominal, whole=whole):
+                future = pool.submit(measure, e, kind, strength, whole=whole)
+                pending[future] = e, kind, strength
 
         for e in dict.fromkeys(e for e, _ in places):
             if not curve(e, ""):
-                keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e)])
+                keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e, whole=whole)])
         for place in places:
             go_on(*place)
         count = 0
@@ -249,8 +272,8 @@ def calibrate(
             go_on(e, kind)
         found = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
         for e, kind in places:
-            own = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0])
-            found.setdefault(e, {})[kind] = own
+            own = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0], whole=whole)
+            found[e] = found.get(e, {}) | {kind: found.get(e, {}).get(kind, {}) | own}
     ordered = {e: found[e] for e in ENVIRONMENTS if e in found}
     write_text(output, json.dumps(ordered, indent=1) + "\n")
     return ordered

@@ -12,7 +12,16 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import write_bytes, write_text
-from oodd_eval.data.ladder import FRACTIONS, PAPER, Rung, read_ladder, rungs_of
+from oodd_eval.data.ladder import (
+    FRACTIONS,
+    PAPER,
+    ROBOTS_CAP,
+    WHOLE,
+    Rung,
+    all_rungs_of,
+    read_ladder,
+    rungs_of,
+)
 from oodd_eval.data.simulate.policies import FROZEN
 from oodd_eval.data.simulate.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
 
@@ -159,14 +168,23 @@ sensor anomaly corrupts {count} of those that may break, drawn for each episode.
 
 A rung is a strength at which the policy keeps that share of its return; `4th`, `16th` and `64th`
 are these parts of the strength of `kept99`, and cost nothing yet. At `{PAPER}` the policy loses
-what the paper's Table 2 says. Intervals are 95 %: of the strength at which the share is kept, and
-of the share that is kept at the strength.
+what the paper's Table 2 says{_whole(environment)}. Intervals are 95 %: of the strength at which
+the share is kept, and of the share that is kept at the strength.
 
 A plot shows one sensor of an episode (orange) and of its nominal twin (grey) around the onset: of
 the sensors that may have changed, the one that differs most. A dot marks the end of the episode.
 
 {kinds}
 """
+
+
+def _whole(environment: str) -> str:
+    """Return what a page says of the length of episodes."""
+    if ENVIRONMENTS[environment].discrete:
+        return ""
+    return (
+        f", in episodes of at most {ROBOTS_CAP} steps as for all rungs; at `{WHOLE}` in whole ones"
+    )
 
 
 _ACTIONS: Final = {
@@ -186,10 +204,7 @@ def _kind(environment: str, kind: str) -> str:
         return "\n\n".join([*parts, "Not calibrated."])
     unit, bound = unit_of(environment, kind), bound_of(environment, kind)
     parts.append(f"Strength: {unit}; at most {bound:g}.")
-    rungs = rungs_of(environment, kind)
-    if PAPER in (entry := read_ladder()[environment][kind]):
-        rungs[PAPER] = Rung(**entry[PAPER])
-    rows = [_rung(name, rung) for name, rung in rungs.items()]
+    rows = [_rung(name, rung) for name, rung in all_rungs_of(environment, kind).items()]
     parts.append(_table(rows, ("rung", "strength", "return kept", "reached")))
     name, strength = pictured(environment, kind)
     about = f"One sensor of an episode under {kind} at {name} ({strength:g}), and of its twin"
