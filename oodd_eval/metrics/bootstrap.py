@@ -61,7 +61,7 @@ def resampled(contribution: Contribution, weights: Weights) -> Samples:
     if contribution.median:
         return _medians(contribution, weights)
     numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
-    if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
+    if contribution.is_mean:  # every resample has n trajectories
         return numerator / len(contribution.denominator)
     denominator = np.einsum("rn,n->r", weights, contribution.denominator)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -267,7 +267,29 @@ def sample_cells(cells: Sequence[DrawnCell]) -> Samples:
     seeds where there are several. Differences, sums and `mean_samples` of what this returns for
     several detectors or anomalies are paired.
     """
-    by_seed: dict[int, list[Samples]] = {}
+    by_seed: dict[int, list[DrawnCell]] = {}
     for cell in cells:
-        by_seed.setdefault(cell.seed, []).append(cell.samples)
-    return mean_over_seeds([mean_samples(by_seed[seed]) for seed in sorted(by_seed)])
+        by_seed.setdefault(cell.seed, []).append(cell)
+    return mean_over_seeds([_sample_seed(by_seed[seed]) for seed in sorted(by_seed)])
+
+
+def _sample_seed(cells: Sequence[DrawnCell]) -> Samples:
+    """Return the resamples of a mean over the cells of one detector seed.
+
+    The means of an environment have the same weights: they are added, and resampled once.
+    """
+    means = [c for c in cells if c.contribution.is_mean]
+    ratios = [c.samples for c in cells if not c.contribution.is_mean]
+    if not means:
+        return mean_samples(ratios)
+    sums: dict[str, list[DrawnCell]] = {}
+    for cell in means:
+        sums.setdefault(cell.environment, []).append(cell)
+    total: Samples = np.zeros(len(means[0].weights))
+    for own in sums.values():
+        added = np.sum([c.contribution.numerator for c in own], axis=0)
+        total += np.einsum("rn,n->r", own[0].weights, added) / len(added)
+    stacked = np.array(ratios or [np.full(1, np.nan)])
+    defined = ~np.isnan(stacked)
+    total += np.where(defined, stacked, 0.0).sum(axis=0)
+    return np.asarray(total / (len(means) + defined.sum(axis=0)))
