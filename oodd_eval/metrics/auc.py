@@ -50,11 +50,6 @@ class Contribution:
         return float(self.numerator.sum()) / total if total else float("nan")
 
     @cached_property
-    def is_mean(self) -> bool:
-        """Whether it is the mean of the numerators."""
-        return not self.median and bool((self.denominator == 1).all())
-
-    @cached_property
     def n(self) -> int:
         """Number of trajectories that contribute."""
         return int(np.count_nonzero(self.denominator))

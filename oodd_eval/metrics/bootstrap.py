@@ -61,7 +61,7 @@ def resampled(contribution: Contribution, weights: Weights) -> Samples:
     if contribution.median:
         return _medians(contribution, weights)
     numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
-    if contribution.is_mean:  # every resample has n trajectories
+    if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
         return numerator / len(contribution.denominator)
     denominator = np.einsum("rn,n->r", weights, contribution.denominator)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -276,20 +276,22 @@ def sample_cells(cells: Sequence[DrawnCell]) -> Samples:
 def _sample_seed(cells: Sequence[DrawnCell]) -> Samples:
     """Return the resamples of a mean over the cells of one detector seed.
 
-    The means of an environment have the same weights: they are added, and resampled once.
+    Ratios with the same denominators are added before they are resampled. Up to the onset all
+    anomalies of an environment are the same, so that most metrics have one sum for each of these.
     """
-    means = [c for c in cells if c.contribution.is_mean]
-    ratios = [c.samples for c in cells if not c.contribution.is_mean]
-    if not means:
-        return mean_samples(ratios)
-    sums: dict[str, list[DrawnCell]] = {}
-    for cell in means:
-        sums.setdefault(cell.environment, []).append(cell)
-    total: Samples = np.zeros(len(means[0].weights))
-    for own in sums.values():
-        added = np.sum([c.contribution.numerator for c in own], axis=0)
-        total += np.einsum("rn,n->r", own[0].weights, added) / len(added)
-    stacked = np.array(ratios or [np.full(1, np.nan)])
-    defined = ~np.isnan(stacked)
-    total += np.where(defined, stacked, 0.0).sum(axis=0)
-    return np.asarray(total / (len(means) + defined.sum(axis=0)))
+    groups: dict[object, list[DrawnCell]] = {}
+    for cell in cells:
+        own = cell.contribution
+        alike = (cell.environment, own.denominator.tobytes()) if not own.median else id(cell)
+        groups.setdefault(alike, []).append(cell)
+    total, count = np.zeros((2, len(cells[0].weights)))
+    for group in groups.values():
+        samples = group[0].samples
+        if len(group) > 1:
+            added = np.sum([cell.contribution.numerator for cell in group], axis=0)
+            whole = Contribution(added, group[0].contribution.denominator)
+            samples = resampled(whole, group[0].weights)
+        undefined = np.isnan(samples)
+        total += np.where(undefined, 0.0, samples)
+        count += np.where(undefined, 0, len(group))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
