@@ -6,12 +6,14 @@ bits between machines: a count of resamples therefore takes what is equal up to 
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds
 
@@ -25,9 +27,11 @@ ENOUGH: Final = 100  # resamples beyond the difference, with which a p-value nee
 _BLOCK: Final = 1024  # resamples at a time: what is computed stays in the processor's cache
 _ROUNDING: Final = 1e-9  # relative; statistics that differ by less are equal
 _SINGLE: Final = 1e-3  # relative; far more than single precision loses
+_WEAK: Final = 1e-2  # studentized differences below which single precision tells too little
 
-Array = NDArray[np.floating]
 Floats = NDArray[np.float64]
+Singles = NDArray[np.floating]
+Bools = NDArray[np.bool_]
 Counts = NDArray[np.unsignedinteger]
 
 
@@ -61,38 +65,51 @@ def _draws(key: str, n: int, resamples: int) -> Counts:
     return drawn
 
 
-class _Moments(NamedTuple):
-    """Of some pairs in some resamples: shifts d* - d, and two terms whose difference is s* ** 2."""
+class _Group:
+    """A row and others, with what is counted of their pairs.
 
-    shifts: Array
-    squares: Array
-    means: Array
-
-
-class _Group(NamedTuple):
-    """A row and others: the counts of resamples beyond the difference, and not beyond it.
-
-    `rare` are the places of the pairs that need further resamples, whose names and influences are
-    `others` and `effects`.
+    `effects` are the influences on the differences of all test seeds, shape (others, seeds), and
+    `observed` the studentized differences, 0 where nobody knows the noise. `counts` are the
+    resamples beyond the observed difference, and those not beyond it, of each pair.
     """
 
-    row: str
-    others: Sequence[str]
-    effects: Mapping[str, Floats]
-    observed: Floats
-    counts: NDArray[np.int64]
-    ends: list[tuple[float, float]]
-    rare: NDArray[np.intp]
+    def __init__(
+        self, row: int, others: NDArray[np.intp], effects: Floats, observed: Floats
+    ) -> None:
+        self.row, self.others, self.effects, self.observed = row, others, effects, observed
+        self.counts = np.zeros((2, len(others)), dtype=np.int64)
+
+    def only(self, places: NDArray[np.intp]) -> "_Group":
+        """Return the group with some of the others, nothing counted."""
+        return _Group(self.row, self.others[places], self.effects[places], self.observed[places])
+
+
+class _Part(NamedTuple):
+    """Some resamples: how often test seeds are drawn, and shifts and variances by detector seeds.
+
+    Shapes are (seeds, resamples) and (2, rows, resamples).
+    """
+
+    drawn: Counts
+    own: Floats
 
 
 class PairTests:
-    """The bootstrap of pairs of rows with R resamples."""
+    """The bootstrap of pairs of rows with R resamples.
+
+    On which side of the observed difference a resample is, is told in single precision where that
+    suffices, and else in double precision.
+    """
 
     def __init__(self, rows: Mapping[str, Influences], resamples: int) -> None:
-        self._rows, self.resamples = rows, resamples
-        self._seeds: dict[tuple[str, int], tuple[Floats, Floats]] = {}
-        first = next(iter(rows.values()), Influences({}, np.zeros(0), ""))
-        self._sizes = {name: z.size for name, z in first.shared.items()}
+        self.resamples = resamples
+        self._places = {name: i for i, name in enumerate(rows)}
+        self._rows = list(rows.values())
+        shared = self._rows[0].shared if rows else {}
+        self._sizes = {name: z.size for name, z in shared.items()}
+        ends = itertools.accumulate(self._sizes.values(), initial=0)
+        self._slices = [slice(*both) for both in itertools.pairwise(ends)]
+        self._influences = np.array([np.concatenate([*r.shared.values()]) for r in self._rows])
         # No p-value is below the chance that all seeds have the signs that they have.
         self._floor = 2.0 ** -sum(self._sizes.values())
 
@@ -105,139 +122,148 @@ class PairTests:
             Of a row's name, the names of others, and the differences of its mean to theirs: shape
             (others,).
         """
-        found = [self._first(*group) for group in groups]
-        self._count_further([group for group in found if group.rare.size])
-        self._seeds.clear()
-        return [self._tested(group) for group in found]
+        if not any(others for _, others, _ in groups):
+            return [[] for _ in groups]
+        # These products are small: threads of a matrix library would wait for one another.
+        with threadpool_limits(1, user_api="blas"):
+            return self._tested(groups)
 
-    def _first(self, row: str, others: Sequence[str], differences: Floats) -> _Group:
-        """Return what the first resamples say of a row and others."""
-        effects = self._effects(row, others)
+    def _tested(self, groups: Sequence[tuple[str, Sequence[str], Floats]]) -> list[list[Tested]]:
         total = min(FIRST, self.resamples)
-        shifts = np.empty((len(others), total))
-        variances = np.empty_like(shifts)
-        for start in range(0, total, _BLOCK):
-            part = slice(start, min(start + _BLOCK, total))
-            found = self._moments(row, others, effects, part, np.dtype(np.float64))
-            shifts[:, part] = found.shifts
-            variances[:, part] = np.maximum(found.squares - found.means, 0.0)
-        observed = self._observed(row, others, effects, differences)
-        beyond = _beyond(shifts, variances, observed[:, None])
-        # On the other side of the observed one, or equal to it.
-        reverse = ~_beyond(shifts, variances, observed[:, None], 1 + _ROUNDING)
-        counts = np.stack([beyond.sum(axis=1), reverse.sum(axis=1)])
-        # A difference of 0, or one whose noise nobody knows.
-        counts[:, (np.abs(differences) <= NOISE) | (observed == 0)] = total
-        few = np.flatnonzero(counts[0] < ENOUGH) if total < self.resamples else np.arange(0)
-        sizes = list(self._sizes.values())
-        ends = [bounds(d + own, d, sizes) for d, own in zip(differences, shifts, strict=True)]
-        names = [others[i] for i in few.tolist()]
-        own = {e: z[few] for e, z in effects.items()}
-        return _Group(row, names, own, observed, counts, ends, few)
-
-    def _tested(self, group: _Group) -> list[Tested]:
-        totals = np.full(group.counts.shape, min(FIRST, self.resamples))
-        totals[0, group.rare] = self.resamples
-        p = np.maximum((1 + group.counts) / (totals + 1), self._floor)
-        return [
-            Tested(*ends, *(both if side >= 0 else both[::-1]))
-            for ends, both, side in zip(group.ends, p.T.tolist(), group.observed, strict=True)
-        ]
-
-    def _effects(self, row: str, others: Sequence[str]) -> dict[str, Floats]:
-        """Return the influences on the differences by environment: shape (others, n)."""
-        own = self._rows[row].shared
-        found = {e: z - np.array([self._rows[o].shared[e] for o in others]) for e, z in own.items()}
-        # Rounding alone must not look like a difference between seeds.
-        return {e: np.where(np.abs(z) > NOISE, z, 0.0) for e, z in found.items()}
-
-    def _observed(
-        self, row: str, others: Sequence[str], effects: Mapping[str, Floats], differences: Floats
-    ) -> Floats:
-        """Return the studentized differences: shape (others,)."""
-        variances = np.zeros(len(others))
-        for z in effects.values():
-            n = z.shape[1]
-            variances += z.var(axis=1) * _of_mean(1.0, n) if n > 1 else math.inf
-        for i, other in enumerate(others):
-            for own in (self._rows[row].own, self._rows[other].own):
-                variances[i] += _of_mean(float(own.var()), own.size) if own.size else 0.0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.divide(differences, np.sqrt(variances)))
-
-    def _moments(
-        self, row: str, others: Sequence[str], effects: Mapping[str, Floats], part: slice,
-        precision: np.dtype[np.floating],
-    ) -> _Moments:  # fmt: skip
-        """Return the moments of pairs in a part of the resamples: shapes (others, resamples)."""
-        shape = len(others), part.stop - part.start
-        found = _Moments(*(np.zeros(shape, precision) for _ in range(3)))
-        for environment, z in effects.items():
-            n = z.shape[1]
-            if n == 1:  # one seed says nothing of the noise
-                found.squares[...] += math.inf
-                continue
-            drawn = _draws(environment, n, self.resamples)[:, part].astype(precision)
-            mean = (z / n).astype(precision) @ drawn
-            found.shifts[...] += mean
-            np.multiply(mean, mean, out=mean)
-            mean *= precision.type(_of_mean(1.0, n))
-            found.means[...] += mean
-            found.squares[...] += (z * z * _of_mean(1 / n, n)).astype(precision) @ drawn
-        shift, variance = self._by_seeds(row, part)
-        theirs = [self._by_seeds(other, part) for other in others]
-        found.shifts[...] += shift - np.array([own for own, _ in theirs])
-        found.squares[...] += variance + np.array([own for _, own in theirs])
+        first = [self._group(*group) for group in groups]
+        self._count(first, 0, total)
+        rare = []
+        for group in first:
+            group.counts[:, group.observed == 0] = total
+            few = group.counts[0] < ENOUGH if total < self.resamples else np.zeros(0, dtype=bool)
+            rare.append(np.flatnonzero(few))
+        further = [group.only(places) for group, places in zip(first, rare, strict=True)]
+        self._count(further, total, self.resamples)
+        shifts, sizes = self._shifts(total), list(self._sizes.values())
+        found = []
+        for group, places, more, (*_, differences) in zip(
+            first, rare, further, groups, strict=True
+        ):
+            totals = np.full(group.counts.shape, total)
+            totals[0, places] = self.resamples
+            group.counts[0, places] += more.counts[0]
+            p = np.maximum((1 + group.counts) / (totals + 1), self._floor)
+            own = shifts[group.row] - shifts[group.others]
+            found.append([
+                Tested(*bounds(d + one, d, sizes), *(both if side >= 0 else both[::-1]))
+                for d, one, both, side in zip(
+                    differences, own, p.T.tolist(), group.observed, strict=True
+                )
+            ])  # fmt: skip
         return found
 
-    def _by_seeds(self, row: str, part: slice) -> tuple[Floats, Floats]:
-        """Return shifts by a row's detector seeds, and the variances of its mean over them."""
-        if (row, part.start) not in self._seeds:
-            z = self._rows[row].own
-            found = np.zeros(part.stop - part.start), np.zeros(part.stop - part.start)
-            if z.size:
-                drawn = _draws(self._rows[row].key, z.size, self.resamples)[:, part]
-                found = _mean_and_variance(z, drawn.astype(np.float64))
-            self._seeds[row, part.start] = found
-        return self._seeds[row, part.start]
+    def _group(self, row: str, others: Sequence[str], differences: Floats) -> _Group:
+        """Return a group with the studentized differences of its pairs."""
+        place, places = self._places[row], np.array([self._places[o] for o in others], np.intp)
+        effects = self._influences[place] - self._influences[places]
+        # Rounding alone must not look like a difference between seeds.
+        effects = np.where(np.abs(effects) > NOISE, effects, 0.0)
+        variances = np.zeros(len(others))
+        for n, own in zip(self._sizes.values(), self._slices, strict=True):
+            variances += effects[:, own].var(axis=1) * _of_mean(1.0, n) if n > 1 else math.inf
+        for i, other in enumerate(places):
+            for own_seeds in (self._rows[place].own, self._rows[other].own):
+                size = own_seeds.size
+                variances[i] += _of_mean(float(own_seeds.var()), size) if size else 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            observed = np.divide(differences, np.sqrt(variances))
+        return _Group(place, places, effects, np.where(np.abs(differences) > NOISE, observed, 0.0))
 
-    def _count_further(self, groups: Sequence[_Group]) -> None:
-        """Add the resamples after the first that reach the differences to the counts.
+    def _part(self, start: int, stop: int) -> _Part:
+        """Return some of the resamples."""
+        part = slice(start, stop)
+        drawn = [_draws(e, n, self.resamples)[:, part] for e, n in self._sizes.items()]
+        own = np.zeros((2, len(self._rows), stop - start))
+        for i, row in enumerate(self._rows):
+            if row.own.size:
+                counts = _draws(row.key, row.own.size, self.resamples)[:, part]
+                own[:, i] = _mean_and_variance(row.own, counts.astype(np.float64))
+        return _Part(np.concatenate(drawn), own)
 
-        What may reach them is sought in single precision, and then computed in double precision.
+    def _shifts(self, total: int) -> Floats:
+        """Return the shifts of all rows' means in the first resamples: shape (rows, total).
+
+        Sums are taken in a fixed order, so that an interval depends on its two rows alone.
         """
-        single = np.dtype(np.float32)
-        for start in range(FIRST, self.resamples, _BLOCK):
-            part = slice(start, min(start + _BLOCK, self.resamples))
-            self._seeds.clear()  # of other resamples
-            for row, others, effects, all_observed, all_counts, _, rare in groups:
-                observed = np.where(np.isfinite(all_observed), all_observed, 0.0)[rare]
-                shifts, squares, means = self._moments(row, others, effects, part, single)
-                signs = np.sign(observed).astype(single)[:, None]
-                near = shifts * signs > 0
-                shifts *= shifts
-                squares *= np.float32(1 - _SINGLE)
-                squares -= means
-                squares *= (observed**2).astype(single)[:, None]
-                near &= shifts >= squares
+        found = np.empty((len(self._rows), total))
+        weights = self._influences / np.repeat([*self._sizes.values()], [*self._sizes.values()])
+        for start in range(0, total, _BLOCK):
+            part = self._part(start, stop := min(start + _BLOCK, total))
+            drawn = part.drawn.astype(np.float64)
+            for i, own in enumerate(weights):
+                found[i, start:stop] = np.einsum("n,nr->r", own, drawn) + part.own[0, i]
+        return found
+
+    def _count(self, groups: Sequence[_Group], start: int, stop: int) -> None:
+        """Add resamples to the counts of the pairs whose noise is known."""
+        tested = [(g, self._terms(g)) for g in groups if g.observed.any()]
+        for begin in range(start, stop, _BLOCK) if tested else ():
+            part = self._part(begin, min(begin + _BLOCK, stop))
+            single = _Part(part.drawn.astype(np.float32), part.own.astype(np.float32))
+            for group, terms in tested:
+                sure, near = self._sides(group, terms, single)
+                beyond = sure.sum(axis=1)
+                group.counts[0] += beyond
+                group.counts[1] += single.own.shape[2] - beyond
                 pairs, places = np.nonzero(near)
                 if pairs.size:
-                    exact = self._chosen(row, others, effects, part, pairs, places)
-                    reached = pairs[_beyond(*exact, observed[pairs])]
-                    all_counts[0, rare] += np.bincount(reached, minlength=len(others))
+                    exact = *self._chosen(group, part, pairs, places), group.observed[pairs]
+                    # On the other side of the observed one, or equal to it.
+                    for i, factor in enumerate((1 - _ROUNDING, 1 + _ROUNDING)):
+                        reached = pairs[_beyond(*exact, factor)]
+                        own = np.bincount(reached, minlength=len(beyond))
+                        group.counts[i] += own if i == 0 else -own
+
+    def _terms(self, group: _Group) -> tuple[Singles, Singles, Singles]:
+        """Return the factors of draws in shifts, their squares, and variances, see `_sides`."""
+        shifts, means, squares = (np.empty_like(group.effects) for _ in range(3))
+        for n, own in zip(self._sizes.values(), self._slices, strict=True):
+            z = group.effects[:, own]
+            shifts[:, own], means[:, own] = z / n, z / n * math.sqrt(_of_mean(1.0, n))
+            squares[:, own] = z * z * _of_mean(1 / n, n)
+        return shifts.astype(np.float32), means.astype(np.float32), squares.astype(np.float32)
+
+    def _sides(
+        self, group: _Group, terms: tuple[Singles, Singles, Singles], part: _Part
+    ) -> tuple[Bools, Bools]:
+        """Tell which resamples are beyond the observed differences, and which are too near to it.
+
+        A shift is beyond where its square is above that of the observed one times the variance.
+        """
+        known = np.where(np.isfinite(group.observed), group.observed, 0.0)
+        sign, square = (x.astype(np.float32)[:, None] for x in (np.sign(known), known * known))
+        shifts = terms[0] @ part.drawn
+        shifts += part.own[0, group.row] - part.own[0, group.others]
+        right = shifts * sign > 0
+        squares = terms[2] @ part.drawn
+        squares += part.own[1, group.row] + part.own[1, group.others]
+        squares *= square
+        np.multiply(shifts, shifts, out=shifts)
+        excess = shifts - squares
+        for own in self._slices:
+            mean = terms[1][:, own] @ part.drawn[own]
+            np.multiply(mean, mean, out=mean)
+            mean *= square
+            excess += mean
+        squares *= np.float32(_SINGLE)
+        near = right & (np.abs(excess) <= squares)
+        near |= ((group.observed != 0) & (np.abs(known) < _WEAK))[:, None]
+        return right & (excess > 0) & ~near, near
 
     def _chosen(
-        self, row: str, others: Sequence[str], effects: Mapping[str, Floats], part: slice,
-        pairs: NDArray[np.intp], places: NDArray[np.intp],
-    ) -> tuple[Floats, Floats]:  # fmt: skip
+        self, group: _Group, part: _Part, pairs: NDArray[np.intp], places: NDArray[np.intp]
+    ) -> tuple[Floats, Floats]:
         """Return shifts and variances of pairs at places of a part, as many of both."""
-        shifts, variances = (x[places] for x in self._by_seeds(row, part))
-        theirs = np.array([self._by_seeds(other, part) for other in others])
-        shifts = shifts - theirs[pairs, 0, places]
-        variances = variances + theirs[pairs, 1, places]
-        for environment, z in effects.items():
-            drawn = _draws(environment, z.shape[1], self.resamples)[:, part][:, places]
-            mean, variance = _mean_and_variance(z[pairs], drawn.T.astype(np.float64), "kn,kn->k")
+        shifts = part.own[0, group.row, places] - part.own[0, group.others[pairs], places]
+        variances = part.own[1, group.row, places] + part.own[1, group.others[pairs], places]
+        for own in self._slices:
+            drawn = part.drawn[own][:, places].T.astype(np.float64)
+            mean, variance = _mean_and_variance(group.effects[pairs, own], drawn, "kn,kn->k")
             shifts += mean
             variances += variance
         return shifts, variances
