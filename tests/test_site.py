@@ -23,7 +23,6 @@ from oodd_eval.leaderboard.site import gridded, packed
 from oodd_eval.leaderboard.site.data import (
     WITH_INTERVALS,
     part_name,
-    selection_intervals,
     selections,
     site_data,
 )
@@ -315,11 +314,6 @@ def test_selections_without_cells_are_left_out():
     found = selections([("ant", "iid"), ("hopper", "gravity")])
     assert "ant|dynamics" not in found
     assert found["all|dynamics"] == [("hopper", "gravity")]
-
-
-def test_no_interval_without_the_metric(entries):
-    records = [r for r in entries[0].records if r.detector == "rf"]
-    assert selection_intervals(records, "no_such", selections([("hopper", "iid")])) == {}
 
 
 def test_curves_are_those_of_the_row(files):

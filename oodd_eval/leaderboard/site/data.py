@@ -17,8 +17,8 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
-from oodd_eval.metrics import bootstrap, catalogue
-from oodd_eval.metrics.bootstrap import DrawnCell, nan_mean
+from oodd_eval.metrics import catalogue
+from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import (
     GUARANTEED,
     HEADLINE,
@@ -31,7 +31,7 @@ from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import Standing, contribution, grouped
+from oodd_eval.results.tables.board import Board, Standing, grouped
 
 _COMPARED: Final = (
     "false_episodes", "early", "delay", "delay_censored", "missed", "found_within_20",
@@ -195,7 +195,7 @@ def _row(
     row, records = standing.entry, standing.records
     source, label, ranks = section.sources[row], str(row), section.ranks
     in_order = sorted(records, key=lambda r: (_ORDER[r.environment, r.anomaly], r.seed))
-    intervals = _intervals(records, names, chosen)
+    intervals = _intervals(ranks.board, standing, names, chosen)
     identity = f"{section.name}/{label}"
     have = {(r.environment, r.anomaly) for r in records}
     line = {
@@ -238,8 +238,7 @@ def _summaries(
     """
     board, found = section.ranks.board, {}
     for key in (key for key in SUMMARIES if key in chosen):
-        environments, anomalies = (list(dict.fromkeys(c)) for c in zip(*chosen[key], strict=True))
-        means = [board.mean(standing.entry, environments, anomalies, name) for name in names]
+        means = [board.mean(standing.entry, *_sides(chosen[key]), name) for name in names]
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
         own = intervals.get(key, [None] * len(_with_intervals(names)))
         ends = [
@@ -297,17 +296,24 @@ def _cell(record: Record, names: Sequence[str]) -> Json:
 
 
 def _intervals(
-    records: Sequence[Record], names: Sequence[str], chosen: Mapping[str, Sequence[SelectedCell]]
-) -> Json:
-    """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
+    board: Board, standing: Standing, names: Sequence[str],
+    chosen: Mapping[str, Sequence[SelectedCell]],
+) -> Json:  # fmt: skip
+    """Intervals of means by key of the selection, in the order of the board's ``intervals``.
+
+    A single record has its own.
+    """
     metrics = _with_intervals(names)
     found: dict[str, list[list[float | None] | None]] = {}
     few = {key: cells for key, cells in chosen.items() if key in SUMMARIES}
     for i, metric in enumerate(metrics):
         wanted = chosen if metric == RANKING else few
-        for key, pair in selection_intervals(records, metric, wanted).items():
-            bounds = [_printed(value, metric_info(metric).unit) for value in pair]
-            found.setdefault(key, [None] * len(metrics))[i] = bounds
+        several = {k: cells for k, cells in wanted.items() if len(cells) > 1 or standing.seeds > 1}
+        for key, cells in several.items():
+            mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
+            if not math.isnan(mean.low):
+                bounds = [_printed(v, metric_info(metric).unit) for v in (mean.low, mean.high)]
+                found.setdefault(key, [None] * len(metrics))[i] = bounds
     return found
 
 
@@ -350,6 +356,12 @@ def _printed(value: float, kind: str) -> float | None:
     return _short(round(value, 1 if kind == "steps" else 3))
 
 
+def _sides(cells: Sequence[SelectedCell]) -> tuple[list[str], list[str]]:
+    """Return the environments and anomalies of a selection."""
+    environments, anomalies = zip(*cells, strict=True)
+    return list(dict.fromkeys(environments)), list(dict.fromkeys(anomalies))
+
+
 def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
     """Return the selections of cells that filters can make, by key.
 
@@ -369,32 +381,3 @@ def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
         for others, named in anomalies.items()
     }
     return {key: chosen for key, chosen in found.items() if chosen}
-
-
-def selection_intervals(
-    records: Sequence[Record], metric: str, chosen: Mapping[str, Sequence[SelectedCell]]
-) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of one row's mean over each selection of cells, by key.
-
-    They are those of `Board.mean`, with each cell resampled once. Left out are selections with a
-    failed cell, without an interval, and of one record, which has its own.
-    """
-    draws: dict[tuple[int, str, str], DrawnCell] = {}
-    for r in records:
-        if metric in r.per_trajectory:
-            drawn = bootstrap.drawn_cell(r.environment, r.seed, contribution(r, metric))
-            draws[r.seed, r.environment, r.anomaly] = drawn
-    if not draws:
-        return {}
-    kind = metric_info(metric).interval
-    seeds = list(dict.fromkeys(seed for seed, _, _ in draws))
-    failed = {(r.environment, r.anomaly) for r in records if not r.ok}
-    found = {}
-    for key, cells in chosen.items():
-        own = [draws[s, *cell] for s in seeds for cell in cells if (s, *cell) in draws]
-        one = len(seeds) == len(cells) == 1
-        if own and not one and not failed.intersection(cells):
-            low, high = bootstrap.mean_interval(own, kind=kind)
-            if not math.isnan(low):
-                found[key] = low, high
-    return found

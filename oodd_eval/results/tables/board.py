@@ -11,7 +11,7 @@ import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.auc import Contribution, contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import ALARM_RANKING, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
@@ -49,6 +49,7 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
+        self._alike = grouped(self.records, lambda r: (r.setting, r.environment))
         self._contributions: dict[tuple[int, str], Contribution] = {}
         self._values: dict[tuple[int, str], float] = {}
         self._means: dict[tuple[object, ...], Value] = {}
@@ -133,10 +134,16 @@ class Board:
         return self._values[key]
 
     def _contribution(self, record: Record, metric: str) -> Contribution:
-        """Return a record's contribution, made once."""
+        """Return a record's contribution, made once, together with those of its row."""
         key = id(record), metric
         if key not in self._contributions:
-            self._contributions[key] = contribution(record, metric)
+            n = len(record.per_trajectory[metric][0])
+            alike = self._alike[record.setting, record.environment]
+            stored = [r for r in alike if len(r.per_trajectory.get(metric, ((), ()))[0]) == n]
+            both = (np.array([r.per_trajectory[metric][i] for r in stored]) for i in (0, 1))
+            found = contributions(*both, median=_is_median(metric))
+            own = [(id(r), metric) for r in stored]
+            self._contributions.update(zip(own, found, strict=True))
         return self._contributions[key]
 
     def failures(self) -> list[Record]:
@@ -163,7 +170,11 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
     numerators, denominators = map(np.array, record.per_trajectory[metric])
-    return Contribution(numerators, denominators, metric in NAMES and metric_info(metric).median)
+    return Contribution(numerators, denominators, _is_median(metric))
+
+
+def _is_median(metric: str) -> bool:
+    return metric in NAMES and metric_info(metric).median
 
 
 class Cost(NamedTuple):
