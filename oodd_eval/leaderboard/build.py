@@ -1,12 +1,16 @@
 """The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
+import contextlib
+import multiprocessing
+import os
 import re
+import sys
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import GROUPS, SPLITS
@@ -28,6 +32,8 @@ from oodd_eval.results.tables.board import Board, primary_settings
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import escape
 from oodd_eval.results.tables.rendering import markdown as table
+
+Made = TypeVar("Made")
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -51,6 +57,7 @@ def build(
     """
     on_part("ranking")
     found = sections(entries)
+    beside = started(lambda: _data(found, suites))
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files: dict[str, str | bytes] = {PAGE: page(found, suites, site=address)}
@@ -58,11 +65,8 @@ def build(
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    on_part("site")
-    shown = site_files(found, suites)
-    on_part("published board")
-    files |= {f"{SITE}/{name}": content for name, content in shown.items()}
-    files[PUBLISHED] = published_bytes(found, suites)
+    on_part("site and published board")
+    files |= beside()
     for name, content in files.items():
         if isinstance(content, bytes):
             write_bytes(output / name, content)
@@ -71,6 +75,45 @@ def build(
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
+
+
+def started(function: Callable[[], Made]) -> Callable[[], Made]:
+    """Start a function in a process of its own, and return what waits for its result.
+
+    Where a process cannot be forked, or the function fails in it, it is called when it is waited
+    for.
+    """
+    if sys.platform != "linux":
+        return function
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def work() -> None:
+        with contextlib.suppress(BaseException):
+            sender.send(function())
+        os._exit(0)  # what this process has begun is not to be finished twice
+
+    process = context.Process(target=work, daemon=True)
+    process.start()
+    sender.close()
+
+    def wait() -> Made:
+        try:
+            made: Made = receiver.recv()
+        except EOFError:
+            made = function()
+        process.join()
+        return made
+
+    return wait
+
+
+def _data(
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
+) -> dict[str, str | bytes]:
+    """Return the files for programs: those of the site, and the published board."""
+    shown = {f"{SITE}/{name}": content for name, content in site_files(sections, suites).items()}
+    return {**shown, PUBLISHED: published_bytes(sections, suites)}
 
 
 def site_files(
