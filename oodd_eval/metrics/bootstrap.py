@@ -14,7 +14,7 @@ import functools
 import math
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Final
 
@@ -56,14 +56,20 @@ def shared_weights(environment: str, n: int) -> Weights:
     return weights
 
 
-def resampled(contribution: Contribution, weights: Weights) -> Samples:
-    """Return a metric in every resample; NaN where its denominator is 0."""
+def resampled(
+    contribution: Contribution, weights: Weights, denominator: Samples | None = None
+) -> Samples:
+    """Return a metric in every resample; NaN where its denominator is 0.
+
+    `denominator` is that in every resample, where it is known.
+    """
     if contribution.median:
         return _medians(contribution, weights)
     numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
     if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
         return numerator / len(contribution.denominator)
-    denominator = np.einsum("rn,n->r", weights, contribution.denominator)
+    if denominator is None:
+        denominator = np.einsum("rn,n->r", weights, contribution.denominator)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(denominator > 0, numerator / denominator, np.nan)
 
@@ -92,7 +98,19 @@ class DrawnCell:
     @functools.cached_property
     def samples(self) -> Samples:
         """The metric in every resample."""
-        return resampled(self.contribution, self.weights)
+        terms = self.contribution.denominator
+        if self.weights is not shared_weights(self.environment, len(terms)):
+            return resampled(self.contribution, self.weights)
+        return resampled(
+            self.contribution, self.weights, _shared(self.environment, terms.tobytes())
+        )
+
+
+@functools.lru_cache(maxsize=2048)
+def _shared(environment: str, terms: bytes) -> Samples:
+    """Return a denominator in every resample, which metrics of one level have in common."""
+    own = np.frombuffer(terms)
+    return np.asarray(np.einsum("rn,n->r", shared_weights(environment, len(own)), own))
 
 
 def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCell:
@@ -286,11 +304,11 @@ def _sample_seed(cells: Sequence[DrawnCell]) -> Samples:
         groups.setdefault(alike, []).append(cell)
     total, count = np.zeros((2, len(cells[0].weights)))
     for group in groups.values():
-        samples = group[0].samples
+        one = group[0]
         if len(group) > 1:
             added = np.sum([cell.contribution.numerator for cell in group], axis=0)
-            whole = Contribution(added, group[0].contribution.denominator)
-            samples = resampled(whole, group[0].weights)
+            one = replace(one, contribution=Contribution(added, one.contribution.denominator))
+        samples = one.samples
         undefined = np.isnan(samples)
         total += np.where(undefined, 0.0, samples)
         count += np.where(undefined, 0, len(group))
