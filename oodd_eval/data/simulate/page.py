@@ -168,8 +168,8 @@ sensor anomaly corrupts {count} of those that may break, drawn for each episode.
 
 A rung is a strength at which the policy keeps that share of its return; `4th`, `16th` and `64th`
 are these parts of the strength of `kept99`, and cost nothing yet. At `{PAPER}` the policy loses
-what the paper's Table 2 says{_whole(environment)}. Intervals are 95 %: of the strength at which
-the share is kept, and of the share that is kept at the strength.
+what the paper's Table 2 says. Intervals are 95 %: of the strength at which the share is kept, and
+of the share that is kept at the strength.{_whole(environment)}
 
 A plot shows one sensor of an episode (orange) and of its nominal twin (grey) around the onset: of
 the sensors that may have changed, the one that differs most. A dot marks the end of the episode.
@@ -183,7 +183,8 @@ def _whole(environment: str) -> str:
     if ENVIRONMENTS[environment].discrete:
         return ""
     return (
-        f", in episodes of at most {ROBOTS_CAP} steps as for all rungs; at `{WHOLE}` in whole ones"
+        f"\nThis is measured in episodes of at most {ROBOTS_CAP} steps; `{WHOLE}` is `{PAPER}` in "
+        "whole ones."
     )
 
 
