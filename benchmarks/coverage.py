@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import DrawnCell, drawn_cell, mean_interval
+from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import IntervalKind
 
 SEEDS: Final = (10, 20, 50)
@@ -89,7 +89,7 @@ class Scenario:
             inside += low <= truth <= high
         return inside / problems
 
-    def _cells(self, rng: np.random.Generator, n: int) -> list[DrawnCell]:
+    def _cells(self, rng: np.random.Generator, n: int) -> list[DrawnCells]:
         cells = []
         for i in range(self.environments):
             top, bottom = self.draw(rng, n)

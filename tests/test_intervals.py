@@ -4,6 +4,7 @@ import importlib.util
 import math
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from statistics import NormalDist
 
@@ -14,7 +15,6 @@ from scipy import stats
 from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.binomial import clopper_pearson
 from oodd_eval.metrics.bootstrap import (
-    DrawnCell,
     bootstrap_weights,
     bounds,
     cell_samples,
@@ -30,7 +30,7 @@ NAN = math.nan
 
 
 def interval(contribution, weights, kind="mean"):
-    cell = DrawnCell("", 0, contribution, weights)
+    cell = replace(drawn_cell("", 0, contribution), weights=weights)
     return mean_interval([cell], kind=kind)
 
 

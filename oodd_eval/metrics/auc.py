@@ -55,19 +55,6 @@ class Contribution:
         return int(np.count_nonzero(self.denominator))
 
 
-def contributions(
-    numerators: Floats, denominators: Floats, *, median: bool = False
-) -> list[Contribution]:
-    """Return those of several cells, of which each has a row: shape (cells, n)."""
-    found = [Contribution(*both, median) for both in zip(numerators, denominators, strict=True)]
-    if not median:
-        totals = denominators.sum(axis=1)
-        values = numerators.sum(axis=1) / np.where(totals == 0, np.nan, totals)
-        for one, value in zip(found, values.tolist(), strict=True):
-            one.__dict__["value"] = value  # what the property would compute and keep
-    return found
-
-
 def mean_of(values: Sequence[float] | Floats, *, median: bool = False) -> Contribution:
     """Contributions of a mean, or median, over the values that are not NaN."""
     array = np.asarray(values, dtype=np.float64)

@@ -29,6 +29,7 @@ RESAMPLES: Final = 2000
 LEVEL: Final = 0.95
 
 Weights = NDArray[np.float64]
+Floats = NDArray[np.float64]
 Samples = NDArray[np.float64]  # A number in every resample: shape (R,), NaN where it is undefined
 
 _NORMAL: Final = NormalDist()
@@ -86,24 +87,51 @@ def _medians(contribution: Contribution, weights: Weights) -> Samples:
     return np.asarray((ordered[low] + ordered[high]) / 2)
 
 
-@dataclass(frozen=True)
-class DrawnCell:
-    """One cell's metric with its environment's weights, made by `drawn_cell`."""
+@dataclass(frozen=True, eq=False)
+class DrawnCells:
+    """A metric of cells of one environment, with its weights.
+
+    `seeds` are their detector seeds, `values` the metric of each, NaN where it is undefined.
+    Numerators and denominators have shape (cells, n), see `Contribution`; denominators are 1 or 0
+    where values are `median`s.
+    """
 
     environment: str
-    seed: int
-    contribution: Contribution
+    seeds: Sequence[int]
+    numerators: Floats
+    denominators: Floats
+    values: Sequence[float]
     weights: Weights
+    median: bool = False
 
     @functools.cached_property
-    def samples(self) -> Samples:
-        """The metric in every resample."""
-        terms = self.contribution.denominator
-        if self.weights is not shared_weights(self.environment, len(terms)):
-            return resampled(self.contribution, self.weights)
-        return resampled(
-            self.contribution, self.weights, _shared(self.environment, terms.tobytes())
-        )
+    def sizes(self) -> list[int]:
+        """The number of trajectories that contribute to each cell."""
+        found: list[int] = np.count_nonzero(self.denominators, axis=1).tolist()
+        return found
+
+    def only(self, places: Sequence[int]) -> "DrawnCells":
+        """Return some of the cells."""
+        at = list(places)
+        return replace(
+            self, seeds=[self.seeds[i] for i in at], values=[self.values[i] for i in at],
+            numerators=self.numerators[at], denominators=self.denominators[at],
+        )  # fmt: skip
+
+    def samples(self, places: Sequence[int]) -> Samples:
+        """Return the sum of cells with the same denominators in every resample."""
+        own = self._contribution(places)
+        n = len(own.denominator)
+        if self.median or self.weights is not shared_weights(self.environment, n):
+            return resampled(own, self.weights)
+        terms = own.denominator.tobytes()
+        return resampled(own, self.weights, _shared(self.environment, terms))
+
+    def _contribution(self, places: Sequence[int]) -> Contribution:
+        added = self.numerators[places[0]]
+        if len(places) > 1:
+            added = self.numerators[list(places)].sum(axis=0)
+        return Contribution(added, self.denominators[places[0]], self.median)
 
 
 @functools.lru_cache(maxsize=2048)
@@ -113,13 +141,29 @@ def _shared(environment: str, terms: bytes) -> Samples:
     return np.asarray(np.einsum("rn,n->r", shared_weights(environment, len(own)), own))
 
 
-def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCell:
-    """Resample a cell of a detector seed, with the weights that its environment shares."""
-    weights = shared_weights(environment, len(contribution.numerator))
-    return DrawnCell(environment, seed, contribution, weights)
+def drawn_cells(
+    environment: str, seeds: Sequence[int], numerators: Floats, denominators: Floats, *,
+    median: bool = False,
+) -> DrawnCells:  # fmt: skip
+    """Return cells with the weights that their environment shares."""
+    values: Sequence[float]
+    if median:
+        both = zip(numerators, denominators, strict=True)
+        values = [Contribution(*terms, median).value for terms in both]
+    else:
+        totals = denominators.sum(axis=1)
+        values = (numerators.sum(axis=1) / np.where(totals == 0, np.nan, totals)).tolist()
+    weights = shared_weights(environment, numerators.shape[1])
+    return DrawnCells(environment, seeds, numerators, denominators, values, weights, median)
 
 
-def mean_interval(cells: Sequence[DrawnCell], *, kind: IntervalKind) -> tuple[float, float]:
+def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCells:
+    """Return a cell of a detector seed with the weights that its environment shares."""
+    terms = contribution.numerator[None], contribution.denominator[None]
+    return drawn_cells(environment, [seed], *terms, median=contribution.median)
+
+
+def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[float, float]:
     """Return the 95 % interval of a mean over those of one detector's cells that define the metric.
 
     Kind ``"mean"``: see `bounds`. ``"share"``: the same, but where all trajectories are at one end
@@ -130,22 +174,21 @@ def mean_interval(cells: Sequence[DrawnCell], *, kind: IntervalKind) -> tuple[fl
     several environments with values in [0, 1]: with means p_i the chance of none is at most the
     product of 1 - p_i, which is at most (1 - p) ** n with p their mean.
     """
-    defined = [c for c in cells if c.contribution.n]
-    if not defined:
-        return math.nan, math.nan
     sizes: dict[str, int] = {}
-    for c in defined:
-        n = c.contribution.n
-        sizes[c.environment] = min(sizes.get(c.environment, n), n)
-    value = mean_over_cells((c.seed, c.contribution.value) for c in defined)
+    for c in cells:
+        for n in filter(None, c.sizes):
+            sizes[c.environment] = min(sizes.get(c.environment, n), n)
+    if not sizes:
+        return math.nan, math.nan
+    value = mean_over_cells(pair for c in cells for pair in zip(c.seeds, c.values, strict=True))
     if kind == "exact":
-        low, high = _exact(defined)
+        low, high = _exact(cells)
         # The mean over cells and the share of all twins differ where environments do in size.
         return min(low, value), max(high, value)
     total = sum(sizes.values())
     if kind == "share" and value in (0.0, 1.0):
         return clopper_pearson(value * total, total, LEVEL)
-    return bounds(sample_cells(defined), value, list(sizes.values()))
+    return bounds(sample_cells(cells), value, list(sizes.values()))
 
 
 def bounds(values: Samples, value: float, sizes: Sequence[int]) -> tuple[float, float]:
@@ -208,12 +251,14 @@ def _quantile(sizes: tuple[int, ...]) -> float:
     return t_quantile((1 + LEVEL) / 2, freedom) * math.sqrt(sum(several) / freedom)
 
 
-def _exact(cells: Sequence[DrawnCell]) -> tuple[float, float]:
+def _exact(cells: Sequence[DrawnCells]) -> tuple[float, float]:
     """Count every twin of an environment once, and average over detector seeds."""
     counts: dict[str, dict[int, tuple[float, float]]] = {}
     for c in cells:
-        terms = float(c.contribution.numerator.sum()), float(c.contribution.denominator.sum())
-        counts.setdefault(c.environment, {})[c.seed] = terms
+        terms = (x.sum(axis=1).tolist() for x in (c.numerators, c.denominators))
+        for seed, size, *both in zip(c.seeds, c.sizes, *terms, strict=True):
+            if size:
+                counts.setdefault(c.environment, {})[seed] = both[0], both[1]
     alarmed, episodes = (
         math.fsum(sum(pair[i] for pair in seeds.values()) / len(seeds) for seeds in counts.values())
         for i in (0, 1)
@@ -278,38 +323,37 @@ def drawn_seeds(seeds: int, resamples: int, *, key: str = "") -> NDArray[np.int6
     return drawn
 
 
-def sample_cells(cells: Sequence[DrawnCell]) -> Samples:
+def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
     """Return the resamples of a mean over at least one cell; a seed's mean is over its own cells.
 
     Test trajectories are resampled, the same ones in all cells of an environment, and detector
     seeds where there are several. Differences, sums and `mean_samples` of what this returns for
     several detectors or anomalies are paired.
     """
-    by_seed: dict[int, list[DrawnCell]] = {}
-    for cell in cells:
-        by_seed.setdefault(cell.seed, []).append(cell)
+    by_seed: dict[int, list[tuple[DrawnCells, list[int]]]] = {}
+    for c in cells:
+        own: dict[int, list[int]] = {}
+        for i, seed in enumerate(c.seeds):
+            own.setdefault(seed, []).append(i)
+        for seed, places in own.items():
+            by_seed.setdefault(seed, []).append((c, places))
     return mean_over_seeds([_sample_seed(by_seed[seed]) for seed in sorted(by_seed)])
 
 
-def _sample_seed(cells: Sequence[DrawnCell]) -> Samples:
-    """Return the resamples of a mean over the cells of one detector seed.
+def _sample_seed(cells: Sequence[tuple[DrawnCells, list[int]]]) -> Samples:
+    """Return the resamples of a mean over the cells of one detector seed, at places in others.
 
-    Ratios with the same denominators are added before they are resampled. Up to the onset all
-    anomalies of an environment are the same, so that most metrics have one sum for each of these.
+    Ratios with the same denominators are added before they are resampled: many metrics have those
+    of all anomalies of an environment in common.
     """
-    groups: dict[object, list[DrawnCell]] = {}
-    for cell in cells:
-        own = cell.contribution
-        alike = (cell.environment, own.denominator.tobytes()) if not own.median else id(cell)
-        groups.setdefault(alike, []).append(cell)
-    total, count = np.zeros((2, len(cells[0].weights)))
-    for group in groups.values():
-        one = group[0]
-        if len(group) > 1:
-            added = np.sum([cell.contribution.numerator for cell in group], axis=0)
-            one = replace(one, contribution=Contribution(added, one.contribution.denominator))
-        samples = one.samples
-        undefined = np.isnan(samples)
-        total += np.where(undefined, 0.0, samples)
-        count += np.where(undefined, 0, len(group))
+    total, count = np.zeros((2, len(cells[0][0].weights)))
+    for c, places in cells:
+        groups: dict[object, list[int]] = {}
+        for i in places:
+            groups.setdefault(i if c.median else c.denominators[i].tobytes(), []).append(i)
+        for group in groups.values():
+            samples = c.samples(group)
+            undefined = np.isnan(samples)
+            total += np.where(undefined, 0.0, samples)
+            count += np.where(undefined, 0, len(group))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -25,7 +25,7 @@ from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
 from oodd_eval.leaderboard.verify.records import Records
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.metrics.binomial import t_quantile
-from oodd_eval.metrics.bootstrap import DrawnCell, drawn_cell, mean_interval, nan_mean
+from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval, nan_mean
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -178,7 +178,7 @@ def _differences(
     Yields metric, the entry's mean and the re-run's, and the difference as text where there is one.
     """
     for metric in COMPARED:
-        drawn: tuple[list[DrawnCell], list[DrawnCell]] = ([], [])
+        drawn: tuple[list[DrawnCells], list[DrawnCells]] = ([], [])
         pairs: dict[str, list[list[float]]] = {}
         for (environment, _), sides in cells.items():
             own = [
@@ -186,7 +186,7 @@ def _differences(
                  for r in side if r.ok and metric in r.per_trajectory]
                 for side in sides
             ]  # fmt: skip
-            both = [nan_mean(cell.contribution.value for cell in side) for side in own]
+            both = [nan_mean(value for cell in side for value in cell.values) for side in own]
             if not any(map(math.isnan, both)):
                 pairs.setdefault(environment, []).append(both)
                 for all_of_side, one in zip(drawn, own, strict=True):

@@ -11,8 +11,14 @@ import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.auc import Contribution, contributions
-from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
+from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.bootstrap import (
+    DrawnCells,
+    drawn_cells,
+    mean_interval,
+    mean_over_cells,
+    nan_mean,
+)
 from oodd_eval.metrics.catalogue import ALARM_RANKING, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
@@ -49,9 +55,7 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
-        self._alike = grouped(self.records, lambda r: (r.setting, r.environment))
-        self._contributions: dict[tuple[int, str], Contribution] = {}
-        self._values: dict[tuple[int, str], float] = {}
+        self._drawn: dict[tuple[Setting, str, str, int], tuple[DrawnCells, dict[int, int]]] = {}
         self._means: dict[tuple[object, ...], Value] = {}
         self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
@@ -103,10 +107,15 @@ class Board:
         brief = bool(records) and all(r.brief for r in records)
         if failed := next((r for r in records if not r.ok), None):
             return Value(state=failed.status, cells=len(records), partial=partial, brief=brief)
-        terms = [r for r in records if intervals and metric in r.per_trajectory]
-        drawn = [drawn_cell(r.environment, r.seed, self._contribution(r, metric)) for r in terms]
-        low, high = mean_interval(drawn, kind=metric_info(metric).interval) if drawn else (NAN, NAN)
-        return Value(self._mean(records, metric), low, high, "", len(records), partial, brief)
+        value, ends = self._mean(records, metric), (NAN, NAN)
+        if intervals:
+            drawn = [
+                whole if chosen == [*range(len(whole.seeds))] else whole.only(chosen)
+                for whole, chosen in self._terms(records, metric)
+            ]
+            if drawn:
+                ends = mean_interval(drawn, kind=metric_info(metric).interval)
+        return Value(value, *ends, "", len(records), partial, brief)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
@@ -121,30 +130,42 @@ class Board:
 
     def _mean(self, records: Iterable[Record], metric: str) -> float:
         """Return the mean over the cells where a metric is defined."""
-        return mean_over_cells((r.seed, self._value(r, metric)) for r in records)
+        own = list(records)
+        values = [
+            (whole.seeds[i], whole.values[i])
+            for whole, chosen in self._terms(own, metric) for i in chosen
+        ]  # fmt: skip
+        # Thresholds are no ratios of sums.
+        values += [(r.seed, r.value(metric)) for r in own if metric not in r.per_trajectory]
+        return mean_over_cells(values)
 
-    def _value(self, record: Record, metric: str) -> float:
-        """Return a record's value, made once."""
-        key = id(record), metric
-        if key not in self._values:
-            # Thresholds are no ratios of sums.
-            several = metric in record.per_trajectory
-            value = self._contribution(record, metric).value if several else record.value(metric)
-            self._values[key] = value
-        return self._values[key]
+    def _terms(self, records: Iterable[Record], metric: str) -> list[tuple[DrawnCells, list[int]]]:
+        """Return the terms of a row's metric, by environment, and the places of records in them."""
+        stored = (r for r in records if metric in r.per_trajectory)
+        by_size = grouped(stored, lambda r: (r.environment, len(r.per_trajectory[metric][0])))
+        found = []
+        for (environment, n), own in by_size.items():
+            whole, places = self._whole(own[0].setting, environment, metric, n)
+            found.append((whole, [places[id(r)] for r in own]))
+        return found
 
-    def _contribution(self, record: Record, metric: str) -> Contribution:
-        """Return a record's contribution, made once, together with those of its row."""
-        key = id(record), metric
-        if key not in self._contributions:
-            n = len(record.per_trajectory[metric][0])
-            alike = self._alike[record.setting, record.environment]
-            stored = [r for r in alike if len(r.per_trajectory.get(metric, ((), ()))[0]) == n]
-            both = (np.array([r.per_trajectory[metric][i] for r in stored]) for i in (0, 1))
-            found = contributions(*both, median=_is_median(metric))
-            own = [(id(r), metric) for r in stored]
-            self._contributions.update(zip(own, found, strict=True))
-        return self._contributions[key]
+    def _whole(
+        self, entry: Setting, environment: str, metric: str, n: int
+    ) -> tuple[DrawnCells, dict[int, int]]:
+        """Return all cells of a row in an environment, made once, and the places of its records."""
+        key = entry, environment, metric, n
+        if key not in self._drawn:
+            cells = [self._cells.get((entry, environment, a), ()) for a in self.anomalies]
+            own = [
+                r
+                for r in itertools.chain(*cells)
+                if metric in r.per_trajectory and len(r.per_trajectory[metric][0]) == n
+            ]
+            terms = (np.array([r.per_trajectory[metric][i] for r in own]) for i in (0, 1))
+            drawn = drawn_cells(environment, [r.seed for r in own], *terms,
+                                median=_is_median(metric))  # fmt: skip
+            self._drawn[key] = drawn, {id(r): i for i, r in enumerate(own)}
+        return self._drawn[key]
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
