@@ -16,7 +16,7 @@ from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import EntryInfo, read_entries
 from oodd_eval.leaderboard.grants import Grant, digest_of, read_grants, write_grants
 from oodd_eval.leaderboard.sections import sections, suite_sections
-from oodd_eval.leaderboard.site.data import site_data
+from oodd_eval.leaderboard.site.data import power_of, site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
@@ -63,7 +63,7 @@ GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
 
 
 def graded(root):
-    """Sections of a leaderboard in `root` with three rows on one ladder."""
+    """What is drawn of a leaderboard in `root` with three rows on one ladder."""
     names = list(rungs_of("cartpole", "iid"))
     lines = []
     for row, (first, last) in GRADED_ROWS.items():
@@ -74,7 +74,7 @@ def graded(root):
     own = root / "suites" / "small"
     own.mkdir(parents=True)
     (own / "records.jsonl").write_text("".join(lines), encoding="utf-8")
-    return suite_sections(root)
+    return power_of(suite_sections(root))
 
 
 def make_curves(record, seed, twins_seed=0):

@@ -13,13 +13,12 @@ from oodd_eval.cli import EXPRESSION, NAMES, Parser, board, rerun, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.build import STALE, differences, stale
+from oodd_eval.leaderboard.build import STALE, differences, stale, started, suite_parts
 from oodd_eval.leaderboard.build import build as build_board
 from oodd_eval.leaderboard.changes import changes_against
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.grants import GRANTS
 from oodd_eval.leaderboard.rerun import read_order
-from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
@@ -95,12 +94,11 @@ def build(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
     output = Path(options.output)
     with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
+        suites = started(lambda: suite_parts(output))
         show("entries")
         entries = read_entries(options.results)
         if not entries:
             return say(f"no entries in {options.results}", 5)
-        show("suites")
-        suites = suite_sections(output)
         target = Path(fresh) if options.check else output
         written = build_board(entries, target, suites, on_part=show)
         lines = differences(target, output) if options.check else []
@@ -216,7 +214,7 @@ def verify_pull_request(console: Console, results: Path, options: argparse.Names
     if refused:
         return say(f"{refused} of {len(entries)} entries are refused", 1)
     with tempfile.TemporaryDirectory() as fresh:
-        build_board(read_entries(results), Path(fresh), suite_sections(results.parent))
+        build_board(read_entries(results), Path(fresh), lambda: suite_parts(results.parent))
     console.print(f"{', '.join(entries)}: may be merged, the board builds with it")
     return 0
 

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import GROUPS, SPLITS
@@ -18,14 +18,16 @@ from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_
 from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
+from oodd_eval.leaderboard.published import PUBLISHED, published_bytes, suite_lines
 from oodd_eval.leaderboard.sections import (
     SUITES,
     TABLES,
     LeaderboardSection,
     SuiteSection,
     sections,
+    suite_sections,
 )
+from oodd_eval.leaderboard.site.data import Json, power_of
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board, primary_settings
@@ -46,9 +48,37 @@ MANY: Final = 6  # findings beyond which they are folded away
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
+class SuiteParts(NamedTuple):
+    """What is shown of results on further test suites.
+
+    Sections of the page, what the site draws, and lines of the table of all cells and of the
+    published file.
+    """
+
+    page: Sequence[str] = ()
+    power: Sequence[Json] = ()
+    cells: str = ""
+    published: str = ""
+
+
+def suite_parts(place: Path) -> SuiteParts:
+    """Return what a leaderboard's directory has of further test suites, ready to be shown."""
+    suites = suite_sections(place)
+    lines: list[tuple[dict[str, str], Record]] = []
+    for suite in suites:
+        first = primary_settings(suite.board.records)
+        for r in suite.board.records:
+            trivial = str(suite.board.is_trivial(r.setting)).lower()
+            about = {"board": suite.name, "entry": "", "trust": "",
+                     "primary": str(r.setting in first).lower(), "trivial": trivial}  # fmt: skip
+            lines.append((about, r))
+    table = rendering.cells_csv(lines, header=False)
+    return SuiteParts([*map(_suite, suites)], power_of(suites), table, suite_lines(suites))
+
+
 def build(
-    entries: Sequence[SubmittedEntry], output: Path, suites: Sequence[SuiteSection] = (), *,
-    on_part: Callable[[str], object] = str,
+    entries: Sequence[SubmittedEntry], output: Path,
+    suites: Callable[[], SuiteParts] = SuiteParts, *, on_part: Callable[[str], object] = str,
 ) -> list[str]:  # fmt: skip
     """Write page, tables, site and the published file, the same bytes for the same entries.
 
@@ -57,16 +87,20 @@ def build(
     """
     on_part("ranking")
     found = sections(entries)
-    beside = started(lambda: _data(found, suites))
+    on_part("suites")
+    further = suites()
+    beside = started(lambda: site_files(found, further))
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
-    files: dict[str, str | bytes] = {PAGE: page(found, suites, site=address)}
+    files: dict[str, str | bytes] = {PAGE: page(found, further.page, site=address)}
     on_part("tables")
     for section in found:
         files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
-    on_part("site and published board")
-    files |= beside()
+    on_part("published board")
+    files[PUBLISHED] = published_bytes(found, further.published)
+    on_part("site")
+    files |= {f"{SITE}/{name}": content for name, content in beside().items()}
     for name, content in files.items():
         if isinstance(content, bytes):
             write_bytes(output / name, content)
@@ -108,24 +142,17 @@ def started(function: Callable[[], Made]) -> Callable[[], Made]:
     return wait
 
 
-def _data(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
-) -> dict[str, str | bytes]:
-    """Return the files for programs: those of the site, and the published board."""
-    shown = {f"{SITE}/{name}": content for name, content in site_files(sections, suites).items()}
-    return {**shown, PUBLISHED: published_bytes(sections, suites)}
-
-
 def site_files(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
+    sections: Sequence[LeaderboardSection], suites: SuiteParts
 ) -> dict[str, str | bytes]:
     """Return the files of the site by name: page, data files, and the table of all cells."""
-    shown = site.files(sections, suites, project=repository())
-    return {**shown, Path(CELLS).name: compress(cells(sections, suites).encode())}
+    shown = site.files(sections, suites.power, project=repository())
+    table = cells(sections) + suites.cells
+    return {**shown, Path(CELLS).name: compress(table.encode())}
 
 
-def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]) -> str:
-    """Return all cells of boards and suites as one table (CSV); empty without any."""
+def cells(sections: Sequence[LeaderboardSection]) -> str:
+    """Return all cells of boards as one table (CSV)."""
     lines: list[tuple[dict[str, str], Record]] = []
     for section in sections:
         for row in section.ranks.standings:
@@ -134,14 +161,7 @@ def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
             about = {"board": "leaderboard", "entry": entry.meta.id, "trust": entry.trust,
                      "primary": primary, "trivial": trivial}  # fmt: skip
             lines += [(about, r) for r in row.records]
-    for suite in suites:
-        first = primary_settings(suite.board.records)
-        for r in suite.board.records:
-            trivial = str(suite.board.is_trivial(r.setting)).lower()
-            about = {"board": suite.name, "entry": "", "trust": "",
-                     "primary": str(r.setting in first).lower(), "trivial": trivial}  # fmt: skip
-            lines.append((about, r))
-    return rendering.cells_csv(lines) if lines else ""
+    return rendering.cells_csv(lines)
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -173,16 +193,16 @@ def _content(path: Path) -> bytes:
 
 
 def page(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
+    sections: Sequence[LeaderboardSection], suites: Sequence[str] = (), *, site: str = ""
 ) -> str:
-    """Return the whole page, which names the `site` if there is one."""
+    """Return the whole page with the sections of suites; it names the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
     parts = [TEXTS["introduction"]]
     if site:
         parts.append(TEXTS["site"].format(site=site))
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
-    parts += [_suite(section) for section in suites]
+    parts += suites
     parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
     return "\n".join(parts)
 

@@ -61,20 +61,26 @@ class Published(NamedTuple):
     suites: dict[str, Board]
 
 
-def published_bytes(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
-) -> bytes:
-    """Return the bytes of the file: the same ones for the same entries and suites."""
+def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
+    """Return the bytes of the file: the same ones for the same entries and `suite_lines`."""
     lines = [
         slim(record, RANKED_BY, entry=section.sources[one.entry].meta.id,
               trust=section.trust[one.entry], primary=one.primary)
         for section in sections for one in section.ranks.standings for record in one.records
     ]  # fmt: skip
-    lines += [
+    return compress((_text(lines) + suites).encode())
+
+
+def suite_lines(suites: Iterable[SuiteSection]) -> str:
+    """Return the lines of further test suites, of those that are graded."""
+    return _text(
         slim(record, (FOUND,), suite=suite.name)
         for suite in suites if suite.graded for record in suite.board.records
-    ]  # fmt: skip
-    return compress("".join(record.to_json() + "\n" for record in lines).encode())
+    )  # fmt: skip
+
+
+def _text(records: Iterable[Record]) -> str:
+    return "".join(record.to_json() + "\n" for record in records)
 
 
 def published_file() -> Path:

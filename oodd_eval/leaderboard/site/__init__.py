@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
+from oodd_eval.leaderboard.sections import LeaderboardSection
 from oodd_eval.leaderboard.site.data import Json, site_data
 from oodd_eval.metrics.cusum import THRESHOLD
 
@@ -38,14 +38,14 @@ _STATIC = Path(__file__).with_name("static")
 
 
 def files(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *,
-    project: str = "",
-) -> dict[str, str]:  # fmt: skip
+    sections: Sequence[LeaderboardSection], power: Sequence[Json] = (), *, project: str = ""
+) -> dict[str, str]:
     """Return the files of a leaderboard's site by name; the same entries give the same bytes.
 
-    `project` is the address of code and documents; without it the page does not link to them.
+    `power` is of further test suites. `project` is the address of code and documents; without it
+    the page does not link to them.
     """
-    data, parts = site_data(sections, suites)
+    data, parts = site_data(sections, power)
     found = {PAGE: index(data | {"project": project})}
     for name, part in parts.items():
         if part.get("curves"):

@@ -63,7 +63,7 @@ SelectedCell = tuple[str, str]  # environment and anomaly
 
 
 def site_data(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
+    sections: Sequence[LeaderboardSection], power: Sequence[Json] = ()
 ) -> tuple[Json, dict[str, Json]]:
     """Return the index, and the parts by name.
 
@@ -81,7 +81,7 @@ def site_data(
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
-        "power": [_power(section) for section in suites if section.graded],
+        "power": [*power],
     }  # fmt: skip
     return data, parts
 
@@ -95,6 +95,11 @@ def part_name(text: str) -> str:
 def metric_part(board: str, metric: str) -> str:
     """Return the name of the part with a metric of all cells of a board."""
     return part_name(f"{board}/{metric}")
+
+
+def power_of(suites: Sequence[SuiteSection]) -> list[Json]:
+    """Return what is drawn of further test suites, of those that are graded."""
+    return [_power(section) for section in suites if section.graded]
 
 
 def _power(section: SuiteSection) -> Json:

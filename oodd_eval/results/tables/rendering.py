@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from tabulate import tabulate
 
 from oodd_eval.data.facts import GROUPS
-from oodd_eval.metrics.catalogue import RANKING
+from oodd_eval.metrics.catalogue import NAMES, RANKING
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
 from oodd_eval.results.tables import ladder, layout
@@ -85,13 +85,15 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     return csv_rows(lines)
 
 
-def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]]) -> str:
+def cells_csv(
+    lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool = True
+) -> str:  # fmt: skip
     """Return one line per cell with its stored metrics and their intervals.
 
-    Every cell has a mapping with columns that stand before its own, the same ones for all.
+    Every cell has a mapping with columns that stand before its own, the same ones for all. Every
+    metric that a record can have has a column.
     """
-    names = list(dict.fromkeys(name for _, r in lines for name in r.metrics))
-    return csv_rows([
+    rows = [
         {**about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
          "limit": "" if r.limit is None else r.limit, "detector": r.detector,
          "version": r.detector_version, "horizon": r.horizon,
@@ -99,9 +101,10 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]]) -> str:
          "group": r.group, "anomaly": r.anomaly, "strength": r.strength, "status": r.status,
          "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
          "microseconds_per_step": number(cost_of([r]).step), "peak_rss_mb": number(r.peak_rss_mb),
-         **_ends({name: r.metrics.get(name) for name in names})}
+         **_ends({name: r.metrics.get(name) for name in NAMES})}
         for about, r in lines
-    ])  # fmt: skip
+    ]  # fmt: skip
+    return csv_rows(rows, header=header)
 
 
 def comparisons_csv(ranks: RankedBoard) -> str:
@@ -146,9 +149,9 @@ def _ends(values: Mapping[str, Value | Metric | None]) -> dict[str, str]:
     return found
 
 
-def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows with the same columns as CSV."""
-    return csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
+def csv_rows(rows: Sequence[Mapping[str, object]], *, header: bool = True) -> str:
+    """Return rows with the same columns as CSV, their names first unless there is no `header`."""
+    return csv_text([*([list(rows[0])] if header else []), *(list(row.values()) for row in rows)])
 
 
 def csv_text(lines: Iterable[Sequence[object]]) -> str:
