@@ -233,8 +233,7 @@ def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
     """Return the strength of each condition of a suite, as an entry of the manifest."""
     if definition.suite == "table1":
         return {}
-    suite, cap = definition.suite, definition.episode_cap
-    return {"strengths": conditions_of(suite, environment, cap)}
+    return {"strengths": conditions_of(definition.suite, environment, definition.episode_cap)}
 
 
 def _base(
