@@ -19,9 +19,9 @@ from oodd_eval._version import repository
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import site_files
+from oodd_eval.leaderboard.build import site_files, suite_parts
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import sections, suite_sections
+from oodd_eval.leaderboard.sections import sections
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
@@ -87,7 +87,7 @@ def board() -> dict[str, str | bytes]:
     if not (ROOT / RESULTS[0]).exists():
         return {}
     entries = read_entries(ROOT / "leaderboard" / "results")
-    shown = site_files(sections(entries), suite_sections(ROOT / "leaderboard"))
+    shown = site_files(sections(entries), suite_parts(ROOT / "leaderboard"))
     # The page of Markdown that it links to is a page of this site.
     page = str(shown[site.PAGE]).replace('href="../README.md"', 'href="../index.html"')
     return {f"{BOARD}/{name}": content for name, content in (shown | {site.PAGE: page}).items()}
