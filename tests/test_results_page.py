@@ -236,7 +236,20 @@ def test_claims_on_whole_episodes_are_told_rightly():
     assert "by {} points of AUC and {} of matched AUC".format(*above) in text
     longer = points("delay-riqn-npn", "paper", -1)[0]
     assert f"longer than NPN's by {longer} steps, as on `standard`; on" in text
+    assert f"RIQN by {points('riqn-above-riqn-ms-10', 'paper', -100)[0]} points" in text
+    assert f"N-RIQN by {points('memory-10-7', 'paper')[0]} points; at Δ = 1" in text
+    assert f"one by {points('ensemble-1', 'paper')[0]} points at Δ = 1" in text
+    assert round(float(own["delay-grows-10", "paper"]["value"])) == 3
+    settled = {"by definition", "by construction"}
+    counted = [r["verdict"] for (_, kind), r in own.items() if kind == "paper"]
+    counted = [verdict for verdict in counted if verdict not in settled]
+    missing = [c for (c, kind), r in own.items() if (r["verdict"], kind) == ("not run", "paper")]
+    assert all("-20" in claim for claim in missing)
+    assert f"{len(counted) - len(missing)} of {len(counted)} claims [on it]" in text
+    assert f"Δ = 20, which {len(missing)} claims are about" in text
     expected = {
+        "memory-1-7": "negligible", "samples-4": "negligible", "ensemble-10": "negligible",
+        "riqn-ms-above-npn-10": "refuted",
         "sensor-above-dynamics-everywhere": "refuted", "riqn-above-npn-1": "refuted",
         "npn-above-rf-1": "confirmed", "riqn-above-rf-1": "confirmed", "delay-riqn-npn": "refuted",
     }  # fmt: skip

@@ -121,6 +121,13 @@ def compress(content: bytes) -> bytes:
     return gzip.compress(content, 9, mtime=0)
 
 
+def packed(path: Path, content: bytes) -> bytes:
+    """Return content as a file of this name holds it: compressed where the name says so."""
+    if path.suffix == XZ:
+        return lzma.compress(content, preset=9 | lzma.PRESET_EXTREME)
+    return compress(content) if path.suffix == GZIP else content
+
+
 def decompress(content: bytes, most: int = MAX_BYTES) -> bytes:
     """Undo gzip or xz, never holding more than `most` bytes; anything else is a `ResultsError`."""
     by_xz = content.startswith(b"\xfd7zXZ\0")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.files import GZIP, compress, write_bytes
+from oodd_eval.data.files import packed, write_bytes
 from oodd_eval.data.parts import CONDITIONS
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
@@ -381,4 +381,4 @@ def write_reference(
         )  # fmt: skip
         lines.append(kept.to_json() + "\n")
     content = "".join(lines).encode()
-    write_bytes(Path(path), compress(content) if Path(path).suffix == GZIP else content)
+    write_bytes(Path(path), packed(Path(path), content))
