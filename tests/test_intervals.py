@@ -19,8 +19,10 @@ from oodd_eval.metrics.bootstrap import (
     bounds,
     cell_samples,
     drawn_cell,
+    drawn_cells,
     mean_interval,
     mean_over_cells,
+    mean_samples,
     nan_mean,
     resampled,
     sample_cells,
@@ -195,6 +197,21 @@ def test_an_exact_interval_contains_a_mean_over_environments_of_unlike_sizes():
     ]
     low, high = mean_interval(cells, kind="exact")
     assert (low, high) == (clopper_pearson(2, 502)[0], 0.5)
+
+
+def test_a_mean_over_cells_is_that_of_their_resamples():
+    """Ratios that share denominators are added first; some have none in a resample or at all."""
+    rng = np.random.default_rng(11)
+    common = rng.integers(0, 2, size=6).astype(float)
+    denominators = [common, common, np.ones(6), np.ones(6), np.eye(6)[2], np.zeros(6)]
+    terms = [Contribution(rng.normal(size=6) * d, d) for d in denominators]
+    both = (np.array([getattr(t, n) for t in terms]) for n in ("numerator", "denominator"))
+    cells = drawn_cells("ant", [0] * len(terms), *both)
+    expected = mean_samples([cell_samples("ant", one) for one in terms])
+    np.testing.assert_allclose(sample_cells([cells]), expected, rtol=1e-12)
+    some = mean_samples([cell_samples("ant", terms[i]) for i in (1, 3, 5)])
+    np.testing.assert_allclose(sample_cells([cells.only([1, 3, 5])]), some, rtol=1e-12)
+    assert cells.values == pytest.approx([one.value for one in terms], nan_ok=True)
 
 
 def test_an_interval_contains_its_value():

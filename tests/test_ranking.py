@@ -308,6 +308,22 @@ def test_rare_differences_have_all_resamples_and_others_the_first(monkeypatch):
         assert one.p == (other.p if small else pytest.approx(other.p, rel=0.3))
 
 
+def test_single_precision_calls_the_same_resamples_beyond_as_double(monkeypatch):
+    rng = np.random.default_rng(9)
+    cells = [(f"e{i}", "iid") for i in range(5)]
+    rows = {
+        f"r{i}": {
+            seed: {c: mean_of(0.003 * i + 0.02 * rng.normal(size=10)) for c in cells}
+            for seed in range(1 + i % 3)
+        }
+        for i in range(7)
+    }
+    rows |= {"r0-again": rows["r0"], "constant": {0: {c: mean_of([0.5] * 10) for c in cells}}}
+    found = rank(rows, resamples=12_000).comparisons
+    monkeypatch.setattr(pairs, "_WEAK", math.inf)  # every one is too weak: all in double precision
+    assert rank(rows, resamples=12_000).comparisons == found
+
+
 def test_pairs_share_draws(monkeypatch):
     pairs._draws.cache_clear()
     drawn = []

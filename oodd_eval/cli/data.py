@@ -113,8 +113,8 @@ def _define_calibrate(action: Callable[[str, str], Parser]) -> None:
     add("--env", default="all", metavar="NAMES", help="environments (default: all)")
     add("--anomaly", default="all", metavar="NAMES", help="kinds of anomalies (default: all)")
     add("--whole", action="store_true",
-        help="robots on whole episodes, at the losses of the paper's Table 2 alone (default: at "
-        "most 300 steps, all rungs)")
+        help="measure robots on whole episodes, and only the rung of the paper's Table 2 "
+        "(default: episodes of at most 300 steps, all rungs)")
     add("--output", required=True, type=Path, metavar="FILE", help="strengths, as JSON")
     add("--work", type=Path, metavar="FILE", help="measured returns (default: OUTPUT.work)")
     add("--jobs", type=at_least(1), metavar="N", help="worker processes (default: one per core)")

@@ -49,10 +49,10 @@ WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``com
 
 
 class SuiteParts(NamedTuple):
-    """What is shown of results on further test suites.
+    """Results on further test suites, ready to be shown.
 
-    Sections of the page, what the site draws, and lines of the table of all cells and of the
-    published file.
+    `page` are sections of the page, `power` is drawn by the site; `cells` are lines of the table
+    of all cells, `published` those of the published file.
     """
 
     page: Sequence[str] = ()
@@ -112,10 +112,10 @@ def build(
 
 
 def started(function: Callable[[], Made]) -> Callable[[], Made]:
-    """Start a function in a process of its own, and return what waits for its result.
+    """Run a function in a forked process; return a function that waits for its result.
 
-    Where a process cannot be forked, or the function fails in it, it is called when it is waited
-    for.
+    Where no process can be forked, or the function fails there, waiting calls it in this process,
+    which raises its error.
     """
     if sys.platform != "linux":
         return function

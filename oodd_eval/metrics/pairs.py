@@ -231,9 +231,10 @@ class PairTests:
     def _sides(
         self, group: _Group, terms: tuple[Singles, Singles, Singles], part: _Part
     ) -> tuple[Bools, Bools]:
-        """Tell which resamples are beyond the observed differences, and which are too near to it.
+        """Tell which resamples are beyond the observed differences, and which are too near to tell.
 
-        A shift is beyond where its square is above that of the observed one times the variance.
+        One is beyond where the square of its shift exceeds the variance times the square of the
+        observed, studentized difference.
         """
         known = np.where(np.isfinite(group.observed), group.observed, 0.0)
         sign, square = (x.astype(np.float32)[:, None] for x in (np.sign(known), known * known))

@@ -39,6 +39,7 @@ from oodd_eval.data.simulate.values import bound_of, unit_of
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
 STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass
 SMALLEST: Final = 4.0**-7  # of the bound; weaker strengths are not tried
+MARGIN: Final = 0.02  # above all levels, where the first pass ends
 FINEST: Final = 1.1  # ratio of neighbours between which nothing is measured any more
 NEAR: Final = 0.1  # of the return that a level loses: so near to it a strength is the level's
 DRAWS: Final = 1000
@@ -146,7 +147,7 @@ def next_strength(
     kept = kept_shares(returns, base)
     # Down from the bound, until the policy keeps nearly all, or more than any of the levels.
     weakest = float(strengths[0])
-    if kept[0] < min(0.995, max(levels) + 0.02) and weakest > SMALLEST * bound * 1.01:
+    if kept[0] < min(0.995, max(levels) + MARGIN) and weakest > SMALLEST * bound * 1.01:
         return _rounded(weakest / STEP)
     fitted = falling(kept)
     errors = (returns - base).std(axis=1, ddof=1) / math.sqrt(len(base)) / abs(base.mean())

@@ -183,8 +183,8 @@ def _whole(environment: str) -> str:
     if ENVIRONMENTS[environment].discrete:
         return ""
     return (
-        f"\nThis is measured in episodes of at most {ROBOTS_CAP} steps; `{WHOLE}` is `{PAPER}` in "
-        "whole ones."
+        f"\nThese strengths were measured in episodes of at most {ROBOTS_CAP} steps, that of "
+        f"`{WHOLE}` in whole episodes."
     )
 
 

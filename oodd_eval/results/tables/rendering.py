@@ -85,9 +85,7 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     return csv_rows(lines)
 
 
-def cells_csv(
-    lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool = True
-) -> str:  # fmt: skip
+def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool = True) -> str:
     """Return one line per cell with its stored metrics and their intervals.
 
     Every cell has a mapping with columns that stand before its own, the same ones for all. Every
