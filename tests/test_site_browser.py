@@ -1,6 +1,7 @@
 """The site in a real browser, opened from disk: sorting, filters, keyboard, a detector's page."""
 
 import itertools
+import time
 import urllib.parse
 
 import helpers_browser
@@ -63,10 +64,16 @@ def browser(window, url):
     assert {request for request in asked if not request.startswith(beside)} <= {url, "data:,"}
 
 
+def column_titles(browser):
+    return [t.removesuffix("↕").removesuffix("▲").removesuffix("▼").replace("\n", " ").strip()
+            for t in browser.texts("#ranking thead button")]  # fmt: skip
+
+
 def column(browser, title):
     """Texts of the values of one column, by row."""
-    titles = [t.removesuffix("↕").removesuffix("▲").removesuffix("▼").replace("\n", " ").strip()
-              for t in browser.texts("#ranking thead button")]  # fmt: skip
+    until = time.monotonic() + 10  # a column may need a data file that is loaded
+    while title not in (titles := column_titles(browser)) and time.monotonic() < until:
+        time.sleep(0.02)
     index = titles.index(title) + 1
     cells = browser.texts(f"#ranking tbody tr > :nth-child({index})")
     return dict(zip(browser.texts(LABELS), cells, strict=True))
