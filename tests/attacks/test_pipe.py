@@ -8,6 +8,7 @@ import json
 import os
 import re
 import struct
+import subprocess
 import threading
 import time
 
@@ -152,6 +153,24 @@ def test_a_wrong_message_in_scoring(converse, message):
     rest = saved(np.zeros((2, ROWS), np.int32))
     out = converse(said(FITTED), said(message), rest, said(LAST), stay=30)
     assert (out.status, out.reason) == ("error", GARBLED)
+
+
+def test_a_process_that_ends_while_it_is_looked_at_is_nobody_elses(converse, monkeypatch):
+    class Reaped(psutil.Process):
+        def ppid(self):
+            if self.pid != ended.pid:
+                return super().ppid()
+            ended.communicate()
+            return 0  # As Linux says while it is reaped.
+
+    ended = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    monkeypatch.setattr(child.psutil, "Process", Reaped)
+    out = converse(
+        said(FITTED), said({"pid": ended.pid, "forked": True}), said({"type": "array"}),
+        saved(np.zeros(ROWS)), said(SCORED), said(LAST),
+    )  # fmt: skip
+    assert ended.returncode == 0
+    assert (out.status, out.reason) == ("ok", "")
 
 
 NPY = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"

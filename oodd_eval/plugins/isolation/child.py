@@ -118,9 +118,10 @@ class Child:
             return
         with contextlib.suppress(psutil.NoSuchProcess):  # It may have ended by now.
             process = psutil.Process(pid)
-            if process.ppid() != self._process.pid:
+            if process.ppid() == self._process.pid:
+                self._scoring, self.forked = process, forked
+            elif process.is_running():  # While one is reaped, Linux says that its parent is 0.
                 raise ValueError(pid)
-            self._scoring, self.forked = process, forked
 
     @property
     def exited(self) -> bool:
