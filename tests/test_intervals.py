@@ -210,7 +210,7 @@ def test_a_mean_over_cells_is_that_of_their_resamples():
     expected = mean_samples([cell_samples("ant", one) for one in terms])
     np.testing.assert_allclose(sample_cells([cells]), expected, rtol=1e-12)
     some = mean_samples([cell_samples("ant", terms[i]) for i in (1, 3, 5)])
-    np.testing.assert_allclose(sample_cells([cells.only([1, 3, 5])]), some, rtol=1e-12)
+    np.testing.assert_allclose(sample_cells([cells.only((1, 3, 5))]), some, rtol=1e-12)
     assert cells.values == pytest.approx([one.value for one in terms], nan_ok=True)
 
 

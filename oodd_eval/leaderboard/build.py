@@ -28,6 +28,7 @@ from oodd_eval.leaderboard.sections import (
     suite_sections,
 )
 from oodd_eval.leaderboard.site.data import Json, power_of
+from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import layout, rendering
 from oodd_eval.results.tables.board import Board, primary_settings
@@ -61,6 +62,7 @@ class SuiteParts(NamedTuple):
     published: str = ""
 
 
+@without_collector()
 def suite_parts(place: Path) -> SuiteParts:
     """Return what a leaderboard's directory has of further test suites, ready to be shown."""
     suites = suite_sections(place)
@@ -76,6 +78,7 @@ def suite_parts(place: Path) -> SuiteParts:
     return SuiteParts([*map(_suite, suites)], power_of(suites), table, suite_lines(suites))
 
 
+@without_collector()
 def build(
     entries: Sequence[SubmittedEntry], output: Path,
     suites: Callable[[], SuiteParts] = SuiteParts, *, on_part: Callable[[str], object] = str,

@@ -11,12 +11,13 @@ share of nominal episodes with an alarm have exact binomial intervals (`metrics.
 """
 
 import functools
+import itertools
 import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,22 +58,18 @@ def shared_weights(environment: str, n: int) -> Weights:
     return weights
 
 
-def resampled(
-    contribution: Contribution, weights: Weights, denominator: Samples | None = None
-) -> Samples:
-    """Return a metric in every resample; NaN where its denominator is 0.
-
-    `denominator` is that in every resample, where it is known.
-    """
+def resampled(contribution: Contribution, weights: Weights) -> Samples:
+    """Return a metric in every resample; NaN where its denominator is 0."""
     if contribution.median:
         return _medians(contribution, weights)
     numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
-    if (contribution.denominator == 1).all():  # as of a mean: every resample has n trajectories
-        return numerator / len(contribution.denominator)
-    if denominator is None:
-        denominator = np.einsum("rn,n->r", weights, contribution.denominator)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(denominator > 0, numerator / denominator, np.nan)
+    return numerator / _total(contribution.denominator, weights)
+
+
+def _total(denominator: Floats, weights: Weights) -> Samples:
+    """Return a denominator in every resample, NaN for 0."""
+    total = np.einsum("rn,n->r", weights, denominator)
+    return np.where(total > 0, total, np.nan)
 
 
 def _medians(contribution: Contribution, weights: Weights) -> Samples:
@@ -85,6 +82,14 @@ def _medians(contribution: Contribution, weights: Weights) -> Samples:
     low, high = ((drawn <= k).sum(axis=1) for k in ((total - 1) // 2, total // 2))
     ordered = np.append(contribution.numerator[chosen], np.nan)  # with none drawn, k is beyond
     return np.asarray((ordered[low] + ordered[high]) / 2)
+
+
+class CellSum(NamedTuple):
+    """The sum of a metric over some cells of a detector seed in every resample."""
+
+    seed: int
+    samples: Samples
+    cells: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +115,8 @@ class DrawnCells:
         found: list[int] = np.count_nonzero(self.denominators, axis=1).tolist()
         return found
 
-    def only(self, places: Sequence[int]) -> "DrawnCells":
+    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded: an old one is let go
+    def only(self, places: tuple[int, ...]) -> "DrawnCells":
         """Return some of the cells."""
         at = list(places)
         return replace(
@@ -118,27 +124,43 @@ class DrawnCells:
             numerators=self.numerators[at], denominators=self.denominators[at],
         )  # fmt: skip
 
-    def samples(self, places: Sequence[int]) -> Samples:
-        """Return the sum of cells with the same denominators in every resample."""
-        own = self._contribution(places)
-        n = len(own.denominator)
-        if self.median or self.weights is not shared_weights(self.environment, n):
-            return resampled(own, self.weights)
-        terms = own.denominator.tobytes()
-        return resampled(own, self.weights, _shared(self.environment, terms))
+    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded; means over several environments share
+    def sums(self) -> list[CellSum]:
+        """Return sums over cells of each seed in every resample.
 
-    def _contribution(self, places: Sequence[int]) -> Contribution:
-        added = self.numerators[places[0]]
-        if len(places) > 1:
-            added = self.numerators[list(places)].sum(axis=0)
-        return Contribution(added, self.denominators[places[0]], self.median)
+        Ratios with the same denominators are added before they are resampled: many metrics have
+        those of all anomalies in common.
+        """
+        groups: dict[object, list[int]] = {}
+        for i, seed in enumerate(self.seeds):
+            own = i if self.median else (seed, self.denominators[i].tobytes())
+            groups.setdefault(own, []).append(i)
+        if self.median:
+            terms = zip(self.numerators, self.denominators, strict=True)
+            found = [_medians(Contribution(*both), self.weights) for both in terms]
+        else:
+            added = np.array([self.numerators[places].sum(axis=0) for places in groups.values()])
+            drawn = np.einsum("rn,gn->gr", self.weights, added)
+            found = [
+                own / self._total(self.denominators[places[0]])
+                for own, places in zip(drawn, groups.values(), strict=True)
+            ]
+        return [
+            CellSum(self.seeds[places[0]], own, len(places))
+            for own, places in zip(found, groups.values(), strict=True)
+        ]
+
+    def _total(self, denominator: Floats) -> Samples:
+        if self.weights is shared_weights(self.environment, len(denominator)):
+            return _shared(self.environment, denominator.tobytes())
+        return _total(denominator, self.weights)
 
 
 @functools.lru_cache(maxsize=2048)
 def _shared(environment: str, terms: bytes) -> Samples:
     """Return a denominator in every resample, which metrics of one level have in common."""
     own = np.frombuffer(terms)
-    return np.asarray(np.einsum("rn,n->r", shared_weights(environment, len(own)), own))
+    return _total(own, shared_weights(environment, len(own)))
 
 
 def drawn_cells(
@@ -330,30 +352,21 @@ def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
     seeds where there are several. Differences, sums and `mean_samples` of what this returns for
     several detectors or anomalies are paired.
     """
-    by_seed: dict[int, list[tuple[DrawnCells, list[int]]]] = {}
-    for c in cells:
-        own: dict[int, list[int]] = {}
-        for i, seed in enumerate(c.seeds):
-            own.setdefault(seed, []).append(i)
-        for seed, places in own.items():
-            by_seed.setdefault(seed, []).append((c, places))
-    return mean_over_seeds([_sample_seed(by_seed[seed]) for seed in sorted(by_seed)])
+    by_seed: dict[int, list[CellSum]] = {}
+    for one in itertools.chain.from_iterable(c.sums() for c in cells):
+        by_seed.setdefault(one.seed, []).append(one)
+    return mean_over_seeds([_mean_of(by_seed[seed]) for seed in sorted(by_seed)])
 
 
-def _sample_seed(cells: Sequence[tuple[DrawnCells, list[int]]]) -> Samples:
-    """Return the resamples of a mean over the cells of one detector seed, at places in others.
-
-    Ratios with the same denominators are added before they are resampled: many metrics have those
-    of all anomalies of an environment in common.
-    """
-    total, count = np.zeros((2, len(cells[0][0].weights)))
-    for c, places in cells:
-        groups: dict[object, list[int]] = {}
-        for i in places:
-            groups.setdefault(i if c.median else c.denominators[i].tobytes(), []).append(i)
-        for group in groups.values():
-            samples = c.samples(group)
-            undefined = np.isnan(samples)
+def _mean_of(sums: Sequence[CellSum]) -> Samples:
+    """Return the mean over cells in every resample."""
+    total, count = np.zeros((2, len(sums[0].samples)))
+    for _, samples, cells in sums:
+        undefined = np.isnan(samples)
+        if undefined.any():
             total += np.where(undefined, 0.0, samples)
-            count += np.where(undefined, 0, len(group))
+            count += np.where(undefined, 0, cells)
+        else:
+            total += samples
+            count += cells
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -13,11 +13,13 @@ Every file is whole or absent, see `oodd_eval.data.files`. A score file that is 
 written is not read; one of an earlier version, without a digest beside it, is.
 """
 
+import gc
 import hashlib
 import io
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -311,6 +313,19 @@ class RecordWriter:
         return [record for index in sorted(self._finished) for record in self._finished[index]]
 
 
+@contextmanager
+def without_collector() -> Iterator[None]:
+    """Leave the collector of cycles off: it would go over all numbers of records, and find none."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@without_collector()
 def read_records(file: Path, notes: list[str] | None = None) -> list[Record]:
     """Read a file of records.
 

@@ -167,11 +167,17 @@ class Record:
     def to_json(self) -> str:
         """Return one line of JSON, keys in a fixed order, NaN as null."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        terms = plain["per_trajectory"]
+        plain = _without_nan({**plain, "per_trajectory": {}, "metrics": {}})
         plain["metrics"] = {
-            name: {"value": m.value, "low": m.low, "high": m.high, "n": m.n}
+            name: {"value": _known(m.value), "low": _known(m.low), "high": _known(m.high), "n": m.n}
             for name, m in self.metrics.items()
         }
-        return json.dumps(_without_nan(plain), allow_nan=False)
+        plain["per_trajectory"] = terms
+        try:
+            return json.dumps(plain, allow_nan=False)
+        except (TypeError, ValueError):  # Seldom has any of the many terms no value.
+            return json.dumps(_without_nan(plain), allow_nan=False)
 
     @classmethod
     def from_json(cls, line: str, where: str = "record") -> "Record":
@@ -212,10 +218,14 @@ def _other_schema(found: object) -> str:
     )
 
 
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _without_nan(value: Any) -> Any:
     """Replace numbers that JSON does not know by None, at any depth."""
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return _known(value)
     if isinstance(value, Mapping):
         return {str(k): _without_nan(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -148,15 +148,17 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
     chosen = selections(cells)
-    rows, ends = [], {}
+    rows, ends, by_cell = [], {}, {}
     for standing in ranks.standings:
         row, part = _row(section, standing, names, chosen, units)
         rows.append(row)
         parts[row["part"]] = part
         ends[row["part"]] = _ranking_intervals(part)
+        by_cell[row["part"]] = _by_cell(standing, cells)
     for metric in names:
-        values = {row["part"]: _by_cell(s, cells, metric)
-                  for row, s in zip(rows, ranks.standings, strict=True)}  # fmt: skip
+        values = {
+            part: [_mean(records, metric) for records in own] for part, own in by_cell.items()
+        }
         parts[metric_part(section.name, metric)] = {
             "values": values, "intervals": ends if metric == RANKING else {},
         }  # fmt: skip
@@ -255,14 +257,16 @@ def _summaries(
     return found
 
 
-def _by_cell(standing: Standing, cells: Sequence[SelectedCell], metric: str) -> list[float | None]:
-    """Return a row's mean over detector seeds in every cell; None where there is none."""
+def _by_cell(standing: Standing, cells: Sequence[SelectedCell]) -> list[list[Record]]:
+    """Return a row's records of every cell, none where one has failed."""
     own = grouped(standing.records, lambda r: (r.environment, r.anomaly))
-    whole = [all(r.ok for r in own.get(cell, ())) for cell in cells]
-    return [
-        _short(nan_mean(r.value(metric) for r in own.get(cell, ()))) if ok else None
-        for cell, ok in zip(cells, whole, strict=True)
-    ]
+    found = [own.get(cell, []) for cell in cells]
+    return [records if all(r.ok for r in records) else [] for records in found]
+
+
+def _mean(records: Sequence[Record], metric: str) -> float | None:
+    """Return the mean over detector seeds; None where there is none."""
+    return _short(nan_mean(r.metrics[metric].value for r in records if metric in r.metrics))
 
 
 def _ranking_intervals(part: Json) -> dict[str, list[float | None]]:

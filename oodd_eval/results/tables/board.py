@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -46,6 +46,41 @@ class Value(NamedTuple):
     brief: bool = False
 
 
+class _Own:
+    """A row's metric in the cells of an environment: of each anomaly, values and their terms."""
+
+    def __init__(
+        self, cells: Mapping[str, Sequence[Record]], environment: str, metric: str
+    ) -> None:
+        self._values: dict[str, list[tuple[int, float]]] = {a: [] for a in cells}
+        self._drawn: list[tuple[DrawnCells, list[str]]] = []
+        stored = ((a, r) for a, own in cells.items() for r in own if metric in r.per_trajectory)
+        by_size = grouped(stored, lambda pair: len(pair[1].per_trajectory[metric][0]))
+        for pairs in by_size.values():
+            terms = (np.array([r.per_trajectory[metric][i] for _, r in pairs]) for i in (0, 1))
+            drawn = drawn_cells(environment, [r.seed for _, r in pairs], *terms,
+                                median=_is_median(metric))  # fmt: skip
+            names = [a for a, _ in pairs]
+            self._drawn.append((drawn, names))
+            for name, seed, value in zip(names, drawn.seeds, drawn.values, strict=True):
+                self._values[name].append((seed, value))
+        # Thresholds are no ratios of sums.
+        for a, r in ((a, r) for a, own in cells.items() for r in own):
+            if metric not in r.per_trajectory:
+                self._values[a].append((r.seed, r.value(metric)))
+
+    def values(self, anomaly: str) -> Sequence[tuple[int, float]]:
+        """Return detector seeds and values of an anomaly's cells."""
+        return self._values.get(anomaly, ())
+
+    def drawn(self, anomalies: Sequence[str]) -> Iterator[DrawnCells]:
+        """Yield the cells of some anomalies that have terms, of one number of trajectories each."""
+        for whole, names in self._drawn:
+            places = tuple(i for a in anomalies for i, name in enumerate(names) if name == a)
+            if places:
+                yield whole if places == (*range(len(names)),) else whole.only(places)
+
+
 class Board:
     """Records of one split digest, protocol and limit, see `boards`."""
 
@@ -55,8 +90,9 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
-        self._drawn: dict[tuple[Setting, str, str, int], tuple[DrawnCells, dict[int, int]]] = {}
+        self._drawn: dict[tuple[Setting, str, str], _Own] = {}
         self._means: dict[tuple[object, ...], Value] = {}
+        self._without: dict[tuple[object, ...], Value] = {}
         self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
         for (setting, _, _), own in self._cells.items():
@@ -100,71 +136,54 @@ class Board:
         self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str,
         intervals: bool,
     ) -> Value:  # fmt: skip
+        unknown = self._without_value(entry, environments, anomalies)
+        if unknown.state:
+            return unknown
+        own = [self._own(entry, e, metric) for e in environments]
+        value = mean_over_cells(pair for one in own for a in anomalies for pair in one.values(a))
+        ends = NAN, NAN
+        if intervals and (drawn := [c for one in own for c in one.drawn(anomalies)]):
+            ends = mean_interval(drawn, kind=metric_info(metric).interval)
+        return unknown._replace(value=value, low=ends[0], high=ends[1])
+
+    def _without_value(
+        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str]
+    ) -> Value:
+        """Return all of an entry's mean but its value: the same for every metric."""
+        key = entry, tuple(environments), tuple(anomalies)
+        if key not in self._without:
+            self._without[key] = self._selected(*key)
+        return self._without[key]
+
+    def _selected(
+        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str]
+    ) -> Value:
         wanted = [p for p in itertools.product(environments, anomalies) if p in self._places]
         cells = [self._cells[entry, *p] for p in wanted if (entry, *p) in self._cells]
         records = [record for cell in cells for record in cell]
-        partial = 0 < len(cells) < len(wanted)
+        state = next((r.status for r in records if not r.ok), "")
         brief = bool(records) and all(r.brief for r in records)
-        if failed := next((r for r in records if not r.ok), None):
-            return Value(state=failed.status, cells=len(records), partial=partial, brief=brief)
-        value, ends = self._mean(records, metric), (NAN, NAN)
-        if intervals:
-            drawn = [
-                whole if chosen == [*range(len(whole.seeds))] else whole.only(chosen)
-                for whole, chosen in self._terms(records, metric)
-            ]
-            if drawn:
-                ends = mean_interval(drawn, kind=metric_info(metric).interval)
-        return Value(value, *ends, "", len(records), partial, brief)
+        partial = 0 < len(cells) < len(wanted)
+        return Value(state=state, cells=len(records), partial=partial, brief=brief)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
         pairs = []
-        for place in itertools.product(self.environments, self.anomalies):
-            cells = [self._cells.get((entry, *place), []) for entry in (first, second)]
-            ok = all(cells) and all(r.ok for cell in cells for r in cell)
-            if ok and not any(math.isnan(self._mean(cell, metric)) for cell in cells):
-                pairs.append(cells)
-        one, two = (self._mean((r for pair in pairs for r in pair[i]), metric) for i in (0, 1))
+        for e, a in itertools.product(self.environments, self.anomalies):
+            cells = [self._cells.get((entry, e, a), []) for entry in (first, second)]
+            if all(cells) and all(r.ok for cell in cells for r in cell):
+                own = [self._own(entry, e, metric).values(a) for entry in (first, second)]
+                if not any(math.isnan(mean_over_cells(values)) for values in own):
+                    pairs.append(own)
+        one, two = (mean_over_cells(value for pair in pairs for value in pair[i]) for i in (0, 1))
         return one, two, len(pairs)
 
-    def _mean(self, records: Iterable[Record], metric: str) -> float:
-        """Return the mean over the cells where a metric is defined."""
-        own = list(records)
-        values = [
-            (whole.seeds[i], whole.values[i])
-            for whole, chosen in self._terms(own, metric) for i in chosen
-        ]  # fmt: skip
-        # Thresholds are no ratios of sums.
-        values += [(r.seed, r.value(metric)) for r in own if metric not in r.per_trajectory]
-        return mean_over_cells(values)
-
-    def _terms(self, records: Iterable[Record], metric: str) -> list[tuple[DrawnCells, list[int]]]:
-        """Return the terms of a row's metric, by environment, and the places of records in them."""
-        stored = (r for r in records if metric in r.per_trajectory)
-        by_size = grouped(stored, lambda r: (r.environment, len(r.per_trajectory[metric][0])))
-        found = []
-        for (environment, n), own in by_size.items():
-            whole, places = self._whole(own[0].setting, environment, metric, n)
-            found.append((whole, [places[id(r)] for r in own]))
-        return found
-
-    def _whole(
-        self, entry: Setting, environment: str, metric: str, n: int
-    ) -> tuple[DrawnCells, dict[int, int]]:
-        """Return all cells of a row in an environment, made once, and the places of its records."""
-        key = entry, environment, metric, n
+    def _own(self, entry: Setting, environment: str, metric: str) -> "_Own":
+        """Return a row's metric in the cells of an environment, put together once."""
+        key = entry, environment, metric
         if key not in self._drawn:
-            cells = [self._cells.get((entry, environment, a), ()) for a in self.anomalies]
-            own = [
-                r
-                for r in itertools.chain(*cells)
-                if metric in r.per_trajectory and len(r.per_trajectory[metric][0]) == n
-            ]
-            terms = (np.array([r.per_trajectory[metric][i] for r in own]) for i in (0, 1))
-            drawn = drawn_cells(environment, [r.seed for r in own], *terms,
-                                median=_is_median(metric))  # fmt: skip
-            self._drawn[key] = drawn, {id(r): i for i, r in enumerate(own)}
+            cells = {a: self._cells.get((entry, environment, a), []) for a in self.anomalies}
+            self._drawn[key] = _Own(cells, environment, metric)
         return self._drawn[key]
 
     def failures(self) -> list[Record]:

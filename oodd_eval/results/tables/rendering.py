@@ -80,7 +80,8 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
             "primary": str(one.primary).lower(), "seeds": one.seeds, "inputs": one.inputs,
             "trust": trust.get(one.entry, ""), "win_rate": number(one.wins),
             "seconds_fit": number(one.cost.fit), "microseconds_per_step": number(one.cost.step),
-            "peak_rss_mb": number(one.cost.peak), **_ends(means),
+            "peak_rss_mb": number(one.cost.peak),
+            **dict(zip(_columns(means), _texts(means.values()), strict=True)),
         })  # fmt: skip
     return csv_rows(lines)
 
@@ -91,18 +92,21 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
     Every cell has a mapping with columns that stand before its own, the same ones for all. Every
     metric that a record can have has a column.
     """
-    rows = [
-        {**about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
-         "limit": "" if r.limit is None else r.limit, "detector": r.detector,
-         "version": r.detector_version, "horizon": r.horizon,
-         "overrides": r.setting.overrides_json, "seed": r.seed, "environment": r.environment,
-         "group": r.group, "anomaly": r.anomaly, "strength": r.strength, "status": r.status,
-         "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
-         "microseconds_per_step": number(cost_of([r]).step), "peak_rss_mb": number(r.peak_rss_mb),
-         **_ends({name: r.metrics.get(name) for name in NAMES})}
-        for about, r in lines
-    ]  # fmt: skip
-    return csv_rows(rows, header=header)
+    own: dict[str, object] = {}
+    rows = []
+    for about, r in lines:
+        own = {
+            **about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
+            "limit": "" if r.limit is None else r.limit, "detector": r.detector,
+            "version": r.detector_version, "horizon": r.horizon,
+            "overrides": r.setting.overrides_json, "seed": r.seed, "environment": r.environment,
+            "group": r.group, "anomaly": r.anomaly, "strength": r.strength, "status": r.status,
+            "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
+            "microseconds_per_step": number(cost_of([r]).step),
+            "peak_rss_mb": number(r.peak_rss_mb),
+        }  # fmt: skip
+        rows.append([*own.values(), *_texts(map(r.metrics.get, NAMES))])
+    return csv_text([*([[*own, *_columns(NAMES)]] if header else []), *rows])
 
 
 def comparisons_csv(ranks: RankedBoard) -> str:
@@ -138,12 +142,16 @@ def _setting(setting: Setting) -> dict[str, object]:
             "overrides": setting.overrides_json}  # fmt: skip
 
 
-def _ends(values: Mapping[str, Value | Metric | None]) -> dict[str, str]:
-    """Return the texts of values and of the ends of their intervals, by column."""
-    found: dict[str, str] = {}
-    for name, v in values.items():
-        texts = [number(v.value), number(v.low), number(v.high)] if v else ["", "", ""]
-        found[name], found[f"{name}_low"], found[f"{name}_high"] = texts
+def _columns(names: Iterable[str]) -> list[str]:
+    """Return the columns of values and of the ends of their intervals."""
+    return [name + end for name in names for end in ("", "_low", "_high")]
+
+
+def _texts(values: Iterable[Value | Metric | None]) -> list[str]:
+    """Return the texts of values and of the ends of their intervals, empty for None."""
+    found: list[str] = []
+    for v in values:
+        found += [number(v.value), number(v.low), number(v.high)] if v else ["", "", ""]
     return found
 
 
