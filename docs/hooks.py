@@ -19,7 +19,7 @@ from oodd_eval._version import repository
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import site_files, suite_parts
+from oodd_eval.leaderboard.build import CELLS, cells, suite_parts
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
 
@@ -86,11 +86,13 @@ def board() -> dict[str, str | bytes]:
     """Return the files of the leaderboard's site, which are not committed."""
     if not (ROOT / RESULTS[0]).exists():
         return {}
-    entries = read_entries(ROOT / "leaderboard" / "results")
-    shown = site_files(sections(entries), suite_parts(ROOT / "leaderboard"))
+    found = sections(read_entries(ROOT / "leaderboard" / "results"))
+    suites = suite_parts(ROOT / "leaderboard")
+    shown = site.files(found, suites.power, project=repository())
     # The page of Markdown that it links to is a page of this site.
-    page = str(shown[site.PAGE]).replace('href="../README.md"', 'href="../index.html"')
-    return {f"{BOARD}/{name}": content for name, content in (shown | {site.PAGE: page}).items()}
+    page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
+    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suites)}
+    return {f"{BOARD}/{name}": content for name, content in files.items()}
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -92,7 +92,7 @@ def build(
     found = sections(entries)
     on_part("suites")
     further = suites()
-    beside = started(lambda: site_files(found, further))
+    beside = started(lambda: site.files(found, further.power, project=repository()))
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files: dict[str, str | bytes] = {PAGE: page(found, further.page, site=address)}
@@ -102,6 +102,7 @@ def build(
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
     on_part("published board")
     files[PUBLISHED] = published_bytes(found, further.published)
+    files[CELLS] = cells(found, further)
     on_part("site")
     files |= {f"{SITE}/{name}": content for name, content in beside().items()}
     for name, content in files.items():
@@ -145,17 +146,8 @@ def started(function: Callable[[], Made]) -> Callable[[], Made]:
     return wait
 
 
-def site_files(
-    sections: Sequence[LeaderboardSection], suites: SuiteParts
-) -> dict[str, str | bytes]:
-    """Return the files of the site by name: page, data files, and the table of all cells."""
-    shown = site.files(sections, suites.power, project=repository())
-    table = cells(sections) + suites.cells
-    return {**shown, Path(CELLS).name: compress(table.encode())}
-
-
-def cells(sections: Sequence[LeaderboardSection]) -> str:
-    """Return all cells of boards as one table (CSV)."""
+def cells(sections: Sequence[LeaderboardSection], suites: SuiteParts) -> bytes:
+    """Return all cells of boards and suites as one table (compressed CSV)."""
     lines: list[tuple[dict[str, str], Record]] = []
     for section in sections:
         for row in section.ranks.standings:
@@ -164,7 +156,7 @@ def cells(sections: Sequence[LeaderboardSection]) -> str:
             about = {"board": "leaderboard", "entry": entry.meta.id, "trust": entry.trust,
                      "primary": primary, "trivial": trivial}  # fmt: skip
             lines += [(about, r) for r in row.records]
-    return rendering.cells_csv(lines)
+    return compress((rendering.cells_csv(lines) + suites.cells).encode())
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:

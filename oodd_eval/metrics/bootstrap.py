@@ -76,10 +76,10 @@ def _medians(contribution: Contribution, weights: Weights) -> Samples:
     """Return the median in every resample: the mean of the two middle ones among even numbers."""
     chosen = np.flatnonzero(contribution.denominator)
     chosen = chosen[np.argsort(contribution.numerator[chosen], kind="stable")]
-    drawn = np.cumsum(weights[:, chosen], axis=1)
-    total = drawn[:, -1:] if chosen.size else np.zeros((len(weights), 1))
+    drawn = np.cumsum(weights.T[chosen], axis=0)
+    total = drawn[-1] if chosen.size else np.zeros(len(weights))
     # The k-th of all that are drawn, from 0, is the first with more than k up to it.
-    low, high = ((drawn <= k).sum(axis=1) for k in ((total - 1) // 2, total // 2))
+    low, high = ((drawn <= k).sum(axis=0) for k in ((total - 1) // 2, total // 2))
     ordered = np.append(contribution.numerator[chosen], np.nan)  # with none drawn, k is beyond
     return np.asarray((ordered[low] + ordered[high]) / 2)
 

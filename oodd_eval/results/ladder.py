@@ -53,8 +53,12 @@ def unit(place: Place) -> float:
 
 def rung_names(records: Iterable[Record]) -> list[str]:
     """Return the names of all rungs with records, the weakest first."""
-    found = {name for rungs in ladders(records).values() for name in rungs}
-    return [name for name in RUNGS if name in found]
+    return _names(ladders(records))
+
+
+def _names(found: Mapping[Place, Mapping[str, Rung]]) -> list[str]:
+    known = {name for rungs in found.values() for name in rungs}
+    return [name for name in RUNGS if name in known]
 
 
 def at_rung(records: Sequence[Record], name: str) -> list[Record]:
@@ -131,8 +135,9 @@ class Point(NamedTuple):
 def curve(records: Sequence[Record], metric: str) -> list[Point]:
     """Return a metric of one row along the ladder, the weakest rung first."""
     found = []
-    known = {place: rungs_of(*place) for place in ladders(records)}
-    for name in rung_names(records):
+    own_rungs = ladders(records)
+    known = {place: rungs_of(*place) for place in own_rungs}
+    for name in _names(own_rungs):
         chosen = {place: _nearest(rungs, name) for place, rungs in known.items()}
         own = [r for r in records if r.ok and r.strength and r.strength == chosen.get(_place(r))]
         rungs = {place: known[place][chosen[place]] for place in dict.fromkeys(map(_place, own))}

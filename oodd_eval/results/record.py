@@ -27,6 +27,8 @@ STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 
 NAN: Final = float("nan")
 
+_COSTS: Final = ("seconds_fit", "seconds_score", "peak_rss_mb")
+
 Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None else value)]
 """A number that is read from null where it is NaN."""
 
@@ -167,16 +169,14 @@ class Record:
     def to_json(self) -> str:
         """Return one line of JSON, keys in a fixed order, NaN as null."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
-        terms = plain["per_trajectory"]
-        plain = _without_nan({**plain, "per_trajectory": {}, "metrics": {}})
+        plain |= {name: _known(plain[name]) for name in _COSTS}
         plain["metrics"] = {
             name: {"value": _known(m.value), "low": _known(m.low), "high": _known(m.high), "n": m.n}
             for name, m in self.metrics.items()
         }
-        plain["per_trajectory"] = terms
         try:
             return json.dumps(plain, allow_nan=False)
-        except (TypeError, ValueError):  # Seldom has any of the many terms no value.
+        except (TypeError, ValueError):  # Seldom has anything else no value.
             return json.dumps(_without_nan(plain), allow_nan=False)
 
     @classmethod

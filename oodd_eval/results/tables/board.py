@@ -47,31 +47,28 @@ class Value(NamedTuple):
 
 
 class _Own:
-    """A row's metric in the cells of an environment: of each anomaly, values and their terms."""
+    """A row's metric in the cells of an environment, given as anomalies and records."""
 
-    def __init__(
-        self, cells: Mapping[str, Sequence[Record]], environment: str, metric: str
-    ) -> None:
-        self._values: dict[str, list[tuple[int, float]]] = {a: [] for a in cells}
-        self._drawn: list[tuple[DrawnCells, list[str]]] = []
-        stored = ((a, r) for a, own in cells.items() for r in own if metric in r.per_trajectory)
-        by_size = grouped(stored, lambda pair: len(pair[1].per_trajectory[metric][0]))
-        for pairs in by_size.values():
-            terms = (np.array([r.per_trajectory[metric][i] for _, r in pairs]) for i in (0, 1))
-            drawn = drawn_cells(environment, [r.seed for _, r in pairs], *terms,
-                                median=_is_median(metric))  # fmt: skip
-            names = [a for a, _ in pairs]
-            self._drawn.append((drawn, names))
-            for name, seed, value in zip(names, drawn.seeds, drawn.values, strict=True):
-                self._values[name].append((seed, value))
+    def __init__(self, cells: Sequence[tuple[str, Record]], environment: str, metric: str) -> None:
         # Thresholds are no ratios of sums.
-        for a, r in ((a, r) for a, own in cells.items() for r in own):
-            if metric not in r.per_trajectory:
-                self._values[a].append((r.seed, r.value(metric)))
+        self._values = [
+            (a, r.seed, r.value(metric)) for a, r in cells if metric not in r.per_trajectory
+        ]
+        self._drawn: list[tuple[DrawnCells, tuple[str, ...]]] = []
+        stored = [
+            (a, r.seed, r.per_trajectory[metric]) for a, r in cells if metric in r.per_trajectory
+        ]
+        for n in {len(terms[0]) for _, _, terms in stored}:
+            names, seeds, own = zip(*(one for one in stored if len(one[2][0]) == n), strict=True)
+            both = np.array(own)
+            drawn = drawn_cells(environment, seeds, both[:, 0], both[:, 1],
+                                median=_is_median(metric))  # fmt: skip
+            self._drawn.append((drawn, names))
+            self._values += zip(names, seeds, drawn.values, strict=True)
 
-    def values(self, anomaly: str) -> Sequence[tuple[int, float]]:
-        """Return detector seeds and values of an anomaly's cells."""
-        return self._values.get(anomaly, ())
+    def values(self, anomalies: Collection[str]) -> list[tuple[int, float]]:
+        """Return detector seeds and values of some anomalies' cells."""
+        return [(seed, value) for a, seed, value in self._values if a in anomalies]
 
     def drawn(self, anomalies: Sequence[str]) -> Iterator[DrawnCells]:
         """Yield the cells of some anomalies that have terms, of one number of trajectories each."""
@@ -91,6 +88,7 @@ class Board:
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         self._drawn: dict[tuple[Setting, str, str], _Own] = {}
+        self._defined: dict[tuple[Setting, str], dict[Place, Sequence[tuple[int, float]]]] = {}
         self._means: dict[tuple[object, ...], Value] = {}
         self._without: dict[tuple[object, ...], Value] = {}
         self._places = {(e, a) for _, e, a in self._cells}
@@ -140,7 +138,7 @@ class Board:
         if unknown.state:
             return unknown
         own = [self._own(entry, e, metric) for e in environments]
-        value = mean_over_cells(pair for one in own for a in anomalies for pair in one.values(a))
+        value = mean_over_cells(pair for one in own for pair in one.values(anomalies))
         ends = NAN, NAN
         if intervals and (drawn := [c for one in own for c in one.drawn(anomalies)]):
             ends = mean_interval(drawn, kind=metric_info(metric).interval)
@@ -168,22 +166,28 @@ class Board:
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
-        pairs = []
-        for e, a in itertools.product(self.environments, self.anomalies):
-            cells = [self._cells.get((entry, e, a), []) for entry in (first, second)]
-            if all(cells) and all(r.ok for cell in cells for r in cell):
-                own = [self._own(entry, e, metric).values(a) for entry in (first, second)]
-                if not any(math.isnan(mean_over_cells(values)) for values in own):
-                    pairs.append(own)
-        one, two = (mean_over_cells(value for pair in pairs for value in pair[i]) for i in (0, 1))
-        return one, two, len(pairs)
+        own = [self._compared(entry, metric) for entry in (first, second)]
+        both = [place for place in own[0] if place in own[1]]
+        one, two = (mean_over_cells(v for place in both for v in side[place]) for side in own)
+        return one, two, len(both)
+
+    def _compared(self, entry: Setting, metric: str) -> dict[Place, Sequence[tuple[int, float]]]:
+        """Return detector seeds and values of the cells in which a row has a mean, found once."""
+        if (entry, metric) not in self._defined:
+            found = self._defined[entry, metric] = {}
+            for e, a in itertools.product(self.environments, self.anomalies):
+                if all(r.ok for r in self._cells.get((entry, e, a), ())):
+                    values = self._own(entry, e, metric).values([a])
+                    if not math.isnan(mean_over_cells(values)):
+                        found[e, a] = values
+        return self._defined[entry, metric]
 
     def _own(self, entry: Setting, environment: str, metric: str) -> "_Own":
         """Return a row's metric in the cells of an environment, put together once."""
         key = entry, environment, metric
         if key not in self._drawn:
-            cells = {a: self._cells.get((entry, environment, a), []) for a in self.anomalies}
-            self._drawn[key] = _Own(cells, environment, metric)
+            found = ((a, self._cells.get((entry, environment, a), ())) for a in self.anomalies)
+            self._drawn[key] = _Own([(a, r) for a, own in found for r in own], environment, metric)
         return self._drawn[key]
 
     def failures(self) -> list[Record]:
@@ -316,9 +320,9 @@ def ranked(
     cells = {r.place for r in records}
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
-    ranking, rows = _ranking(by_row, states, first - below, RANKING)
     by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
                  for e, own in by_row.items()}  # fmt: skip
+    ranking, rows = _ranking(by_row, states, first - below, RANKING)
     alarms, _ = _ranking(by_row, by_alarms, first - below, ALARM_RANKING)
     rates = win_rates({
         label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}

@@ -52,9 +52,10 @@ def tables(board: Board, *, intervals: bool = False, places: bool = False) -> li
     made = [_separability(board, found)] if found else []
     if not any(found.values()):  # no level of 5 %, with few calibration episodes
         return made
-    own = [by_place(board, e, found, intervals=intervals) for e in board.entries if found.get(e)]
     by_kind = _by_kind(board, found, intervals=intervals)
-    return [overview(board, found), *made, by_kind, *(own if places else ())]
+    rows = [e for e in board.entries if places and found.get(e)]
+    own = [by_place(board, e, found, intervals=intervals) for e in rows]
+    return [overview(board, found), *made, by_kind, *own]
 
 
 def by_place(
