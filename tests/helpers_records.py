@@ -19,10 +19,9 @@ def make_record(
     given = values or {}
     numbers = {name: list(given.get(name, [0.5, 0.5])) for name in {**METRICS, **given}}
     per_trajectory = {
-        name: ([0.0 if v is None else float(v) for v in column],
-               [0.0 if v is None else 1.0 for v in column])
+        name: np.array([[v or 0.0 for v in column], [v is not None for v in column]], dtype=float)
         for name, column in numbers.items()
-    }  # fmt: skip
+    }
     metrics = {}
     for name, column in numbers.items():
         defined = [v for v in column if v is not None]

@@ -101,9 +101,9 @@ def describe(record, *, inputs="observations", **fields):
     own = record.per_trajectory
     alarms = {f"{name}_at_5pct": own.get(SIMILAR.get(name, name), own.get("far_twin"))
               for name in GUARANTEED}  # fmt: skip
-    columns = {k: v for k, v in (own | alarms).items() if v}
+    columns = {k: v for k, v in (own | alarms).items() if v is not None}
     metrics = {
-        name: metric_of(name, Contribution(*map(np.array, pair)), record.environment)
+        name: metric_of(name, Contribution(*pair), record.environment)
         for name, pair in columns.items()
     }
     fields = {"metrics": metrics, "per_trajectory": columns} | fields

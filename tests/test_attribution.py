@@ -272,7 +272,7 @@ def test_records_have_the_metrics_of_detectors_that_explain_only(world):
         named, error = (record.metrics[name] for name in ATTRIBUTION)
         delays = record.per_trajectory["delay_at_5pct"]
         # It names the row of the alarm, so that its error is the delay.
-        assert record.per_trajectory[ONSET_ERROR] == delays
+        assert np.array_equal(record.per_trajectory[ONSET_ERROR], delays)
         assert error.n == sum(delays[1])
         if error.n:
             defined = [d for d, known in zip(*delays, strict=True) if known]

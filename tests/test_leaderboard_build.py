@@ -15,9 +15,10 @@ from helpers_records import example, make_record
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import SPLITS
+from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.build import cells, page
+from oodd_eval.leaderboard.build import SuiteParts, cells, page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.grants import Grant
 from oodd_eval.leaderboard.published import PUBLISHED
@@ -41,12 +42,12 @@ def record(detector, matched, *, environment="hopper", anomaly="iid", **more):
     one = dataclasses.replace(one, counts={"test": SEEDS})
     if not one.ok:
         return one
-    none = [0.0] * SEEDS, [1.0] * SEEDS
+    none = np.repeat([[0.0], [1.0]], SEEDS, axis=1)
     per_trajectory = one.per_trajectory | {
         "false_episodes_at_5pct": none,
         "early_at_5pct": none,
         "missed_at_5pct": one.per_trajectory["missed"],
-        "delay_censored_at_5pct": ([60 * (1 - (m or 0)) for m in matched], [1.0] * SEEDS),
+        "delay_censored_at_5pct": np.array([[60 * (1 - (m or 0)) for m in matched], none[1]]),
     }
     metrics = one.metrics | {name: Metric(0.5) for name in per_trajectory}
     return dataclasses.replace(
@@ -336,7 +337,7 @@ def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
     }  # fmt: skip
     slow = [
         dataclasses.replace(r, per_trajectory=r.per_trajectory | {
-            "delay_censored_at_5pct": ([90.0] * SEEDS, [1.0] * SEEDS)
+            "delay_censored_at_5pct": np.repeat([[90.0], [1.0]], SEEDS, axis=1)
         }) if r.detector == "riqn" else r
         for r in board()
     ]  # fmt: skip
@@ -345,7 +346,7 @@ def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
     # A row in which it is undefined says so.
     undefined = [
         dataclasses.replace(r, per_trajectory=r.per_trajectory | {
-            "delay_censored_at_5pct": ([0.0] * SEEDS, [0.0] * SEEDS)
+            "delay_censored_at_5pct": np.zeros((2, SEEDS))
         }) if (r.setting, r.environment) == (Setting("riqn"), "ant") else r
         for r in board()
     ]  # fmt: skip
@@ -619,7 +620,7 @@ def test_nothing_that_others_wrote_becomes_markup():
 
 def test_csv_of_cells_has_a_line_per_cell_with_stored_metrics():
     found = sections(entries())
-    lines = lines_of(cells(found))
+    lines = lines_of(decompress(cells(found, SuiteParts())).decode())
     assert len(lines) == 22
     assert {line["board"] for line in lines} == {"leaderboard"}
     by_cell = {(r.detector, r.horizon, r.environment, r.anomaly): r for r in board()}
@@ -636,7 +637,7 @@ def test_every_column_of_the_table_of_cells_is_described():
     page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
     listed = [name for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
               for name in re.findall(r"`(\w+)`", row)]  # fmt: skip
-    columns = list(lines_of(cells(sections(entries())))[0])
+    columns = list(lines_of(decompress(cells(sections(entries()), SuiteParts())).decode())[0])
     own = [c for c in columns if re.sub(r"_(low|high)$", "", c) not in catalogue.NAMES]
     assert sorted(own) == sorted(name for name in listed if not name.startswith("_"))
     assert len(own) < len(columns)
@@ -754,7 +755,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 def test_a_mean_is_within_its_interval_where_a_cell_is_undefined_for_one_seed():
     def one(seed, anomaly, steps):
         made = record("riqn", [0.7] * SEEDS, seed=seed, anomaly=anomaly)
-        term = [steps or 0.0] * SEEDS, [float(steps is not None)] * SEEDS
+        term = np.repeat([[steps or 0.0], [float(steps is not None)]], SEEDS, axis=1)
         return dataclasses.replace(made, per_trajectory=made.per_trajectory | {"delay": term})
 
     unlike = [one(0, "iid", None), one(0, "gravity", 5.0), one(1, "iid", 50.0),

@@ -50,13 +50,14 @@ def must_be_like_its_twins(record):
     """Every metric of a cell is what its nominal twins give, episode by episode."""
     assert record.ok
     for metric in ("auc_matched", "auc_smoothed"):
-        values, counted = map(np.array, record.per_trajectory[metric])
+        values, counted = record.per_trajectory[metric]
         assert counted.any()
         assert (values == 0.5 * counted).all()
     nulls = [n for n in record.per_trajectory if n.endswith(("_null_at_5pct", "_null_at_10pct"))]
     assert {"found_within_100_null_at_5pct", "missed_null_at_5pct"} <= {*nulls}
     for null in nulls:
-        assert record.per_trajectory[null.replace("_null", "")] == record.per_trajectory[null]
+        plain = record.per_trajectory[null.replace("_null", "")]
+        assert np.array_equal(plain, record.per_trajectory[null])
     assert record.value("auc_unpaired") == record.value("auc_placebo")
 
 

@@ -38,8 +38,8 @@ def row(detector, mean, *, seeds=(0, 1, 2), places=PLACES, **more):
                 **more,
             )  # fmt: skip
             terms = one.per_trajectory | {
-                "delay_censored_at_5pct": ([float(v) for v in 60 * (1 - matched)], [1.0] * TEST),
-                "false_episodes_at_5pct": ([0.0] * TEST, [1.0] * TEST),
+                "delay_censored_at_5pct": np.array([60 * (1 - matched), np.ones(TEST)]),
+                "false_episodes_at_5pct": np.array([np.zeros(TEST), np.ones(TEST)]),
             }
             metrics = one.metrics | dict.fromkeys(terms, one.metrics["auc"])
             counts = {"train": 40, "calibration": 40, "test": TEST}
@@ -257,7 +257,7 @@ def test_rankings_mark_own_rows_and_have_an_order_of_their_own(shipped):
     slow = [
         dataclasses.replace(
             r, per_trajectory=r.per_trajectory | {
-                "delay_censored_at_5pct": ([59.0] * TEST, [1.0] * TEST)
+                "delay_censored_at_5pct": np.repeat([[59.0], [1.0]], TEST, axis=1)
             },
         )
         for r in row("slow", 0.9)

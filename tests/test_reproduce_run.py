@@ -190,7 +190,12 @@ def test_figures_are_drawn_once_and_again_when_numbers_change(finished, tmp_path
 def comparable(directory):
     """What records say, by cell: all but when and how fast."""
     return {
-        r.cell: (r.status, r.metrics, r.per_trajectory, r.scores)
+        r.cell: (
+            r.status,
+            r.metrics,
+            {n: t.tolist() for n, t in r.per_trajectory.items()},
+            r.scores,
+        )
         for r in ResultsDirectory(directory).records()
     }
 

@@ -17,7 +17,7 @@ from oodd_eval.metrics.catalogue import (
 )
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import Record, same_terms
 from oodd_eval.results.tables.board import (
     SEEDS,
     RankedBoard,
@@ -93,8 +93,12 @@ def place(
 
 def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:
     """Tell whether all numbers of a row are among those of another."""
-    known = {(r.place, r.seed): (r.status, r.per_trajectory) for r in others}
-    return all(known.get((r.place, r.seed)) == (r.status, r.per_trajectory) for r in own)
+    known = {(r.place, r.seed, r.status): r.per_trajectory for r in others}
+    keys = [(r.place, r.seed, r.status) for r in own]
+    return all(
+        key in known and same_terms(known[key], r.per_trajectory)
+        for key, r in zip(keys, own, strict=True)
+    )
 
 
 def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:

@@ -94,7 +94,7 @@ def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rule
         corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
     )  # fmt: skip
     per_trajectory = {
-        name: (c.numerator.tolist(), c.denominator.tolist()) for name, c in contributions.items()
+        name: np.array([c.numerator, c.denominator]) for name, c in contributions.items()
     }
     return replace(record, metrics=metrics, per_trajectory=per_trajectory, brief=bool(known.brief))
 

@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
-from pydantic import BeforeValidator, TypeAdapter, ValidationError
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, GetPydanticSchema, TypeAdapter, ValidationError
 
 from oodd_eval.data.facts import join_condition
 from oodd_eval.errors import ResultsError
@@ -33,6 +35,12 @@ Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None els
 """A number that is read from null where it is NaN."""
 
 
+Terms = Annotated[
+    NDArray[np.float64], GetPydanticSchema(lambda _, read: read(tuple[list[float], list[float]]))
+]
+"""Numerators and denominators of a ratio of sums: shape (2, n)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Metric:
     """A value with its 95 % interval over n trajectories; NaN where undefined."""
@@ -45,7 +53,7 @@ class Metric:
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Record:
     """One cell: split x environment x anomaly x detector x parameters x horizon x seed.
 
@@ -76,7 +84,8 @@ class Record:
     counts
         Numbers of trajectories used, by part.
     per_trajectory
-        For each metric that is a ratio of sums, its numerators and denominators in test order.
+        For each metric that is a ratio of sums, its numerators and denominators in test order:
+        shape (2, n).
     scores
         Key of the file with the scores.
     seconds_fit, seconds_score, steps_scored, peak_rss_mb
@@ -112,7 +121,7 @@ class Record:
     metrics: dict[str, Metric] = field(default_factory=dict)
     brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
-    per_trajectory: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
+    per_trajectory: dict[str, Terms] = field(default_factory=dict)
     scores: str = ""
     seconds_fit: Number = NAN
     seconds_score: Number = NAN
@@ -122,6 +131,15 @@ class Record:
     schema: int = SCHEMA
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields."""
+        if not isinstance(other, Record):
+            return NotImplemented
+        both = [[getattr(r, n) for n in _PLAIN] for r in (self, other)]
+        return both[0] == both[1] and same_terms(self.per_trajectory, other.per_trajectory)
+
+    __hash__ = None  # type: ignore[assignment]
 
     @property
     def ok(self) -> bool:
@@ -170,6 +188,7 @@ class Record:
         """Return one line of JSON, keys in a fixed order, NaN as null."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain |= {name: _known(plain[name]) for name in _COSTS}
+        plain["per_trajectory"] = {n: own.tolist() for n, own in self.per_trajectory.items()}
         plain["metrics"] = {
             name: {"value": _known(m.value), "low": _known(m.low), "high": _known(m.high), "n": m.n}
             for name, m in self.metrics.items()
@@ -191,10 +210,32 @@ class Record:
             raise ResultsError(f"{where} {_problem(line, error)}") from None
         if record.schema != SCHEMA:
             raise ResultsError(f"{where} {_other_schema(record.schema)}")
+        for name, (tops, bottoms) in record.per_trajectory.items():
+            if len(tops) != len(bottoms):
+                raise ResultsError(
+                    f"{where} is no record: per_trajectory.{name}: {len(tops)} numerators and "
+                    f"{len(bottoms)} denominators, expected as many of both"
+                )
+        # Of a record that nobody has yet.
+        object.__setattr__(record, "per_trajectory", _arrays(record.per_trajectory))
         return record
 
 
 _READER: Final = TypeAdapter(Record)
+_PLAIN: Final = tuple(f.name for f in fields(Record) if f.name != "per_trajectory")
+
+
+def _arrays(terms: Mapping[str, Any]) -> dict[str, Terms]:
+    """Return lists of terms as arrays."""
+    if len({len(tops) for tops, _ in terms.values()}) > 1:
+        return {name: np.array(own) for name, own in terms.items()}
+    return dict(zip(terms, np.array([*terms.values()]), strict=True))  # faster than one by one
+
+
+def same_terms(first: Mapping[str, Terms], second: Mapping[str, Terms]) -> bool:
+    """Tell whether terms are equal to the last bit."""
+    known = first.keys() == second.keys()
+    return known and all(np.array_equal(own, second[name]) for name, own in first.items())
 
 
 def _problem(line: str, error: ValidationError) -> str:

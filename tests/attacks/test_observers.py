@@ -44,7 +44,7 @@ CHANGES = {
     "a value": ("oodd_cell_finished(record)",
                 f"[{SET}(m, 'value', 1.0) for m in record.metrics.values()]"),
     "terms": ("oodd_cell_finished(record)",
-              "[t.append(9.0) for pair in record.per_trajectory.values() for t in pair]"),
+              "[terms.fill(9.0) for terms in record.per_trajectory.values()]"),
     "parameters of a record": ("oodd_cell_finished(record)", "record.parameters['x'] = 1"),
     "counts": ("oodd_cell_finished(record)", "record.counts['test'] = 10**6"),
     "a status": ("oodd_cell_finished(record)", f"{SET}(record, 'status', 'error')"),

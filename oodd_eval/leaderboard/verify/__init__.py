@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import forms
 from oodd_eval.data.split import Split, load_split, published_digests
@@ -255,8 +257,8 @@ def check_copies(name: str, records: Records, seen: _Numbers, findings: Findings
     """
     cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
     for record in records.values():
-        terms, row = record.per_trajectory.get(RANKING, ((), ()))[0], str(record.setting)
-        told = tuple(round(term, 3) for term in terms)
+        terms, row = record.per_trajectory.get(RANKING, np.zeros((2, 0))), str(record.setting)
+        told = tuple(round(term, 3) for term in terms[0].tolist())
         if len(set(told)) > 1:
             cells[row] += 1
             place = record.split_digest, record.environment, record.condition, told

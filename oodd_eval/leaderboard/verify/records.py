@@ -183,13 +183,13 @@ def _agreements(record: Record) -> Iterator[tuple[str, Any, Any, str]]:
     if not record.ok:
         return
     yield "scores", fit, record.scores, "both are of the same fit"
+    terms = {name: own.tolist() for name, own in record.per_trajectory.items()}
     if record.deterministic:
         row = str(record.setting), *place
-        yield "per_trajectory", row, record.per_trajectory, "its seed changes nothing"
-    of_twins = ["far_twin", *(n for n in record.per_trajectory if n.startswith("false_episodes"))]
-    for name in of_twins:
-        terms = record.per_trajectory.get(name)
-        yield f"per_trajectory.{name}", fit, terms, "both are of the same fit on the same twins"
+        yield "per_trajectory", row, terms, "its seed changes nothing"
+    for name in ["far_twin", *(n for n in terms if n.startswith("false_episodes"))]:
+        reason = "both are of the same fit on the same twins"
+        yield f"per_trajectory.{name}", fit, terms.get(name), reason
     for name in catalogue.ATTRIBUTION:
         reason = "a detector explains all of its alarms or none"
         yield f"metrics.{name} is there", record.detector, name in record.metrics, reason

@@ -194,8 +194,8 @@ def check_rescored(records: Records, directory: Path, split: Split, findings: Fi
             findings.refuse(where, f"metrics.{name}", "cannot be computed from the scores")
         compare_metrics(where, record, again.metrics, "the scores give", findings)
         for name in sorted(record.per_trajectory.keys() & again.per_trajectory.keys()):
-            pairs = zip(record.per_trajectory[name], again.per_trajectory[name], strict=True)
-            if not all(len(a) == len(b) and all(map(same, a, b)) for a, b in pairs):
+            own, other = (r.per_trajectory[name] for r in (record, again))
+            if own.shape != other.shape or not all(map(same, own.flat, other.flat)):
                 message = "differs from what the scores give"
                 findings.refuse(where, f"per_trajectory.{name}", message)
     return findings.count == before
@@ -270,8 +270,8 @@ def _contradictions(unit: Json, record: Record) -> Complaints:
         told = f"far {far:.4g}, delay_censored {delay:.4g} and missed {missed:.4g}"
         yield "delay_far", f"lacks the record's {told} at threshold {THRESHOLD}"
     example = unit["example"]
-    terms = record.per_trajectory.get("auc_matched", ([], []))
-    own = [n / d if d else math.nan for n, d in zip(*terms, strict=True)]
+    terms = record.per_trajectory.get("auc_matched", np.zeros((2, 0)))
+    own = [n / d if d else math.nan for n, d in terms.T.tolist()]
     if own and not _close(example["auc_matched"], own[example["index"]]):
         yield "example.auc_matched", f"is not the record's {own[example['index']]:.4f}"
 

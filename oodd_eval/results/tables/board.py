@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -87,10 +87,7 @@ class Board:
         self.split, self.digest = first.split, first.split_digest
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
-        self._drawn: dict[tuple[Setting, str, str], _Own] = {}
-        self._defined: dict[tuple[Setting, str], dict[Place, Sequence[tuple[int, float]]]] = {}
-        self._means: dict[tuple[object, ...], Value] = {}
-        self._without: dict[tuple[object, ...], Value] = {}
+        self._made: dict[tuple[object, ...], Any] = {}
         self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
         for (setting, _, _), own in self._cells.items():
@@ -125,37 +122,35 @@ class Board:
         The interval resamples test trajectories, the same ones for all cells of an environment,
         and detector seeds where there are several. A mean is computed once: tables share many.
         """
-        key = entry, tuple(environments), tuple(anomalies), metric, intervals
-        if key not in self._means:
-            self._means[key] = self._computed(*key)
-        return self._means[key]
+        places = tuple(environments), tuple(anomalies)
+        return self._once(self._computed, entry, *places, metric, intervals)
+
+    def _once(self, make: Callable[..., Item], *arguments: Hashable) -> Item:
+        """Call a method, once with the same arguments."""
+        key = make.__name__, *arguments
+        if key not in self._made:
+            self._made[key] = make(*arguments)
+        made: Item = self._made[key]
+        return made
 
     def _computed(
         self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str,
         intervals: bool,
     ) -> Value:  # fmt: skip
-        unknown = self._without_value(entry, environments, anomalies)
+        unknown = self._once(self._unknown, entry, environments, anomalies)
         if unknown.state:
             return unknown
-        own = [self._own(entry, e, metric) for e in environments]
+        own = [self._once(self._own, entry, e, metric) for e in environments]
         value = mean_over_cells(pair for one in own for pair in one.values(anomalies))
         ends = NAN, NAN
         if intervals and (drawn := [c for one in own for c in one.drawn(anomalies)]):
             ends = mean_interval(drawn, kind=metric_info(metric).interval)
         return unknown._replace(value=value, low=ends[0], high=ends[1])
 
-    def _without_value(
+    def _unknown(
         self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str]
     ) -> Value:
         """Return all of an entry's mean but its value: the same for every metric."""
-        key = entry, tuple(environments), tuple(anomalies)
-        if key not in self._without:
-            self._without[key] = self._selected(*key)
-        return self._without[key]
-
-    def _selected(
-        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str]
-    ) -> Value:
         wanted = [p for p in itertools.product(environments, anomalies) if p in self._places]
         cells = [self._cells[entry, *p] for p in wanted if (entry, *p) in self._cells]
         records = [record for cell in cells for record in cell]
@@ -166,29 +161,25 @@ class Board:
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
-        own = [self._compared(entry, metric) for entry in (first, second)]
+        own = [self._once(self._defined, entry, metric) for entry in (first, second)]
         both = [place for place in own[0] if place in own[1]]
         one, two = (mean_over_cells(v for place in both for v in side[place]) for side in own)
         return one, two, len(both)
 
-    def _compared(self, entry: Setting, metric: str) -> dict[Place, Sequence[tuple[int, float]]]:
-        """Return detector seeds and values of the cells in which a row has a mean, found once."""
-        if (entry, metric) not in self._defined:
-            found = self._defined[entry, metric] = {}
-            for e, a in itertools.product(self.environments, self.anomalies):
-                if all(r.ok for r in self._cells.get((entry, e, a), ())):
-                    values = self._own(entry, e, metric).values([a])
-                    if not math.isnan(mean_over_cells(values)):
-                        found[e, a] = values
-        return self._defined[entry, metric]
+    def _defined(self, entry: Setting, metric: str) -> dict[Place, list[tuple[int, float]]]:
+        """Return detector seeds and values of the cells in which a row has a mean."""
+        found = {}
+        for e, a in itertools.product(self.environments, self.anomalies):
+            if all(r.ok for r in self._cells.get((entry, e, a), ())):
+                values = self._once(self._own, entry, e, metric).values([a])
+                if not math.isnan(mean_over_cells(values)):
+                    found[e, a] = values
+        return found
 
-    def _own(self, entry: Setting, environment: str, metric: str) -> "_Own":
-        """Return a row's metric in the cells of an environment, put together once."""
-        key = entry, environment, metric
-        if key not in self._drawn:
-            found = ((a, self._cells.get((entry, environment, a), ())) for a in self.anomalies)
-            self._drawn[key] = _Own([(a, r) for a, own in found for r in own], environment, metric)
-        return self._drawn[key]
+    def _own(self, entry: Setting, environment: str, metric: str) -> _Own:
+        """Return a row's metric in the cells of an environment."""
+        found = ((a, self._cells.get((entry, environment, a), ())) for a in self.anomalies)
+        return _Own([(a, r) for a, own in found for r in own], environment, metric)
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
@@ -213,7 +204,7 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
-    numerators, denominators = map(np.array, record.per_trajectory[metric])
+    numerators, denominators = record.per_trajectory[metric]
     return Contribution(numerators, denominators, _is_median(metric))
 
 
