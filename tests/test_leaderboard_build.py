@@ -701,8 +701,15 @@ def test_check_compares_what_compressed_files_say(tmp_path):
     _, results, output = built(tmp_path, entries())
     check = ["leaderboard", "build", str(results), "--output", str(output), "--check"]
     content = gzip.decompress((output / PUBLISHED).read_bytes())
-    (output / PUBLISHED).write_bytes(gzip.compress(content, 1, mtime=1))
+    elsewhere = gzip.compress(content, 1, mtime=1)
+    (output / PUBLISHED).write_bytes(elsewhere)
     assert main(check) == 0
+    assert main(check[:-1]) == 0
+    assert (output / PUBLISHED).read_bytes() == elsewhere
+    for other in (gzip.compress(content[:-2]), elsewhere[:-9]):
+        (output / PUBLISHED).write_bytes(other)
+        assert main(check[:-1]) == 0
+        assert gzip.decompress((output / PUBLISHED).read_bytes()) == content
     (output / PUBLISHED).write_bytes(gzip.compress(content[:-2]))
     assert main(check) == 1
 

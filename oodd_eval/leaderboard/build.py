@@ -16,6 +16,7 @@ from oodd_eval._version import repository
 from oodd_eval.data.facts import GROUPS, SPLITS
 from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
+from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.leaderboard.published import PUBLISHED, published_bytes, suite_lines
@@ -83,10 +84,11 @@ def build(
     entries: Sequence[SubmittedEntry], output: Path,
     suites: Callable[[], SuiteParts] = SuiteParts, *, on_part: Callable[[str], object] = str,
 ) -> list[str]:  # fmt: skip
-    """Write page, tables, site and the published file, the same bytes for the same entries.
+    """Write page, tables, site and the published file, the same for the same entries.
 
-    Returns their names, the page first. `on_part` is called with the name of each part before it
-    is made. ResultsError: the entries contradict one another.
+    Returns their names, the page first. A compressed file with the same content stays as it is,
+    whatever has compressed it. `on_part` is called with the name of each part before it is made.
+    ResultsError: the entries contradict one another.
     """
     on_part("ranking")
     found = sections(entries)
@@ -106,10 +108,10 @@ def build(
     on_part("site")
     files |= {f"{SITE}/{name}": content for name, content in beside().items()}
     for name, content in files.items():
-        if isinstance(content, bytes):
-            write_bytes(output / name, content)
-        else:
+        if isinstance(content, str):
             write_text(output / name, content)
+        elif not _says(output / name, decompress(content)):
+            write_bytes(output / name, content)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
@@ -185,6 +187,12 @@ def _content(path: Path) -> bytes:
     """Return what a file says: versions of zlib compress the same content differently."""
     content = path.read_bytes()
     return decompress(content) if path.suffix == GZIP else content
+
+
+def _says(path: Path, content: bytes) -> bool:
+    with contextlib.suppress(OSError, ResultsError):
+        return _content(path) == content
+    return False
 
 
 def page(

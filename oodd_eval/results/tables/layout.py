@@ -95,9 +95,13 @@ def _by_group(board: Board, title: str, *, intervals: bool) -> list[_Mean]:
     return [_Mean(t, RANKING, board.environments, a, intervals) for t, a in chosen.items()]
 
 
-def _overall(board: Board, names: Iterable[str], intervals: Collection[str] = ()) -> list[_Mean]:
+def _overall(
+    board: Board, names: Iterable[str], intervals: Collection[str] = (), *, level: bool = True
+) -> list[_Mean]:
+    titles = {n: metric_info(n).title for n in names}
+    titles |= {} if level else {n: t.partition(" at ")[0].lower() for n, t in titles.items()}
     over = board.environments, board.anomalies
-    return [_Mean(metric_info(n).title, n, *over, n in intervals) for n in names]
+    return [_Mean(title, n, *over, n in intervals) for n, title in titles.items()]
 
 
 def separability(board: Board, *, intervals: bool = False) -> Table:
@@ -106,12 +110,10 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     Beside the mean over all cells stand that of smoothed scores and that against another twin.
     """
     columns = _by_group(board, "mean", intervals=intervals)
-    more = "auc_smoothed", "auc_unpaired"
-    columns += [c._replace(title=c.metric.removeprefix("auc_"))
-                for c in _overall(board, more, more if intervals else ())]  # fmt: skip
+    over = board.environments, board.anomalies
+    columns += [_Mean(n, f"auc_{n}", *over, intervals) for n in ("smoothed", "unpaired")]
     columns += [_Mean(e, RANKING, [e], board.anomalies, intervals) for e in board.environments]
-    over = board.environments, board.anomalies, RANKING
-    means = {entry: board.mean(entry, *over).value for entry in board.entries}
+    means = {entry: board.mean(entry, *over, RANKING).value for entry in board.entries}
     order = sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
     rows = [[str(entry), *_texts(board, entry, columns)] for entry in order]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
@@ -133,9 +135,8 @@ def guaranteed(
     names = _present(board, (f"{name}_{suffix}" for name in bases))
     if not names:
         return None
-    shown = [n for n in names if intervals or n.startswith("false_episodes")]
-    columns = [c._replace(title=c.title.partition(" at ")[0].lower())
-               for c in _overall(board, names, shown)]  # fmt: skip
+    with_ends = [n for n in names if intervals or n.startswith("false_episodes")]
+    columns = _overall(board, names, with_ends, level=False)
     level = f"{100 * catalogue.LEVELS[suffix]:g} %"
     title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
     note = (
@@ -152,10 +153,9 @@ def attribution(
     explaining = {r.setting for r in board.records if r.metrics.keys() & {*catalogue.ATTRIBUTION}}
     if not explaining:
         return None
-    own = Board([r for r in board.records if r.setting in explaining])
     names = catalogue.ATTRIBUTION
-    columns = [c._replace(title=c.title.partition(" at ")[0].lower())
-               for c in _overall(own, names, names if intervals else ())]  # fmt: skip
+    own = board if standings else Board([r for r in board.records if r.setting in explaining])
+    columns = _overall(own, names, names if intervals else (), level=False)
     title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
     note = (
         "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
