@@ -316,8 +316,7 @@ class SecretWarmUp(Good):
 
 
 @breaks(
-    "warm-up",
-    "warm_up is 9, but only the first 1 scores are NaN: declare what is left undefined",
+    "warm-up", "warm_up is 9, but only the first 1 scores are NaN: declare what is left undefined"
 )
 class BraggingWarmUp(Good):
     warm_up = 9
@@ -488,8 +487,7 @@ class SharesOfOne(Good):
 
 
 @breaks(
-    "explain",
-    "explain returned onsets as float64 of shape (81,), expected int64 of shape (81,)",
+    "explain", "explain returned onsets as float64 of shape (81,), expected int64 of shape (81,)"
 )
 class OnsetsInBetween(Good):
     def explain(self, x):
@@ -578,8 +576,7 @@ class Hurried(Good):
 
 
 @breaks(
-    "streaming",
-    "update differs from score of the whole episode: at t = 1 it is <n> instead of <n>",
+    "streaming", "update differs from score of the whole episode: at t = 1 it is <n> instead of <n>"
 )
 class CountsEpisodes(Good):
     episodes = -1
@@ -671,11 +668,7 @@ class SavesNothing(Good):
     def save(self, directory): ...
 
 
-@breaks(
-    "save-and-load",
-    "load raised FileNotFoundError: <...>",
-    also={"shared-fit"},
-)
+@breaks("save-and-load", "load raised FileNotFoundError: <...>", also={"shared-fit"})
 class LoadsElsewhere(Good):
     def load(self, directory):
         (directory / "elsewhere").read_bytes()
@@ -817,8 +810,7 @@ class PrintsBelow(Good):
 
 
 @breaks(
-    "warnings",
-    "fit or score warned: UserWarning: it is late: mend or silence what is expected",
+    "warnings", "fit or score warned: UserWarning: it is late: mend or silence what is expected"
 )
 class Warns(Good):
     def fit(self, nominal):

@@ -8,11 +8,7 @@ Nothing is simulated, so a split takes milliseconds.
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
-from oodd_eval.data.layout import (
-    pack_parameters,
-    write_environment,
-    write_manifest,
-)
+from oodd_eval.data.layout import pack_parameters, write_environment, write_manifest
 from oodd_eval.data.parts import TWINS
 
 

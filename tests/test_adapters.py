@@ -12,12 +12,7 @@ from sklearn.neighbors import KernelDensity
 
 from oodd_eval import Trajectory, load_split
 from oodd_eval.cli.main import main
-from oodd_eval.errors import (
-    ContractError,
-    MissingExtraError,
-    UnknownNameError,
-    UsageError,
-)
+from oodd_eval.errors import ContractError, MissingExtraError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters

@@ -269,10 +269,7 @@ def test_parameters_come_from_a_file_too(run, tmp_path, failing):
         (["show", "nowhere", "--metric", "acc"], "unknown metric 'acc': did you mean 'auc'?"),
         (["data", "build", "mini", "--train", "3"], "is published: --train would make another"),
         (["data", "build", "dev"], "--train, --calibration, --test, --seed-base must be given"),
-        (
-            [*BUILD[:-1], "--seed-base=2"],
-            "--seed-base is 2, expected 10 to 899",
-        ),
+        ([*BUILD[:-1], "--seed-base=2"], "--seed-base is 2, expected 10 to 899"),
         (["policies", "train", "antt"], "unknown environment 'antt': did you mean 'ant'?"),
         (["policies", "evaluate", "ant", "--episodes", "0"], "of at least 1"),
     ],

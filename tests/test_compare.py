@@ -304,9 +304,7 @@ def test_a_reference_says_what_the_records_say(tmp_path):
     assert second.status == "timeout"
 
 
-def test_a_reference_has_a_record_per_line_in_the_benchmarks_order_and_no_more(
-    tmp_path,
-):
+def test_a_reference_has_a_record_per_line_in_the_benchmarks_order_and_no_more(tmp_path):
     one = dataclasses.replace(
         record("iid"), seconds_fit=2.0, provenance={"python": "3.11", "time": "now"}, scores="key"
     )

@@ -200,8 +200,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_records(tiny_split, monkey
         # A killed harness is forgotten: what it had ordered ends.
         log.unlink()
         killed = oodd_eval(
-            *command(tiny_split, tmp_path / "killed", *place, "--param", "pause=600"),
-            env=variables,
+            *command(tiny_split, tmp_path / "killed", *place, "--param", "pause=600"), env=variables
         )
         assert wait_until(log.exists)
         assert workers_of(marker)

@@ -417,8 +417,7 @@ def test_constant_sensors_have_scale_one():
 
 
 @pytest.mark.parametrize(
-    "parameters",
-    [{"members": 0}, {"samples": 1.5}, {"updates": True}, {"scheduled_sampling": 2}],
+    "parameters", [{"members": 0}, {"samples": 1.5}, {"updates": True}, {"scheduled_sampling": 2}]
 )
 def test_parameters_out_of_range_are_named(parameters):
     with pytest.raises(UsageError, match=next(iter(parameters))):

@@ -201,10 +201,7 @@ HANGING = {
     "importhangs": "if 'OODD_EVAL_PROCESS' in os.environ: time.sleep(600)",
 }
 
-BROKEN = {
-    "leavesatimport": "import sys; sys.exit(0)",
-    "brokenatimport": "import no_such_module",
-}
+BROKEN = {"leavesatimport": "import sys; sys.exit(0)", "brokenatimport": "import no_such_module"}
 
 # A harness that imported these would be gone.
 DEADLY = {

@@ -13,12 +13,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
 from oodd_eval.plugins.contract import DetectorSpec
 from oodd_eval.plugins.discovery import Offer, discover, offer_of
-from oodd_eval.plugins.parameters import (
-    declared_by,
-    parameter,
-    parameters_of,
-    resolve_parameters,
-)
+from oodd_eval.plugins.parameters import declared_by, parameter, parameters_of, resolve_parameters
 
 OFFER = """
 @hookimpl

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
-from oodd_eval.data.info import (
-    collect_returns,
-    column_lines,
-    describe,
-    group_rows,
-    return_rows,
-)
+from oodd_eval.data.info import collect_returns, column_lines, describe, group_rows, return_rows
 from oodd_eval.data.parts import AnomalousSet
 from oodd_eval.data.split import load_split
 

@@ -168,10 +168,7 @@ def test_digest_ignores_chunks_compression_and_block_size(tmp_path, monkeypatch)
         assert content_digest(file["packed"]) == expected
 
 
-@given(
-    st.lists(st.floats(width=32, allow_nan=False), min_size=2, max_size=20),
-    st.integers(0, 19),
-)
+@given(st.lists(st.floats(width=32, allow_nan=False), min_size=2, max_size=20), st.integers(0, 19))
 def test_digest_changes_with_any_value_and_with_the_shape(values, index):
     array = np.array(values, "<f4")
     other = array.copy()

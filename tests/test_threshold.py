@@ -10,12 +10,7 @@ from hypothesis.extra import numpy as arrays
 from sklearn.isotonic import IsotonicRegression
 
 from oodd_eval.metrics.bootstrap import drawn_seeds, shared_weights
-from oodd_eval.metrics.threshold import (
-    DetectionThreshold,
-    crossing,
-    geometric_mean,
-    isotonic,
-)
+from oodd_eval.metrics.threshold import DetectionThreshold, crossing, geometric_mean, isotonic
 
 STRENGTHS = (1.0, 4.0, 16.0)
 

@@ -27,13 +27,7 @@ from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.layout import split_digest
 from oodd_eval.data.split import SHIPPED, split_directories
-from oodd_eval.errors import (
-    DigestError,
-    OutputError,
-    SplitError,
-    SplitNotFoundError,
-    UsageError,
-)
+from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
 
 
 @pytest.fixture

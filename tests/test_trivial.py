@@ -2,15 +2,7 @@
 
 import numpy as np
 import pytest
-from oodd_trivial import (
-    Clock,
-    Comb,
-    Mahalanobis,
-    Persistence,
-    Random,
-    Range,
-    oodd_detectors,
-)
+from oodd_trivial import Clock, Comb, Mahalanobis, Persistence, Random, Range, oodd_detectors
 from scipy.stats import binom, kstest
 
 from oodd_eval.data.split import load_split

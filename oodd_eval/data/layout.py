@@ -31,14 +31,7 @@ from oodd_eval.data.facts import (
     split_condition,
 )
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.parts import (
-    CALIBRATION,
-    NAMES,
-    NOMINAL,
-    TRAIN,
-    TWINS,
-    anomalies_in,
-)
+from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, anomalies_in
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2

@@ -10,22 +10,10 @@ def isotonic(found: Floats, total: Floats) -> Floats:
     """Return the non-decreasing shares that are nearest to `found` / `total`, weighted by `total`.
 
     Least squares; the min-max formula of isotonic regression (Barlow et al. 1972), for many columns
-    at once.
+    at once. Shapes are (K, ...), by rung; no total may be 0. At rung k it is the largest, over the
+    rungs i up to k, of the smallest pooled share of i to j, over the rungs j from k on. That is
+    what pooling adjacent violators gives.
 
-    Parameters
-    ----------
-    found, total
-        Numbers of episodes in which an anomaly was found, and of all, by rung: shape (K, ...). A
-        total may not be 0.
-
-    Returns
-    -------
-    Floats
-        Of shape (K, ...): at rung k the largest, over the rungs i up to k, of the smallest pooled
-        share of i to j, over the rungs j from k on. That is what pooling adjacent violators gives.
-
-    Examples
-    --------
     >>> isotonic(np.array([1.0, 3.0, 1.0, 4.0]), np.array([4.0, 4.0, 4.0, 4.0])).tolist()
     [0.25, 0.5, 0.5, 1.0]
     """

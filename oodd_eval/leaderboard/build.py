@@ -337,12 +337,7 @@ def _entry(entry: SubmittedEntry) -> str:
     listed = [f"- {name}: {escape(text)}" for name, text in lines if text]
     if meta.url:
         listed.append(f"- Page: {_link(meta.url)}")
-    made = [
-        "",
-        "To run it again:",
-        "",
-        *(f"    {command}" for command in entry.commands),
-    ]
+    made = ["", "To run it again:", "", *(f"    {command}" for command in entry.commands)]
     return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, *made, ""])
 
 

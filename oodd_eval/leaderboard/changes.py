@@ -18,17 +18,9 @@ class Changes(NamedTuple):
 def changes_against(base: str, results: Path) -> Changes:
     """Return what differs from the commit where the current branch left a base, by name.
 
-    Parameters
-    ----------
-    base
-        A branch, tag or commit.
-    results
-        Directory of the entries, in a checkout. In it, files that git does not know yet count, too.
-
-    Raises
-    ------
-    UsageError
-        When this is no checkout, or `base` is no commit of it that the branch comes from.
+    The base is a branch, tag or commit. `results` is the directory of the entries, in a checkout,
+    where files that git does not know yet count, too. `UsageError`: this is no checkout, or `base`
+    is no commit of it that the branch comes from.
     """
     place = results if results.is_dir() else Path()
     top = Path(_git(place, "rev-parse", "--show-toplevel").rstrip("\n"))

@@ -8,13 +8,7 @@ from typing import Final, NamedTuple
 
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.published import ALARMS, PublishedBoard, slim
-from oodd_eval.metrics.catalogue import (
-    ALARM_RANKING,
-    FOUND_WITHIN,
-    RANKING,
-    UNDEFINED,
-    metric_info,
-)
+from oodd_eval.metrics.catalogue import ALARM_RANKING, FOUND_WITHIN, RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record, same_terms

@@ -13,13 +13,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import (
-    Board,
-    RankedBoard,
-    boards,
-    primary_settings,
-    ranked,
-)
+from oodd_eval.results.tables.board import Board, RankedBoard, boards, primary_settings, ranked
 from oodd_eval.results.tables.layout import Table
 
 TABLES: Final = "tables"  # directory of the CSV files

@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import AlarmKind
-from oodd_eval.plugins.contract import (
-    Detector,
-    StreamingDetector,
-    make_detector,
-)
+from oodd_eval.plugins.contract import Detector, StreamingDetector, make_detector
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.explanations import ExplainingDetector, StreamingExplainer
 

@@ -118,11 +118,7 @@ class PairTests:
     def test(self, groups: Sequence[tuple[str, Sequence[str], Floats]]) -> list[list[Tested]]:
         """Test rows against others.
 
-        Parameters
-        ----------
-        groups
-            Of a row's name, the names of others, and the differences of its mean to theirs: shape
-            (others,).
+        A group is a row's name, the names of others, and the differences of its mean to theirs.
         """
         if not any(others for _, others, _ in groups):
             return [[] for _ in groups]

@@ -31,23 +31,12 @@ _ROUNDING: Final = 1e-8  # what such weights may take off a share
 
 
 def crossing(shares: Floats, strengths: Floats) -> Floats:
-    """Return the logarithm of the strength at which shares reach one half.
+    """Return the logarithm of the strength at which shares reach one half: shape (...).
 
-    Parameters
-    ----------
-    shares
-        Of episodes, non-decreasing along the rungs: shape (K, ...).
-    strengths
-        Of the rungs, positive and non-decreasing: shape (K,).
+    `shares` of episodes do not decrease along the K rungs: shape (K, ...); nor do `strengths`,
+    which are positive: shape (K,). Between rungs it is linear in the logarithm. It is minus
+    infinity where the weakest rung has one half already, infinity where the strongest has less.
 
-    Returns
-    -------
-    Floats
-        Of shape (...): linear in the logarithm of the strength between rungs, minus infinity where
-        the weakest rung has one half already, infinity where the strongest has less.
-
-    Examples
-    --------
     >>> np.exp(crossing(np.array([[0.0], [0.25], [0.75]]), np.array([1.0, 4.0, 16.0]))).round(9)
     array([8.])
     """
@@ -78,28 +67,13 @@ class DetectionThreshold:
     def of(
         cls, environment: str, strengths: Sequence[float], found: Floats, counted: Floats
     ) -> "DetectionThreshold":
-        """Estimate the threshold.
+        """Estimate the threshold; `ValueError` for strengths that are not as told here.
 
-        Parameters
-        ----------
-        environment
-            Its name: what is found in one environment is resampled with the same episodes.
-        strengths
-            Of the K rungs, positive and non-decreasing.
-        found
-            1 where a detector seed found an episode's anomaly in time, else 0: shape
-            (detector seeds, K, episodes). An episode is of the same test seed on every rung.
-        counted
-            1, or 0 for an episode that does not count, such as one with an early alarm.
-
-        Returns
-        -------
-        DetectionThreshold
-
-        Raises
-        ------
-        ValueError
-            For strengths that are not positive and non-decreasing, one a rung.
+        `strengths`, of the K rungs, are positive and do not decrease. `found` is 1 where a detector
+        seed found an episode's anomaly in time, else 0: shape (detector seeds, K, episodes). An
+        episode is of the same test seed on every rung. `counted` is 0 for an episode that does not
+        count, such as one with an early alarm, else 1. What is found in one environment is
+        resampled with the same episodes.
         """
         ends = np.asarray(strengths, dtype=np.float64)
         if len(ends) != found.shape[1] or not (ends > 0).all() or (np.diff(ends) < 0).any():
@@ -181,15 +155,10 @@ class MeanThreshold(NamedTuple):
 def geometric_mean(
     thresholds: Sequence[DetectionThreshold], units: Sequence[DetectionThreshold | float]
 ) -> MeanThreshold:
-    """Return the geometric mean of the ratios of thresholds to units.
+    """Return the geometric mean of the ratios of thresholds, at least one, to units.
 
-    Parameters
-    ----------
-    thresholds
-        At least one, none of them undefined.
-    units
-        As many strengths, or thresholds of another detector at the same places, whose resamples are
-        then paired with these.
+    Units are as many strengths, or thresholds of another detector at the same places, whose
+    resamples are then paired with these.
     """
     ratios, censored, sides = [], [], set()
     for own, unit in zip(thresholds, units, strict=True):

@@ -91,18 +91,7 @@ def compare(
 ) -> PairedComparison:
     """Compare two rows of one board over the cells in which both have a value.
 
-    Parameters
-    ----------
-    records
-        Of one board: one split, protocol and limit.
-    first, second
-        Names of rows: detectors, or settings as tables print them.
-    metric
-        Any metric that is a mean over trajectories.
-
-    Returns
-    -------
-    PairedComparison
+    Rows are named as tables print them; the metric is any that is a mean over trajectories.
 
     Raises
     ------

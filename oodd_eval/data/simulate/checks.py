@@ -10,13 +10,7 @@ import numpy as np
 
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, info_of
 from oodd_eval.data.simulate.policies import Policy, load_policy
-from oodd_eval.data.simulate.record import (
-    SHORTEST_TWIN,
-    Episode,
-    Setup,
-    measure,
-    record_anomalous,
-)
+from oodd_eval.data.simulate.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
 from oodd_eval.data.simulate.values import bound_of
 from oodd_eval.errors import OoddError, SimulationError
 

@@ -47,14 +47,8 @@ def write_pages(
 ) -> None:  # fmt: skip
     """Write the overview, ``environments.md``, and the pages with their pictures below it.
 
-    Parameters
-    ----------
-    directory
-        Where the documents are; the same versions write the same bytes.
-    environments
-        Those whose page and pictures are written; the overview names all.
-    progress
-        Called with the name of each environment when its files are written.
+    The same versions write the same bytes. The overview names all environments; `progress` is
+    called with the name of each when its files are written.
     """
     # Texts alone need no simulators.
     from oodd_eval.data.simulate.pictures import draw_pictures  # noqa: PLC0415

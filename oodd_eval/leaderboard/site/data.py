@@ -19,14 +19,7 @@ from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import (
-    GUARANTEED,
-    HEADLINE,
-    LEVELS,
-    METRICS,
-    RANKING,
-    metric_info,
-)
+from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve

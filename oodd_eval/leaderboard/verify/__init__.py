@@ -18,13 +18,7 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import (
-    ENTRY,
-    EntryInfo,
-    read_entry,
-    recorded_versions,
-    row_of,
-)
+from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, read_entry, recorded_versions, row_of
 from oodd_eval.leaderboard.grants import GRANTS, TRUST, digest_of, read_grants
 from oodd_eval.leaderboard.rerun import RerunOrder
 from oodd_eval.leaderboard.verify import scores

@@ -23,13 +23,7 @@ from typing import Final
 import psutil
 
 from oodd_eval.errors import OoddError
-from oodd_eval.plugins.isolation import (
-    END_POLL_SECONDS,
-    MARK,
-    Channel,
-    ChannelClosedError,
-    end_all,
-)
+from oodd_eval.plugins.isolation import END_POLL_SECONDS, MARK, Channel, ChannelClosedError, end_all
 from oodd_eval.plugins.isolation.sandbox import PROCESSES, Sandbox
 
 LOG_BYTES: Final = 64_000

@@ -14,12 +14,7 @@ from typing import Any, Final, TypeVar
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.plugins.isolation import (
-    ROW_BYTES,
-    Channel,
-    ChannelClosedError,
-    ChannelGarbledError,
-)
+from oodd_eval.plugins.isolation import ROW_BYTES, Channel, ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
 from oodd_eval.plugins.isolation.sandbox import Sandbox
 

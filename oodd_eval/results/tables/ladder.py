@@ -8,15 +8,7 @@ from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import (
-    FOUND,
-    Place,
-    Thresholds,
-    at_rung,
-    rung_names,
-    thresholds,
-    unit,
-)
+from oodd_eval.results.ladder import FOUND, Place, Thresholds, at_rung, rung_names, thresholds, unit
 from oodd_eval.results.tables.board import Board
 from oodd_eval.results.tables.layout import Table, show_value
 
@@ -39,14 +31,8 @@ _RUNGS: Final = (
 def tables(board: Board, *, intervals: bool = False, places: bool = False) -> list[Table]:
     """Return all tables of a board's records at strengths; none where it has no such records.
 
-    Parameters
-    ----------
-    board
-        Any board.
-    intervals
-        Whether means by kind, and thresholds of single places, have their 95 % intervals.
-    places
-        Whether to add a table for each row, with its threshold in every environment.
+    With `intervals`, means by kind and thresholds of single places have their 95 % intervals. With
+    `places`, each row has a table with its threshold in every environment.
     """
     found = thresholds(board.records)
     made = [_separability(board, found)] if found else []
