@@ -98,11 +98,11 @@ def board() -> dict[str, str | bytes]:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links, formulas and the mark for commands into what the site shows."""
     del config
+    outside = {*elsewhere()}
     source = page.file.src_uri
-    source = source if source in elsewhere() else DOCS + source
+    source = source if source in outside else DOCS + source
     shown = [file.src_uri for file in files if file.inclusion.is_included()]
-    pages = {uri: uri if uri in elsewhere() else DOCS + uri for uri in shown}
-    pages = {repository: uri for uri, repository in pages.items()}
+    pages = {uri if uri in outside else DOCS + uri: uri for uri in shown}
 
     def outside_of_code(text: str) -> str:
         text = LINK.sub(lambda found: _link(found, source, page.file.src_uri, pages), text)

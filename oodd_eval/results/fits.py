@@ -69,14 +69,20 @@ class FitStore:
         `OutputError`: it cannot be made.
         """
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            made = tempfile.TemporaryDirectory(
-                prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
-            )
+            try:
+                made = self._temporary()
+            except FileNotFoundError:  # Somebody has just removed the directory.
+                made = self._temporary()
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
         with made as place:
             yield Path(place)
+
+    def _temporary(self) -> "tempfile.TemporaryDirectory[str]":
+        self.path.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryDirectory(
+            prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
+        )
 
     def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
         """Move a filled directory to its key; do nothing when it is empty or too large.

@@ -26,12 +26,18 @@ SIMPLE = "@hookimpl\ndef oodd_detectors(): return offer(one=Good, two=Good)"
 
 
 class Killing:
-    """A command that is killed so many times, each at a random moment, and then resumed."""
+    """A command that is killed so many times, each at a random moment, and then resumed.
 
-    def __init__(self, times, path, *arguments, seconds, **variables):
-        self.times, self.path, self.arguments, self.seconds = times, path, arguments, seconds
+    It runs once as a whole first, into ``whole``, which tells how long it takes on this machine.
+    """
+
+    def __init__(self, times, path, *arguments, **variables):
+        self.times, self.path, self.arguments = times, path, arguments
         self.marker = f"RUN={path}"
         self.variables = environment(path, path / "fits", RUN=str(path), **variables)
+        begun = time.monotonic()
+        self.finish(path / "whole")
+        self.seconds = time.monotonic() - begun
 
     def start(self, output):
         words = [str(output) if word is None else str(word) for word in self.arguments]
@@ -65,7 +71,8 @@ class Killing:
                     break
                 killed += 1
                 kept = check(place, kept)
-            self.finish(place)
+            else:
+                self.finish(place)
             check(place, kept)
             rounds += 1
             yield place
@@ -99,9 +106,7 @@ def test_a_run_killed_at_random(request, tiny_split, tmp_path, monkeypatch):
     killing = Killing(
         times(request, 14, 250), tmp_path, "run", "-q", "--detector", "one,two", "--env", "all",
         "--anomaly", "iid,gravity", "--split", tiny_split, "--jobs", "2", "--output", None,
-        seconds=4,
     )  # fmt: skip
-    killing.finish(tmp_path / "whole")
     whole = records_of(tmp_path / "whole")
     assert len(whole) == 8
     for place in killing(tmp_path / "killed", finished_stays(whole)):
@@ -113,9 +118,7 @@ def test_a_reproduction_killed_at_random(request, tiny_split, tmp_path, monkeypa
     killing = Killing(
         times(request, 3, 100), tmp_path, "reproduce", "-q", "--tier", "mini", "--split",
         tiny_split, "--only", "delays", "--jobs", "2", "--no-figures", "--output", None,
-        seconds=8,
     )  # fmt: skip
-    killing.finish(tmp_path / "whole")
     whole = records_of(tmp_path / "whole")
     for place in killing(tmp_path / "killed", finished_stays(whole)):
         # What was left comes behind what was there.
@@ -138,7 +141,7 @@ def whole_or_absent(digest):
 def test_a_fetch_killed_at_random(request, tiny_split, tmp_path):
     digest = load_split(tiny_split).digest
     killing = Killing(
-        times(request, 8, 75), tmp_path, "data", "fetch", tiny_split, "--output", None, seconds=1.5
+        times(request, 8, 75), tmp_path, "data", "fetch", tiny_split, "--output", None
     )
     for place in killing(tmp_path / "killed", whole_or_absent(digest)):
         assert load_split(place).digest == digest
@@ -149,9 +152,8 @@ def test_a_build_killed_at_random(request, tmp_path):
     killing = Killing(
         times(request, 5, 75), tmp_path, "data", "build", "small", "--train", "4",
         "--calibration", "2", "--test", "2", "--cap", "60", "--seed-base", "850", "--env",
-        "cartpole", "--jobs", "1", "--output", None, seconds=5,
+        "cartpole", "--jobs", "1", "--output", None,
     )  # fmt: skip
-    killing.finish(tmp_path / "whole")
     digest = load_split(tmp_path / "whole").digest
     for place in killing(tmp_path / "killed", whole_or_absent(digest)):
         assert load_split(place).digest == digest
