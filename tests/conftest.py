@@ -33,6 +33,12 @@ def pytest_addoption(parser):
     parser.addoption("--long", action="store_true", help="random attacks: many thousands of them")
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the longest tests, so that no process waits for the other one's at the end."""
+    longest = ("test_walk", "test_packaging", "test_docs", "test_committed_board", "test_examples")
+    items.sort(key=lambda item: not item.path.name.startswith(longest))
+
+
 @pytest.fixture(scope="session")
 def tiny_split(tmp_path_factory):
     """Directory of a synthetic split with two environments; tests must not write to it."""

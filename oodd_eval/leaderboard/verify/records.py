@@ -64,7 +64,8 @@ def check_record(where: str, record: Record, findings: Findings) -> Sums | None:
 def _refuse_terms(where: str, sums: Sums, wrong: Wrong, findings: Findings) -> None:
     """Refuse the first trajectory that breaks a rule, of every rule that is broken."""
     for name, mask, expected in wrong:
-        for i in np.flatnonzero(mask)[:1]:
+        if mask.any():
+            i = int(mask.argmax())
             terms = f"{sums[name].numerator[i]:g} / {sums[name].denominator[i]:g}"
             message = f"trajectory {i} is {terms}, expected {expected}"
             findings.refuse(where, f"per_trajectory.{name}", message)
