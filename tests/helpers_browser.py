@@ -44,6 +44,7 @@ class Browser:
                 "args": [*FLAGS, f"--user-data-dir={profile}", f"--window-size={size}"],
             },
             "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
+            "timeouts": {"implicit": 10_000},  # milliseconds in which an element may appear
         }
         found = self._call("POST", "/session", {"capabilities": {"alwaysMatch": capabilities}})
         self._session = f"/session/{found['sessionId']}"
