@@ -239,8 +239,9 @@ def test_costs_are_bounded_by_what_the_harness_knows(converse):
 
 def test_memory_is_at_least_what_was_seen(converse):
     out = converse(
-        said(FITTED), said({"type": "array"}), saved(np.zeros(ROWS)), said(SCORED), said(LAST)
-    )
+        said(FITTED), said({"type": "array"}), saved(np.zeros(ROWS)), said(SCORED), said(LAST),
+        stay=30,  # so that it is there when it is looked at
+    )  # fmt: skip
     assert out.peak_rss_mb > 3.0  # an interpreter holds more than the megabyte that it told of
 
 
