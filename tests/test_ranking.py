@@ -308,7 +308,7 @@ def test_rare_differences_have_all_resamples_and_others_the_first(monkeypatch):
         assert one.p == (other.p if small else pytest.approx(other.p, rel=0.3))
 
 
-def test_single_precision_calls_the_same_resamples_beyond_as_double(monkeypatch):
+def test_neither_single_precision_nor_threads_change_what_is_beyond(monkeypatch):
     rng = np.random.default_rng(9)
     cells = [(f"e{i}", "iid") for i in range(5)]
     rows = {
@@ -322,6 +322,11 @@ def test_single_precision_calls_the_same_resamples_beyond_as_double(monkeypatch)
     found = rank(rows, resamples=12_000).comparisons
     monkeypatch.setattr(pairs, "_WEAK", math.inf)  # every one is too weak: all in double precision
     assert rank(rows, resamples=12_000).comparisons == found
+    monkeypatch.undo()
+    for threads, block in ((1, 12_000), (5, 700)):
+        monkeypatch.setattr(pairs.os, "cpu_count", lambda threads=threads: threads)
+        monkeypatch.setattr(pairs, "_BLOCK", block)
+        assert rank(rows, resamples=12_000).comparisons == found
 
 
 def test_pairs_share_draws(monkeypatch):

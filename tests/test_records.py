@@ -1,5 +1,6 @@
 """Records and results directories: what is written is what is read."""
 
+import gc
 import json
 import math
 from dataclasses import replace
@@ -78,6 +79,28 @@ def test_metrics_may_have_different_numbers_of_trajectories():
     assert {name: terms.shape for name, terms in read.per_trajectory.items()} == {
         "auc": (2, 3), "far": (2, 1),
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_is_off_while_records_are_read_and_as_it_was_after(
+    tmp_path, monkeypatch, enabled
+):
+    ResultsDirectory(tmp_path).merge_records([record()])
+    seen, read = [], Record.from_json
+    monkeypatch.setattr(
+        Record, "from_json", lambda *line: seen.append(gc.isenabled()) or read(*line)
+    )
+    gc.enable() if enabled else gc.disable()
+    try:
+        ResultsDirectory(tmp_path).records()
+        assert gc.isenabled() == enabled
+        (tmp_path / "records.jsonl").write_text("{")
+        with pytest.raises(ResultsError):
+            ResultsDirectory(tmp_path).records()
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
+    assert seen == [False, False]
 
 
 def test_undefined_is_null():
