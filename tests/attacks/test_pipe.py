@@ -33,12 +33,17 @@ SCORED = {"seconds_score": 0.0, "peak_rss_mb": 1.0}
 LAST = {"peak_rss_mb": 1.0}
 
 WORKER = """
-import os, sys, time
+import os, sys, threading, time
 reading, writing = int(sys.argv[1]), int(sys.argv[2])
-import threading
+told, groups = threading.Event(), int(os.environ["GROUPS"])
 def drain():
-    while os.read(reading, 1 << 16): pass
+    rest = b""
+    while part := os.read(reading, 1 << 16):
+        rest += part
+        if rest.count(b'{"score": 0}') == groups:  # the ends of all groups
+            told.set()
 threading.Thread(target=drain, daemon=True).start()
+told.wait()  # A worker cannot answer what it was not sent.
 with open(os.environ["SCRIPT"], "rb") as script:
     while part := script.read(1 << 20):
         os.write(writing, part.replace(b"@PID", str(os.getpid()).encode()))
@@ -75,6 +80,7 @@ def converse(tmp_path, monkeypatch):
         (tmp_path / "script").write_bytes(b"".join(parts))
         monkeypatch.setenv("SCRIPT", str(tmp_path / "script"))
         monkeypatch.setenv("STAY", str(stay))
+        monkeypatch.setenv("GROUPS", str(groups))
         monkeypatch.syspath_prepend(str(tmp_path))
         child = supervisor.Child
         monkeypatch.setattr(supervisor, "Child", lambda _, *more: child("oodd_script", *more))
