@@ -66,31 +66,15 @@ def import_data(
 ) -> Split:  # fmt: skip
     """Import logs as one environment of a split; one of that name gets it as a further one.
 
-    Parameters
-    ----------
-    name, environment
-        Names of one's own: no published split, no environment of the benchmark.
-    form
-        One of `oodd_eval.data.logs.FORMATS`.
-    train, calibration
-        Places of nominal episodes: to fit on, and for the thresholds of alarms.
-    test
-        Folder with the place ``nominal`` of the twins, and one place for each anomaly, whose name
-        is the anomaly's. None for a split to watch with, which cannot be evaluated.
-    sensors, actions
-        Names and units of the columns; by default the files' own, else numbers.
-    discrete
-        Number of actions where each is a whole number from 0 on; 0 where actions are not discrete.
-    groups
-        Groups of anomalies that the benchmark does not know; by default ``"dynamics"``.
-    output
-        Directory of the split; by default where splits are found.
-    progress
-        Called with the name of each part when it is read.
-
-    Returns
-    -------
-    Split
+    `name` and `environment` are one's own: no published split, no environment of the benchmark.
+    `form` is one of `oodd_eval.data.logs.FORMATS`. `train` and `calibration` are places of nominal
+    episodes: to fit on, and for the thresholds of alarms. `test` is a folder with the place
+    ``nominal`` of the twins and one place for each anomaly, with its name; None for a split to
+    watch with, which cannot be evaluated. `sensors` and `actions` are names and units of the
+    columns, by default the files' own, else numbers; `discrete` is the number of actions where each
+    is a whole number from 0 on, else 0. `groups` are those of anomalies that the benchmark does not
+    know, by default ``"dynamics"``. `output` is the directory of the split, by default where splits
+    are found. `progress` is called with the name of each part when it is read.
 
     Raises
     ------
