@@ -34,7 +34,7 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(items):
-    """Begin with the longest tests, so that no process waits for the other one's at the end."""
+    """Put the longest tests first, so that no process is idle at the end."""
     longest = ("test_walk", "test_packaging", "test_docs", "test_committed_board", "test_examples")
     items.sort(key=lambda item: not item.path.name.startswith(longest))
 

@@ -118,7 +118,7 @@ def redirected(file: IO[Any]) -> Iterator[None]:
 
 def compress(content: bytes) -> bytes:
     """Compress with gzip: the same bytes for the same content, without name and time."""
-    return gzip.compress(content, 7, mtime=0)  # 9 takes four times as long, for 5 %
+    return gzip.compress(content, 7, mtime=0)  # Level 9 takes four times as long and saves 5 %.
 
 
 def packed(path: Path, content: bytes) -> bytes:

@@ -110,7 +110,7 @@ def build(
     for name, content in files.items():
         if isinstance(content, str):
             write_text(output / name, content)
-        elif not _says(output / name, decompress(content)):
+        elif not _has_content(output / name, decompress(content)):
             write_bytes(output / name, content)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
@@ -189,7 +189,8 @@ def _content(path: Path) -> bytes:
     return decompress(content) if path.suffix == GZIP else content
 
 
-def _says(path: Path, content: bytes) -> bool:
+def _has_content(path: Path, content: bytes) -> bool:
+    """Tell whether a file is there and says this."""
     with contextlib.suppress(OSError, ResultsError):
         return _content(path) == content
     return False

@@ -124,7 +124,7 @@ class DrawnCells:
             numerators=self.numerators[at], denominators=self.denominators[at],
         )  # fmt: skip
 
-    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded; means over several environments share
+    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded: means over several environments share
     def sums(self) -> list[CellSum]:
         """Return sums over cells of each seed in every resample.
 

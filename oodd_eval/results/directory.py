@@ -315,7 +315,7 @@ class RecordWriter:
 
 @contextmanager
 def without_collector() -> Iterator[None]:
-    """Leave the collector of cycles off: it would go over all numbers of records, and find none."""
+    """Switch Python's garbage collector off: records have no cycles, and it visits all of them."""
     enabled = gc.isenabled()
     gc.disable()
     try:

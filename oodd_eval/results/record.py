@@ -187,15 +187,15 @@ class Record:
     def to_json(self) -> str:
         """Return one line of JSON, keys in a fixed order, NaN as null."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
-        plain |= {name: _known(plain[name]) for name in _COSTS}
+        plain |= {name: _finite(plain[name]) for name in _COSTS}
         plain["per_trajectory"] = {n: own.tolist() for n, own in self.per_trajectory.items()}
         plain["metrics"] = {
-            name: {"value": _known(m.value), "low": _known(m.low), "high": _known(m.high), "n": m.n}
+            name: {e: _finite(getattr(m, e)) for e in ("value", "low", "high")} | {"n": m.n}
             for name, m in self.metrics.items()
         }
         try:
             return json.dumps(plain, allow_nan=False)
-        except (TypeError, ValueError):  # Seldom has anything else no value.
+        except (TypeError, ValueError):  # A NaN in a parameter, say, which is rare.
             return json.dumps(_without_nan(plain), allow_nan=False)
 
     @classmethod
@@ -259,14 +259,15 @@ def _other_schema(found: object) -> str:
     )
 
 
-def _known(value: float) -> float | None:
+def _finite(value: float) -> float | None:
+    """Return a number, or None where it is NaN or infinite."""
     return value if math.isfinite(value) else None
 
 
 def _without_nan(value: Any) -> Any:
     """Replace numbers that JSON does not know by None, at any depth."""
     if isinstance(value, float):
-        return _known(value)
+        return _finite(value)
     if isinstance(value, Mapping):
         return {str(k): _without_nan(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -46,7 +46,7 @@ class Value(NamedTuple):
     brief: bool = False
 
 
-class _Own:
+class _RowCells:
     """A row's metric in the cells of an environment, given as anomalies and records."""
 
     def __init__(self, cells: Sequence[tuple[str, Record]], environment: str, metric: str) -> None:
@@ -137,17 +137,17 @@ class Board:
         self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str,
         intervals: bool,
     ) -> Value:  # fmt: skip
-        unknown = self._once(self._unknown, entry, environments, anomalies)
-        if unknown.state:
-            return unknown
-        own = [self._once(self._own, entry, e, metric) for e in environments]
+        blank = self._once(self._without_value, entry, environments, anomalies)
+        if blank.state:
+            return blank
+        own = [self._once(self._row_cells, entry, e, metric) for e in environments]
         value = mean_over_cells(pair for one in own for pair in one.values(anomalies))
         ends = NAN, NAN
         if intervals and (drawn := [c for one in own for c in one.drawn(anomalies)]):
             ends = mean_interval(drawn, kind=metric_info(metric).interval)
-        return unknown._replace(value=value, low=ends[0], high=ends[1])
+        return blank._replace(value=value, low=ends[0], high=ends[1])
 
-    def _unknown(
+    def _without_value(
         self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str]
     ) -> Value:
         """Return all of an entry's mean but its value: the same for every metric."""
@@ -171,15 +171,15 @@ class Board:
         found = {}
         for e, a in itertools.product(self.environments, self.anomalies):
             if all(r.ok for r in self._cells.get((entry, e, a), ())):
-                values = self._once(self._own, entry, e, metric).values([a])
+                values = self._once(self._row_cells, entry, e, metric).values([a])
                 if not math.isnan(mean_over_cells(values)):
                     found[e, a] = values
         return found
 
-    def _own(self, entry: Setting, environment: str, metric: str) -> _Own:
+    def _row_cells(self, entry: Setting, environment: str, metric: str) -> _RowCells:
         """Return a row's metric in the cells of an environment."""
         found = ((a, self._cells.get((entry, environment, a), ())) for a in self.anomalies)
-        return _Own([(a, r) for a, own in found for r in own], environment, metric)
+        return _RowCells([(a, r) for a, own in found for r in own], environment, metric)
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""
@@ -311,9 +311,9 @@ def ranked(
     cells = {r.place for r in records}
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
+    ranking, rows = _ranking(by_row, states, first - below, RANKING)
     by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
                  for e, own in by_row.items()}  # fmt: skip
-    ranking, rows = _ranking(by_row, states, first - below, RANKING)
     alarms, _ = _ranking(by_row, by_alarms, first - below, ALARM_RANKING)
     rates = win_rates({
         label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}

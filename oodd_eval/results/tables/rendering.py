@@ -92,10 +92,8 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
     Every cell has a mapping with columns that stand before its own, the same ones for all. Every
     metric that a record can have has a column.
     """
-    own: dict[str, object] = {}
-    rows = []
-    for about, r in lines:
-        own = {
+    known: list[dict[str, object]] = [
+        {
             **about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
             "limit": "" if r.limit is None else r.limit, "detector": r.detector,
             "version": r.detector_version, "horizon": r.horizon,
@@ -104,9 +102,12 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
             "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
             "microseconds_per_step": number(cost_of([r]).step),
             "peak_rss_mb": number(r.peak_rss_mb),
-        }  # fmt: skip
-        rows.append([*own.values(), *_texts(map(r.metrics.get, NAMES))])
-    return csv_text([*([[*own, *_columns(NAMES)]] if header else []), *rows])
+        } for about, r in lines
+    ]  # fmt: skip
+    first = [[*known[0], *_columns(NAMES)]] if header else []
+    metrics = (_texts(map(r.metrics.get, NAMES)) for _, r in lines)
+    rows = ([*own.values(), *texts] for own, texts in zip(known, metrics, strict=True))
+    return csv_text([*first, *rows])
 
 
 def comparisons_csv(ranks: RankedBoard) -> str:
@@ -155,9 +156,9 @@ def _texts(values: Iterable[Value | Metric | None]) -> list[str]:
     return found
 
 
-def csv_rows(rows: Sequence[Mapping[str, object]], *, header: bool = True) -> str:
-    """Return rows with the same columns as CSV, their names first unless there is no `header`."""
-    return csv_text([*([list(rows[0])] if header else []), *(list(row.values()) for row in rows)])
+def csv_rows(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return rows with the same columns as CSV, their names first."""
+    return csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
 
 
 def csv_text(lines: Iterable[Sequence[object]]) -> str:
