@@ -56,7 +56,6 @@ def wheel(tmp_path_factory):
 @pytest.fixture(scope="session")
 def submissions(tmp_path_factory):
     """Valid entries of the leaderboard with their results and split; see `Submissions`."""
-    from helpers_submission import make_submissions, remembered_metrics
+    from helpers_submission import make_submissions
 
-    with remembered_metrics():
-        yield make_submissions(tmp_path_factory.mktemp("submissions"))
+    return make_submissions(tmp_path_factory.mktemp("submissions"))

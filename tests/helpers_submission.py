@@ -1,6 +1,5 @@
 """Valid entries to tamper with, and the tools to do so without leaving broken digests behind."""
 
-import contextlib
 import hashlib
 import json
 import lzma
@@ -8,13 +7,12 @@ import shutil
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 from helpers_split import make_split
 
 from oodd_eval.api import evaluate
 from oodd_eval.data import files
 from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import records, verify_entry
+from oodd_eval.leaderboard.verify import verify_entry
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import metric_info
@@ -28,24 +26,6 @@ class Submissions:
     results: object
     plain: object
     full: object
-
-
-@contextlib.contextmanager
-def remembered_metrics():
-    """Resample equal terms once: most records of a tampered entry are as they were."""
-    whole, known = records.metric_of, {}
-
-    def metric_of(name, sums, environment):
-        kind = metric_info(name).interval
-        terms = sums.numerator.tobytes(), sums.denominator.tobytes(), sums.median
-        key = kind, environment, *terms
-        if key not in known:
-            known[key] = whole(name, sums, environment)
-        return known[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(records, "metric_of", metric_of)
-        yield
 
 
 def make_submissions(home):
