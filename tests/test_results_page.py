@@ -278,12 +278,18 @@ def test_the_ladder_is_that_of_its_records():
     assert found == expected
 
 
-@pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5"])
+@pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5", "horizons"])
 def test_the_page_of_a_suite_is_printed_from_its_records(suite, capsys):
     own = SUITES / suite
     assert main(["show", str(own), "--stored", "--markdown"]) == 0
     told = f"run `oodd-eval show leaderboard/suites/{suite} --stored --markdown`"
     assert capsys.readouterr().out == (own / "README.md").read_text(encoding="utf-8"), told
+
+
+def rows_of_nine(title):
+    """Return the rows of a section's table that have a detector and nine numbers."""
+    number = r" \| ".join([r"(-?[\d.]+)"] * 9)
+    return re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", section(title), re.MULTILINE)
 
 
 UNDER_NOISE = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
@@ -300,8 +306,7 @@ def test_the_table_under_noise_is_that_of_the_records():
     def mean(board, row, metric):
         return 100 * board.mean(row, board.environments, board.anomalies, metric).value
 
-    number = r" \| ".join([r"(-?[\d.]+)"] * 9)
-    rows = re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", PAGE, re.MULTILINE)
+    rows = rows_of_nine("With noise in every sensor")
     assert {r[0] for r in rows} == {row.detector for row in five.entries}
     for name, *found in rows:
         row = Setting(name)
@@ -309,3 +314,54 @@ def test_the_table_under_noise_is_that_of_the_records():
         assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
     shown = [float(r[3]) for r in rows]
     assert shown == sorted(shown, reverse=True)
+
+
+def test_longer_horizons_are_told_as_the_records_have_them():
+    """With detector seed 0 on reduced; at one step beside what the board of standard has."""
+    (board,) = boards(ResultsDirectory(SUITES / "horizons").records())
+    robots = [name for name, info in ENVIRONMENTS.items() if not info.discrete]
+    classic = [name for name in ENVIRONMENTS if name not in robots]
+
+    def mean(name, horizon, metric="auc_matched", environments=board.environments):
+        row = Setting(name, horizon)
+        return 100 * board.mean(row, environments, board.anomalies, metric).value
+
+    found = "found_within_20_at_5pct"
+    rows = rows_of_nine("At longer horizons")
+    names = {row.detector for row in board.entries}
+    assert {r[0] for r in rows} == names
+    for name, *numbers in rows:
+        metrics = ("auc_matched", found, "missed_at_5pct")
+        expected = [mean(name, h, m) for m in metrics for h in (1, 10, 20)]
+        assert [float(n) for n in numbers] == pytest.approx(expected, abs=0.051), name
+    shown = [float(r[1]) for r in rows]
+    assert shown == sorted(shown, reverse=True)
+
+    def gain(name, horizon, environments=board.environments):
+        return mean(name, horizon, environments=environments) - mean(
+            name, 1, environments=environments
+        )
+
+    text = " ".join(section("At longer horizons").split())
+    assert all(mean(name, 20, found) < mean(name, 1, found) for name in names)
+    better = {name for name in names if gain(name, 20) > 0}
+    assert better == {"pe-step", "pe-step-a", "persistence"}
+    single = ("pe-step", "rf", "riqn-ms", "npn")
+    told = [f"{gain(name, 10, robots):.1f}" for name in single]
+    assert (
+        "gains {} points of matched AUC there, `rf` {}, `riqn-ms` {} and `npn` {}.".format(*told)
+        in text
+    )
+    told = [f"{-gain(name, 10, classic):.1f}" for name in single]
+    assert "they lose {}, {}, {} and {}.".format(*told) in text
+    assert all(gain(n, 10, robots) < 0 for n in ("pe", "pe-a", "mewma", "mewma-a", "rf-ewma"))
+    told = [f"{-gain(name, 20):.1f}" for name in ("n-riqn", "riqn", "riqn-ms")]
+    assert (
+        "falls by {} points from Δ = 1 to 20, `riqn` by {} and `riqn-ms` by {}.".format(*told)
+        in text
+    )
+    first = ranking("standard")
+    apart = {m: [100 * float(first[n][m]) - mean(n, 1, m) for n in names]
+             for m in ("auc_matched", found)}  # fmt: skip
+    assert max(map(abs, apart["auc_matched"])) < 0.35
+    assert round(max(apart[found])) == 6

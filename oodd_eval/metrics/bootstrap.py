@@ -360,8 +360,6 @@ def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
 
 def _mean_of(sums: Sequence[CellSum]) -> Samples:
     """Return the mean over cells in every resample."""
-    if len(sums) == 1:
-        return sums[0].samples / sums[0].cells
     total, count = np.zeros((2, len(sums[0].samples)))
     for _, samples, cells in sums:
         undefined = np.isnan(samples)
