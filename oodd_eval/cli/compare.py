@@ -38,7 +38,7 @@ def define(parser: Parser) -> None:
     add("--junit", metavar="FILE", help="write JUnit XML, a test case per cell and metric")
     add("--markdown", metavar="FILE", help="write Markdown, for a pull request")
     add("--write-reference", metavar="FILE",
-        help="write a small file of records to compare with later; compressed as .xz or .gz")
+        help="write a small file of records to compare with later, compressed if named .xz or .gz")
     add("--keep", metavar="METRICS", default="",
         help="of these metrics alone, but with what their intervals are made of")
     # fmt: on

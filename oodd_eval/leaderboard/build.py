@@ -270,8 +270,8 @@ def _section(section: LeaderboardSection) -> str:
 def _suite(section: SuiteSection) -> str:
     """Return what rows find on a further test suite, with a link to all tables."""
     place = f"{SUITES}/{section.name}/{PAGE}"
-    other = "horizons" if section.board.split in TEXTS["tiers"] else "nominal"
-    texts = TEXTS["suites"]["graded" if section.graded else other]
+    several = len({row.horizon for row in section.board.entries}) > 1
+    texts = TEXTS["suites"]["graded" if section.graded else "horizons" if several else "nominal"]
     title = f"## {texts['title']}: {escape(_title(section.board))}\n"
     text = texts["text"].format(split=escape(section.board.split), place=place)
     return "\n".join([title, text, *map(table, section.tables[:1])])

@@ -71,11 +71,11 @@ def metric_of(name: str, contribution: Contribution, environment: str) -> Metric
     return Metric(contribution.value, *ends, n=contribution.n)
 
 
-@functools.lru_cache(maxsize=1 << 14)
+@functools.lru_cache(maxsize=4096)
 def _interval(
     kind: IntervalKind, environment: str, median: bool, numerator: bytes, denominator: bytes
 ) -> tuple[float, float]:
-    """Return the interval of a metric; two thirds of an entry's have the terms of another one."""
+    """Return the interval of a metric. Many metrics of a detector have the same terms."""
     terms = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
     return mean_interval([drawn_cell(environment, 0, terms)], kind=kind)
 
