@@ -1,6 +1,7 @@
 """The house: who imports what, how large a module may be, one public class a name."""
 
 import ast
+import functools
 import subprocess
 import sys
 from collections import Counter
@@ -11,16 +12,20 @@ import pytest
 ROOT = Path(__file__).parents[1]
 CORE = sorted((ROOT / "oodd_eval").rglob("*.py"))
 OTHERS = sorted([*(ROOT / "detectors").glob("*/*/*.py"), *(ROOT / "training").glob("*/*.py")])
-TREES = {path: ast.parse(path.read_text()) for path in (*CORE, *OTHERS)}
 
 NEVER = {"pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
 HEAVY = {"torch", "sklearn", "scipy", "pandas"}
 SIMULATORS = {"gymnasium", "pybullet", "pybullet_envs_gymnasium", "Box2D"}
 
 
+@functools.cache
+def tree(path):
+    return ast.parse(path.read_text())
+
+
 def imported(path):
     """Top-level names that a module imports anywhere in it."""
-    for node in ast.walk(TREES[path]):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name.split(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -52,11 +57,11 @@ def test_nothing_unpickles():
         flags = {f for f in ("allow_pickle=True", "weights_only=False") if f in source}
         return flags | ({*imported(path)} & NEVER)
 
-    assert not wrong(TREES, unsafe)
+    assert not wrong([*CORE, *OTHERS], unsafe)
 
 
 def test_modules_are_few_and_short():
-    lines = {path: len(path.read_text().splitlines()) for path in TREES}
+    lines = {path: len(path.read_text().splitlines()) for path in (*CORE, *OTHERS)}
     assert not {str(path): n for path, n in lines.items() if n > 400}
     assert len(CORE) <= 150
     assert sum(lines[path] for path in CORE) <= 27_050
@@ -68,8 +73,8 @@ def test_modules_are_few_and_short():
 def test_no_two_public_classes_have_one_name():
     names = Counter(
         node.name
-        for tree in TREES.values()
-        for node in tree.body
+        for path in (*CORE, *OTHERS)
+        for node in tree(path).body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert not {name: n for name, n in names.items() if n > 1}

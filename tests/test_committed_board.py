@@ -18,7 +18,6 @@ from oodd_eval.leaderboard.placing import place
 from oodd_eval.leaderboard.published import PUBLISHED, board_of, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.verify import verify
-from oodd_eval.results.tables.board import boards
 
 BOARD = Path(__file__).parents[1] / "leaderboard"
 
@@ -72,16 +71,21 @@ def check_board(board, scratch):
     return lines
 
 
+@pytest.fixture(scope="module")
+def committed():
+    """The committed entries, sorted into sections with their rankings."""
+    return sections(read_entries(BOARD / "results"))
+
+
 @pytest.mark.artefacts
 def test_every_number_of_the_committed_board_comes_from_its_records(tmp_path):
     assert check_board(BOARD, tmp_path) == []
 
 
 @pytest.mark.artefacts
-def test_nominal_twins_look_alike_to_every_row_in_every_environment():
+def test_nominal_twins_look_alike_to_every_row_in_every_environment(committed):
     """Matched AUC of one twin against another: chance, unless the harness leaks something."""
-    records = [r for entry in read_entries(BOARD / "results") for r in entry.records]
-    for board in boards(records):
+    for board in (section.ranks.board for section in committed):
         for row in board.entries:
             for environment in board.environments:
                 placebo = board.mean(
@@ -97,13 +101,13 @@ def test_every_committed_entry_is_valid():
 
 
 @pytest.mark.artefacts
-def test_committed_entries_have_their_committed_places_on_the_published_board():
+def test_committed_entries_have_their_committed_places_on_the_published_board(committed):
     published = read_published(BOARD / PUBLISHED).boards
 
     def places(ranks):
         return {s.entry: (s.rank, s.alarm_rank, s.ties, s.below) for s in ranks.standings}
 
-    for section in sections(read_entries(BOARD / "results")):
+    for section in committed:
         for one in section.entries:
             placed = place(one.records, board_of(one.records, published), one.meta.primary)
             assert places(placed.ranks) == places(section.ranks), one.meta.id
