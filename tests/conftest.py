@@ -34,9 +34,14 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(items):
-    """Put the longest tests first, so that no process is idle at the end."""
-    longest = ("test_walk", "test_packaging", "test_docs", "test_committed_board", "test_examples")
-    items.sort(key=lambda item: not item.path.name.startswith(longest))
+    """Put the longest tests first, and what can be shared out last of them.
+
+    Processes that have nothing left take tests over from the others, but none can take half a test.
+    """
+    longest = ["test_walk", "test_packaging", "test_committed_board", "test_docs", "test_examples",
+               "test_docs_commands"]  # fmt: skip
+    place = {name: i for i, name in enumerate(longest)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(longest)))
 
 
 @pytest.fixture(scope="session")

@@ -378,9 +378,11 @@ def test_the_address_says_what_is_shown(browser, url):
     browser.wait_for("document.querySelector('#detector').hidden")
     assert browser.text("#ranking caption") == caption
     browser.click("header a")
-    browser.wait_for("location.hash === '#/'")
     expected = "Separability: all environments, all anomalies"
-    assert browser.text("#ranking caption").startswith(expected)
+    browser.wait_for(
+        "location.hash === '#/'"
+        f"&& document.querySelector('#ranking caption').textContent.startsWith('{expected}')"
+    )
 
 
 @pytest.mark.parametrize(
