@@ -1,6 +1,7 @@
 """Fixtures that more than one test module uses."""
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -42,6 +43,12 @@ def pytest_collection_modifyitems(items):
                "test_docs_commands"]  # fmt: skip
     place = {name: i for i, name in enumerate(longest)}
     items.sort(key=lambda item: place.get(item.path.stem, len(longest)))
+
+
+def pytest_collection_finish():
+    """Spare the garbage collector what stays until the end: all modules, and thousands of tests."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,11 @@ COLUMNS = ("auc_matched", "auc_unpaired", "auc_smoothed", "found_within_20_at_5p
            "missed_at_5pct", "false_episodes_at_5pct")  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def entries():
+    return read_entries(ROOT / "leaderboard" / "results")
+
+
 def section(title):
     return PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
 
@@ -73,8 +78,7 @@ def test_the_table_of_fresh_seeds_is_that_of_the_grants():
     )
 
 
-def test_the_table_by_environment_is_the_boards():
-    entries = read_entries(ROOT / "leaderboard" / "results")
+def test_the_table_by_environment_is_the_boards(entries):
     records = [r for e in entries for r in e.records if r.split == "mini"]
 
     def mean(detector, group, metric):
@@ -295,9 +299,8 @@ def rows_of_nine(title):
 UNDER_NOISE = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
 
 
-def test_the_table_under_noise_is_that_of_the_records():
+def test_the_table_under_noise_is_that_of_the_records(entries):
     """Detector seed 0 on mini and on both noisy splits, metric by metric."""
-    entries = read_entries(ROOT / "leaderboard" / "results")
     chosen = [r for e in entries for r in e.records if r.split == "mini" and r.seed == 0]
     (mini,) = boards(chosen)
     noisy = (ResultsDirectory(SUITES / name).records() for name in ("noisy-1", "noisy-5"))
