@@ -3,6 +3,8 @@
 import gc
 import json
 import math
+import os
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval.errors import OutputError, ResultsError, UsageError
+from oodd_eval.results import provenance
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell, Setting
 from oodd_eval.results.record import SCHEMA, STATUSES, Metric, Record, same_terms
@@ -285,3 +288,26 @@ def test_what_is_no_cell_is_refused(text):
 
 def test_the_order_of_parameters_is_not_in_a_setting():
     assert Setting.of("x", 1, {"a": 2, "b": 1}) == Setting.of("x", 1, {"b": 1, "a": 2})
+
+
+def test_the_commit_is_read_without_writing_to_the_checkout(tmp_path, monkeypatch):
+    """`git status` writes the index anew where it may; killed there, it leaves a lock behind."""
+
+    def git(*arguments):
+        told = ("-c", "user.name=one", "-c", "user.email=one@example.org")
+        done = ["git", "-C", tmp_path, *told, *arguments]
+        return subprocess.run(done, check=True, capture_output=True, text=True).stdout.strip()
+
+    file = tmp_path / "__init__.py"
+    file.write_text("1\n")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "one")
+    monkeypatch.setattr(provenance, "_HOME", tmp_path)
+    os.utime(file, (1, 1))  # git has to look whether it is the same
+    index = (tmp_path / ".git" / "index").read_bytes()
+    found = provenance.gather()
+    assert (found["git_commit"], found["git_dirty"]) == (git("rev-parse", "HEAD"), False)
+    assert (tmp_path / ".git" / "index").read_bytes() == index
+    file.write_text("2\n")
+    assert provenance.gather()["git_dirty"] is True

@@ -44,7 +44,8 @@ def _commit() -> dict[str, Any]:
 
 
 def _git(*arguments: str) -> str:
-    command = ["git", *arguments]  # whichever git is on the path
+    # Whichever git is on the path. Killed while it holds the index, it would leave a lock behind.
+    command = ["git", "--no-optional-locks", *arguments]
     text = subprocess.check_output(  # noqa: S603  fixed arguments
         command, cwd=_HOME, stderr=subprocess.DEVNULL, text=True, timeout=10
     )
