@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import TOLERANCE, Detector, Scores, StreamingDetector
+from oodd_eval.plugins.contract import Detector, Scores, StreamingDetector
 
 Named: TypeAlias = NDArray[np.int32]
 """Sensors named first and onsets by row, shape (2, T + 1); -1 where a row has none."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
+
+
+_ROUNDING: Final = 1e-5  # of a sum of shares
 
 
 class Explanation(NamedTuple):
@@ -98,7 +101,7 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
         if found != form:
             raise ContractError(f"explain returned {name} as {found}, expected {form}")
     undefined = np.isnan(shares).all(axis=1)
-    parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= TOLERANCE)
+    parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= _ROUNDING)
     known = (onsets >= 0) & (onsets <= np.arange(rows))
     for name, array, fine, expected in (
         ("shares", shares, undefined | parts, "parts of 1, or NaN alone where it is undefined"),

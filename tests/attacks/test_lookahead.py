@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from oodd_eval.metrics.auc import auc
-from oodd_eval.plugins.contract import PROBE_TOLERANCE, ROLLOUT_TOLERANCE, difference
+from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, difference
 
 ROWS = 300
 T = np.arange(float(ROWS))
@@ -82,7 +82,7 @@ def test_look_ahead_that_passes_the_check_orders_nothing(name, size, onset):
 
 def test_most_disguises_do_not_pass_and_the_undisguised_never():
     seen = [
-        bool(difference(found, whole, PROBE_TOLERANCE))
+        bool(difference(found, whole, TOLERANCE))
         for name in DISGUISES for size in SIZES
         for whole, found, _ in [episodes(DISGUISES[name], size)]
     ]  # fmt: skip

@@ -172,7 +172,7 @@ def check_explain(trial: Trial) -> None:
         raise CheckFailedError(f"{message}: expected -1, and shares of NaN, where it is NaN only")
     for n in _rows(trial):
         shares, found = _explanation(trial, trajectory[:n])
-        same = np.isclose(shares, whole[:n], 0, contract.PROBE_TOLERANCE, equal_nan=True)
+        same = np.isclose(shares, whole[:n], 0, contract.TOLERANCE, equal_nan=True)
         for what, differs in (("shares", ~same), ("onsets", found != onsets[:n])):
             if differs.mean() > FLIPPED:
                 first = f"the first {n} of {len(trajectory)} observations alone have other {what}"
@@ -191,7 +191,7 @@ def _must_explain_last(trial: Trial, trajectory: Trajectory, expected: Explanati
             detector.update(*row)
             rows.append(detector.explain_last())
         shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
-    near = np.isclose(shares, expected.shares, 0, contract.PROBE_TOLERANCE, equal_nan=True)
+    near = np.isclose(shares, expected.shares, 0, contract.TOLERANCE, equal_nan=True)
     for what, same in (("shares", near.all(axis=1)), ("onset", onsets == expected.onsets)):
         # Rounding may turn a few, as with prefixes.
         if (~same).mean() > FLIPPED:

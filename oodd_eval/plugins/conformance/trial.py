@@ -19,7 +19,7 @@ from oodd_eval.errors import ContractError
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, settings, watch
 from oodd_eval.plugins.contract import (
-    FAR_TOLERANCE,
+    ROLLOUT_TOLERANCE,
     TOLERANCE,
     Detector,
     DetectorSpec,
@@ -64,7 +64,7 @@ class Trial:
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
         self.arguments = {"seed": seed, "horizon": horizon, **self.parameters}
         self.rows = ROWS + horizon  # of an ordinary episode
-        self.tolerance = TOLERANCE if horizon == 1 else FAR_TOLERANCE
+        self.tolerance = TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE
         self.events = Events()  # of all checks so far
         self._settings_before = settings()
 
