@@ -83,7 +83,7 @@ class NetworkDetector(StorableWindowDetector):
     Notes
     -----
     Scores depend on a trajectory's past alone, up to the rounding of single-precision matrix
-    products of different shapes (differences below 1e-4 of how far scores vary). Quantile levels
+    products of different shapes (differences below 1e-3 of how far scores vary). Quantile levels
     are keyed by seed and time. Source: Danesh & Fern (2021), section 3 and appendix B.
     """
 
