@@ -49,8 +49,7 @@ MIN_ROWS: Final = 8  # observations of the shortest episode that is cut
 TOLERANCE: Final = 1e-3
 """Difference that stands for the same score where matrices differ in shape: see `difference`.
 
-Summation orders, and so the last digits, depend on it: the networks of this project have reached
-7e-5. The same computation gives the same bits.
+Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
 """
 
 ROLLOUT_TOLERANCE: Final = 5e-3

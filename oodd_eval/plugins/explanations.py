@@ -16,7 +16,6 @@ Named: TypeAlias = NDArray[np.int32]
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
 
-
 _ROUNDING: Final = 1e-5  # of a sum of shares
 
 
