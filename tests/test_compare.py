@@ -629,7 +629,7 @@ def own_check():
 def test_the_check_of_this_project_parses_and_is_two_sided():
     runs = [o for o in own_check() if o.command == "run"]
     comparisons = [o for o in own_check() if o.command == "compare"]
-    assert [o.detector for o in runs] == ["rf", "riqn,npn,pe-a"]
+    assert [o.detector for o in runs] == ["rf", "riqn,npn", "pe-a"]
     assert len(comparisons) == 3
     for options in comparisons:
         assert options.two_sided
@@ -643,10 +643,14 @@ def test_the_check_of_this_project_is_sound_shell():
 
 
 REFERENCES = {
-    "mini.jsonl": ("paper-mini", ("riqn", "npn", "rf")),
-    "pe.jsonl": ("pe-mini", ("pe-a",)),
+    "mini.jsonl": ("rf[h=1,seed=0]",),
+    "pe.jsonl": ("pe-a[h=1,seed=0]",),
+    "quick.jsonl": ("npn[h=1,seed=0,updates=250]", "riqn[h=1,seed=0,updates=250]"),
 }
-"""Files of reference scores, the entries that they are from, and the detectors in them."""
+"""Files of reference scores, and the settings in them."""
+
+ENTRIES = {"mini.jsonl": "paper-mini", "pe.jsonl": "pe-mini"}
+"""Entries of the board that references are from."""
 
 
 def reference(name):
@@ -659,22 +663,23 @@ def test_the_references_of_this_project_are_of_the_split_that_ships(name):
     ((conditions, cells),) = found.boards.items()
     assert conditions == Conditions("mini", load_split("mini").digest, PROTOCOL, None)
     assert all(r.ok for r in found.records)
-    whole = {
-        f"mini/{e}/{a}::{detector}[h=1,seed=0]"
-        for e in ENVIRONMENTS
-        for a in TABLE1
-        for detector in REFERENCES[name][1]
-    }
+    whole = {f"mini/{e}/{a}::{s}" for e in ENVIRONMENTS for a in TABLE1 for s in REFERENCES[name]}
     assert whole == set(map(str, cells))
 
 
-@pytest.mark.parametrize("name", REFERENCES)
+@pytest.mark.parametrize("name", ENTRIES)
 def test_the_references_of_this_project_are_of_the_committed_records(name, tmp_path):
-    entry, detectors = REFERENCES[name]
-    of_default = expression(" or ".join(f"::{d}[h=1,seed=0]" for d in detectors))
-    records = read_record_set(ROOT / "leaderboard/results" / entry).records
+    of_default = expression(" or ".join(f"::{setting}" for setting in REFERENCES[name]))
+    records = read_record_set(ROOT / "leaderboard/results" / ENTRIES[name]).records
     write_reference([r for r in records if of_default(str(r.cell))], tmp_path / "r.jsonl")
     assert reference(name).read_bytes() == (tmp_path / "r.jsonl").read_bytes()
+
+
+def test_quick_references_differ_from_the_rows_of_the_board_in_their_updates_alone():
+    board = read_record_set(ROOT / "leaderboard/results/paper-mini").records
+    default = {r.detector: r.parameters for r in board}
+    for r in read_record_set(reference("quick.jsonl")).records:
+        assert r.parameters == default[r.detector] | {"updates": 250}
 
 
 def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
@@ -684,8 +689,9 @@ def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
     for options in own_check():
         if options.command == "run":
             names = ENVIRONMENTS if options.env == "all" else options.env.split(",")
+            changed = "".join(f",{name}={value}" for name, value in options.param or ())
             ran |= {
-                f"mini/{e}/{a}::{detector}[h=1,seed=0]"
+                f"mini/{e}/{a}::{detector}[h=1,seed=0{changed}]"
                 for e in names
                 for a in TABLE1
                 for detector in options.detector.split(",")
