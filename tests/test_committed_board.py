@@ -78,7 +78,9 @@ def committed():
 
 
 @pytest.mark.artefacts
-def test_every_number_of_the_committed_board_comes_from_its_records(tmp_path):
+def test_every_number_of_the_committed_board_comes_from_its_records(tmp_path, monkeypatch):
+    # The site is not committed; test_docs builds it.
+    monkeypatch.setattr(leaderboard_build.site, "files", lambda *_, **__: {})
     assert check_board(BOARD, tmp_path) == []
 
 

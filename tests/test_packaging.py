@@ -17,27 +17,6 @@ pytestmark = pytest.mark.packaging
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope="session")
-def installed(wheel, tmp_path_factory):
-    target = tmp_path_factory.mktemp("installed")
-    pip("install", "--no-deps", "--target", str(target), str(wheel))
-    return target
-
-
-def run_installed(installed, tmp_path, *arguments):
-    """Run the command line from the installed wheel, in front of the checkout on the path."""
-    code = (
-        f"import sys; sys.path.insert(0, {str(installed)!r}); import oodd_eval;"
-        f"assert oodd_eval.__file__.startswith({str(installed)!r}), oodd_eval.__file__;"
-        "from oodd_eval.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    )
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "PYTHONPATH": str(installed)},
-    )  # fmt: skip
-
-
 def test_wheel_ships_only_leaf_named_packages(wheel):
     names = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     packages = {name for name in names if not name.endswith(".dist-info")}
@@ -76,23 +55,6 @@ def test_what_is_handed_out_works_in_environments_of_its_own(tmp_path):
 
 def test_wheel_is_at_most_30_megabytes(wheel):
     assert wheel.stat().st_size <= 30e6
-
-
-def test_installed_wheel_lists_detectors_and_runs(installed, tmp_path):
-    listed = run_installed(installed, tmp_path, "list", "detectors")
-    assert listed.returncode == 0, listed.stderr
-    assert re.search(r"^rf\b", listed.stdout, re.MULTILINE)
-    ran = run_installed(
-        installed, tmp_path, "run", "--detector", "clock", "--env", "cartpole", "--output", "out"
-    )
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert len((tmp_path / "out" / "records.jsonl").read_text().splitlines()) == 8
-
-
-def test_installed_wheel_shows_the_published_board(installed, tmp_path):
-    shown = run_installed(installed, tmp_path, "leaderboard", "show", "--split", "mini", "--csv")
-    assert shown.returncode == 0, shown.stderr
-    assert len(shown.stdout.splitlines()) > 30
 
 
 def readme_pyproject():
