@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers_wheel import PIP
 
 pytestmark = pytest.mark.packaging
 
@@ -36,10 +37,10 @@ def records(directory):
 @pytest.mark.skipif(interpreter() is None, reason="no newer Python on this machine")
 def test_a_newer_python_gives_the_same_results(wheel, tmp_path):
     environment = tmp_path / "venv"
-    subprocess.run([interpreter(), "-m", "venv", environment], check=True)
+    subprocess.run([interpreter(), "-m", "venv", "--without-pip", environment], check=True)
     python = environment / "bin" / "python"
-    pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    done = subprocess.run([*pip, wheel], capture_output=True, text=True, check=False)
+    install = [*PIP, "--python", python, "install", wheel]
+    done = subprocess.run(install, capture_output=True, text=True, check=False)
     if done.returncode:
         pytest.skip(f"its libraries cannot be installed: {done.stderr[-200:]}")
     results = {}
