@@ -650,7 +650,7 @@ REFERENCES = {
 """Files of reference scores, and the settings in them."""
 
 ENTRIES = {"mini.jsonl": "paper-mini", "pe.jsonl": "pe-mini"}
-"""Entries of the board that references are from."""
+"""The entry of the board that a reference is from."""
 
 
 def reference(name):
