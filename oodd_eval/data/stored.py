@@ -149,36 +149,42 @@ def child(group: h5py.Group, name: str) -> Any:
     `SplitError` for a link that leads elsewhere, for content in another file, and for more content
     than the file can hold.
     """
-    where = f"{Path(group.file.filename).name}, {group.name}"
     if not isinstance(group, h5py.Group):
-        raise SplitError(f"{where} is no group, expected one with {name!r}")
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise SplitError(f"{where} holds {name!r}, which points elsewhere: refused")
+        raise SplitError(f"{_place(group)} is no group, expected one with {name!r}")
+    if group.id.links.get_info(name.encode(errors="surrogateescape")).type != h5py.h5l.TYPE_HARD:
+        raise SplitError(f"{_place(group)} holds {name!r}, which points elsewhere: refused")
     if isinstance(found := group[name], h5py.Dataset) and found.shape:
-        check_plain(f"{where.rstrip('/')}/{name}", found)
+        check_plain(found)
     return found
 
 
-def check_plain(where: str, dataset: h5py.Dataset) -> None:
-    """Raise `SplitError` unless a dataset's content is in its file, and no more than it can hold.
+def _place(found: Any) -> str:
+    """Return a group or dataset as messages name it."""
+    return f"{Path(found.file.filename).name}, {found.name}"
 
-    `where` names it in messages.
-    """
-    layout, item = dataset.id.get_create_plist(), dataset.dtype.itemsize
-    if dataset.is_virtual or layout.get_external_count():
-        raise SplitError(f"{where} keeps its content in another file: refused")
+
+def check_plain(dataset: h5py.Dataset) -> None:
+    """Raise `SplitError` unless a dataset's content is in its file, and no more than it can hold."""
+    # Opening a split comes here for some hundred datasets: what h5py makes anew is asked for once.
+    layout, item, held = dataset.id.get_create_plist(), dataset.dtype.itemsize, dataset.nbytes
+    if layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count():
+        raise SplitError(f"{_place(dataset)} keeps its content in another file: refused")
     filters = [layout.get_filter(i)[0] for i in range(layout.get_nfilters())]
     if {*filters} - _FILTERS or len(filters) > len({*filters}):
-        raise SplitError(f"{where} is packed by the filters {filters}, expected gzip and shuffle: "
-                         "repack it, as with h5repack -f SHUF -f GZIP=4")  # fmt: skip
-    size = os.fstat(dataset.file.id.get_vfd_handle()).st_size
-    pieces, longest, found, large = 1, dataset.nbytes, [dataset.id.get_storage_size()], []
-    if dataset.chunks:
-        pairs = zip(dataset.shape, dataset.chunks, strict=True)
-        pieces, longest = math.prod(-(-n // c) for n, c in pairs), math.prod(dataset.chunks) * item
+        raise SplitError(
+            f"{_place(dataset)} is packed by the filters {filters}, expected gzip and shuffle: "
+            "repack it, as with h5repack -f SHUF -f GZIP=4"
+        )
+    size = os.fstat(h5py.h5i.get_file_id(dataset.id).get_vfd_handle()).st_size
+    pieces, longest, found, large = 1, held, [dataset.id.get_storage_size()], []
+    if chunks := dataset.chunks:
+        pairs = zip(dataset.shape, chunks, strict=True)
+        pieces, longest = math.prod(-(-n // c) for n, c in pairs), math.prod(chunks) * item
         if longest > _MOST_CHUNK:
-            raise SplitError(f"{where} has chunks of {longest} bytes, expected at most "
-                             f"{_MOST_CHUNK}: repack it, as with h5repack")  # fmt: skip
+            raise SplitError(
+                f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
+                f"{_MOST_CHUNK}: repack it, as with h5repack"
+            )
         found = []
 
         def note(chunk: Any) -> None:
@@ -189,13 +195,15 @@ def check_plain(where: str, dataset: h5py.Dataset) -> None:
         if pieces <= size:
             dataset.id.chunk_iter(note)
     most = sum(found) * (_DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1)
-    if dataset.nbytes > most or len(found) < pieces or sum(found) > size:
+    if held > most or len(found) < pieces or sum(found) > size:
         raise SplitError(
-            f"{where} has {dataset.nbytes} bytes in {pieces} pieces, of which the file holds "
+            f"{_place(dataset)} has {held} bytes in {pieces} pieces, of which the file holds "
             f"{len(found)} in {sum(found)} bytes: it is damaged, or made to fill the memory"
         )
     for chunk in large:
         _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
         with contextlib.suppress(zlib.error):  # HDF5 says so, too, when the chunk is read
             if len(zlib.decompressobj().decompress(content, longest + 1)) > longest:
-                raise SplitError(f"{where} has a chunk that unpacks to more than {longest} bytes")
+                raise SplitError(
+                    f"{_place(dataset)} has a chunk that unpacks to more than {longest} bytes"
+                )

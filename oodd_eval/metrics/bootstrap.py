@@ -223,7 +223,8 @@ def bounds(values: Samples, value: float, sizes: Sequence[int]) -> tuple[float, 
     variance were divided by n, not n - 1 (Hesterberg, Am. Stat. 69, 2015). `sizes` are the numbers
     of trajectories in the environments that it is a mean over.
     """
-    defined = values[~np.isnan(values)]
+    undefined = np.isnan(values)
+    defined = values[~undefined] if undefined.any() else values
     if not defined.size:
         return math.nan, math.nan
     near = _NOISE * max(1.0, abs(value))
@@ -360,6 +361,8 @@ def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
 
 def _mean_of(sums: Sequence[CellSum]) -> Samples:
     """Return the mean over cells in every resample."""
+    if len(sums) == 1:  # the interval of a cell, of which there are tens of thousands
+        return sums[0].samples / sums[0].cells
     total, count = np.zeros((2, len(sums[0].samples)))
     for _, samples, cells in sums:
         undefined = np.isnan(samples)

@@ -224,9 +224,9 @@ def descend(
 
     The loss is the mean over steps, pieces, levels and the network's sensors. ``kappa`` has shape
     (E,); ``tau`` (E, N) holds the levels of this update, shared by all steps, pieces and sensors,
-    so that their embeddings cost next to nothing. The slope of the loss is handed to the backward
-    pass directly: the loss itself, a dozen passes over the largest array of a training step, is
-    only needed when it is looked at.
+    so that their embeddings cost next to nothing. The slope of the loss is what the backward pass
+    begins with: the loss itself, a dozen passes over the largest array of a training step, is only
+    needed when it is looked at.
     """
     heads = None if tau is None else network.heads_at(tau)
     z, memory = hidden(network, x, memory, kept)
@@ -237,7 +237,9 @@ def descend(
             slope = quantile_huber_slope(slope, tau[:, None, None, :, None], _wide(kappa))
         _, t, b, n, _ = slope.shape
         slope *= -1 / (t * b * n * network.architecture.outputs)
-    change.backward(slope)  # type: ignore[no-untyped-call]
+    # Handed to `backward`, a slope has PyTorch import SymPy: half a second of every fit.
+    change.register_hook(lambda _: slope)
+    change.sum().backward()  # type: ignore[no-untyped-call]
     return memory
 
 

@@ -65,7 +65,7 @@ _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
 
 def _is_whole(item: h5py.Dataset) -> bool:
     try:
-        check_plain(str(item.name), item)
+        check_plain(item)
     except SplitError:
         return False
     return True
