@@ -164,27 +164,23 @@ def _place(found: Any) -> str:
 
 
 def check_plain(dataset: h5py.Dataset) -> None:
-    """Raise `SplitError` unless a dataset's content is in its file, and no more than it can hold."""
+    """Raise `SplitError` unless a dataset's content is in its file, and no more than fits there."""
     # Opening a split comes here for some hundred datasets: what h5py makes anew is asked for once.
     layout, item, held = dataset.id.get_create_plist(), dataset.dtype.itemsize, dataset.nbytes
     if layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count():
         raise SplitError(f"{_place(dataset)} keeps its content in another file: refused")
     filters = [layout.get_filter(i)[0] for i in range(layout.get_nfilters())]
     if {*filters} - _FILTERS or len(filters) > len({*filters}):
-        raise SplitError(
-            f"{_place(dataset)} is packed by the filters {filters}, expected gzip and shuffle: "
-            "repack it, as with h5repack -f SHUF -f GZIP=4"
-        )
+        raise SplitError(f"{_place(dataset)} is packed by the filters {filters}, expected gzip and "
+                         "shuffle: repack it, as with h5repack -f SHUF -f GZIP=4")  # fmt: skip
     size = os.fstat(h5py.h5i.get_file_id(dataset.id).get_vfd_handle()).st_size
     pieces, longest, found, large = 1, held, [dataset.id.get_storage_size()], []
     if chunks := dataset.chunks:
         pairs = zip(dataset.shape, chunks, strict=True)
         pieces, longest = math.prod(-(-n // c) for n, c in pairs), math.prod(chunks) * item
         if longest > _MOST_CHUNK:
-            raise SplitError(
-                f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
-                f"{_MOST_CHUNK}: repack it, as with h5repack"
-            )
+            raise SplitError(f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
+                             f"{_MOST_CHUNK}: repack it, as with h5repack")  # fmt: skip
         found = []
 
         def note(chunk: Any) -> None:
@@ -204,6 +200,5 @@ def check_plain(dataset: h5py.Dataset) -> None:
         _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
         with contextlib.suppress(zlib.error):  # HDF5 says so, too, when the chunk is read
             if len(zlib.decompressobj().decompress(content, longest + 1)) > longest:
-                raise SplitError(
-                    f"{_place(dataset)} has a chunk that unpacks to more than {longest} bytes"
-                )
+                where = _place(dataset)
+                raise SplitError(f"{where} has a chunk that unpacks to more than {longest} bytes")

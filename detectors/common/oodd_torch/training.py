@@ -238,7 +238,7 @@ def descend(
         _, t, b, n, _ = slope.shape
         slope *= -1 / (t * b * n * network.architecture.outputs)
     # Handed to `backward`, a slope has PyTorch import SymPy: half a second of every fit.
-    change.register_hook(lambda _: slope)
+    change.register_hook(lambda _: slope)  # type: ignore[no-untyped-call]
     change.sum().backward()  # type: ignore[no-untyped-call]
     return memory
 

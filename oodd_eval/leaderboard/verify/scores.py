@@ -45,7 +45,6 @@ AREA: Final = 0.002  # what rounding changes of the area below a curve
 
 _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
 _EXPLAINED: Final = dict.fromkeys(EXPLAINED, np.dtype(np.int32))  # of anomalous parts, if at all
-_FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
 
 Json = dict[str, Any]
 Complaints = Iterator[tuple[str, str]]  # places in a file and what is wrong with them
@@ -55,25 +54,18 @@ _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
     (lambda d, dtype: d.dtype == dtype, "float64 scores, int64 offsets and int32 explanations"),
     (lambda d, _: d.shape is not None and d.ndim == 1 and d.size, "one dimension and not empty"),
     (lambda d, _: d.size <= MOST_VALUES, f"at most {MOST_VALUES} values"),
-    (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
     (lambda d, _: not len(d.attrs), "no attributes"),
-    (lambda d, _: _filters(d) <= _FILTERS, "no filter but gzip and shuffle"),
-    (lambda d, _: _is_whole(d), "content that the file holds, in chunks of at most 64 MB"),
+    (lambda d, _: _is_plain(d), "all content in this file, as gzip in chunks of at most 64 MB"),
 )
 """Predicates of an item and its expected type, each safe where those before hold."""
 
 
-def _is_whole(item: h5py.Dataset) -> bool:
+def _is_plain(item: h5py.Dataset) -> bool:
     try:
         check_plain(item)
     except SplitError:
         return False
     return True
-
-
-def _filters(item: h5py.Dataset) -> set[int]:
-    pipeline = item.id.get_create_plist()
-    return {pipeline.get_filter(i)[0] for i in range(pipeline.get_nfilters())}
 
 
 def check_scores(
