@@ -1,6 +1,8 @@
 """riqn, riqn-ms, n-riqn and npn: loss, learned distributions, rollouts, and the score contract."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -221,6 +223,22 @@ def test_training_lowers_the_held_out_loss():
     detector = riqn(seed=0, horizon=1, members=2, updates=100).fit(waves(20))
     before, after = detector.history_
     assert max(after) < 0.7 * min(before)
+
+
+NO_SYMPY = """
+import sys
+import numpy as np
+from oodd_eval import Trajectory
+from oodd_riqn import riqn
+
+rows = np.random.default_rng(0).normal(size=(4, 40, 2))
+riqn(members=1, updates=1).fit([Trajectory(r, np.zeros((39, 1))) for r in rows])
+assert "sympy" not in sys.modules
+"""
+
+
+def test_a_fit_does_without_sympy_whose_import_takes_half_a_second():
+    subprocess.run([sys.executable, "-c", NO_SYMPY], check=True)
 
 
 def test_members_differ():

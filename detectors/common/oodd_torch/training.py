@@ -237,7 +237,7 @@ def descend(
             slope = quantile_huber_slope(slope, tau[:, None, None, :, None], _wide(kappa))
         _, t, b, n, _ = slope.shape
         slope *= -1 / (t * b * n * network.architecture.outputs)
-    # Handed to `backward`, a slope has PyTorch import SymPy: half a second of every fit.
+    # `change.backward(slope)` does the same, but imports SymPy, which takes half a second.
     change.register_hook(lambda _: slope)  # type: ignore[no-untyped-call]
     change.sum().backward()  # type: ignore[no-untyped-call]
     return memory

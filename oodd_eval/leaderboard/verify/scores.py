@@ -54,8 +54,10 @@ _DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
     (lambda d, dtype: d.dtype == dtype, "float64 scores, int64 offsets and int32 explanations"),
     (lambda d, _: d.shape is not None and d.ndim == 1 and d.size, "one dimension and not empty"),
     (lambda d, _: d.size <= MOST_VALUES, f"at most {MOST_VALUES} values"),
+    (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
     (lambda d, _: not len(d.attrs), "no attributes"),
-    (lambda d, _: _is_plain(d), "all content in this file, as gzip in chunks of at most 64 MB"),
+    (lambda d, _: not d.fletcher32, "no filter but gzip and shuffle"),
+    (lambda d, _: _is_plain(d), "content that the file holds, as gzip in chunks of at most 64 MB"),
 )
 """Predicates of an item and its expected type, each safe where those before hold."""
 
