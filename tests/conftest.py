@@ -34,15 +34,36 @@ def pytest_addoption(parser):
     parser.addoption("--long", action="store_true", help="random attacks: many thousands of them")
 
 
-def pytest_collection_modifyitems(items):
-    """Put the longest tests first, and what can be shared out last of them.
+LONGEST = (
+    ("test_walk", "test_packaging", "test_python_versions", "test_examples", "test_site_browser"),
+    ("test_docs", "test_committed_board"),
+    ("test_docs_commands",),
+)
+"""Modules that take longest, as three processes share them out to begin with."""
 
-    Processes that have nothing left take tests over from the others, but none can take half a test.
+
+@pytest.hookimpl(trylast=True)  # when the tests of other marks are out
+def pytest_collection_modifyitems(items):
+    """Let every process begin with long tests.
+
+    Each gets a stretch of the tests, and who has none left takes over some of the others' last
+    ones. None can take half a test: it would wait for a long one that came last.
     """
-    longest = ["test_walk", "test_packaging", "test_committed_board", "test_docs", "test_examples",
-               "test_docs_commands"]  # fmt: skip
-    place = {name: i for i, name in enumerate(longest)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(longest)))
+    place = {name: i for i, names in enumerate(LONGEST) for name in names}
+    heads = [[] for _ in LONGEST]
+    rest = []
+    for item in items:
+        i = place.get(item.path.stem)
+        (rest if i is None else heads[i]).append(item)
+    for i, names in enumerate(LONGEST):
+        heads[i].sort(key=lambda item, names=names: names.index(item.path.stem))
+    found, total = [], len(items)
+    for i, head in enumerate(heads):
+        # As pytest-xdist shares them out.
+        size = (total - len(found)) // (len(heads) - i) - len(head)
+        found += head + rest[: max(0, size)]
+        del rest[: max(0, size)]
+    items[:] = found + rest
 
 
 def pytest_collection_finish():
