@@ -19,9 +19,10 @@ from oodd_eval._version import repository
 from oodd_eval.cli import Parser
 from oodd_eval.cli.main import build_parser
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import CELLS, cells, suite_parts
+from oodd_eval.leaderboard.build import CELLS, cells, suite_cells
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.sections import sections, suite_sections
+from oodd_eval.leaderboard.site.data import power_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
@@ -87,11 +88,11 @@ def board() -> dict[str, str | bytes]:
     if not (ROOT / RESULTS[0]).exists():
         return {}
     found = sections(read_entries(ROOT / "leaderboard" / "results"))
-    suites = suite_parts(ROOT / "leaderboard")
-    shown = site.files(found, suites.power, project=repository())
+    suites = suite_sections(ROOT / "leaderboard")
+    shown = site.files(found, power_of(suites), project=repository())
     # The page of Markdown that it links to is a page of this site.
     page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
-    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suites)}
+    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suite_cells(suites))}
     return {f"{BOARD}/{name}": content for name, content in files.items()}
 
 

@@ -18,7 +18,7 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.build import SuiteParts, cells, page
+from oodd_eval.leaderboard.build import cells, page
 from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.grants import Grant
 from oodd_eval.leaderboard.published import PUBLISHED
@@ -620,7 +620,7 @@ def test_nothing_that_others_wrote_becomes_markup():
 
 def test_csv_of_cells_has_a_line_per_cell_with_stored_metrics():
     found = sections(entries())
-    lines = lines_of(decompress(cells(found, SuiteParts())).decode())
+    lines = lines_of(decompress(cells(found)).decode())
     assert len(lines) == 22
     assert {line["board"] for line in lines} == {"leaderboard"}
     by_cell = {(r.detector, r.horizon, r.environment, r.anomaly): r for r in board()}
@@ -637,7 +637,7 @@ def test_every_column_of_the_table_of_cells_is_described():
     page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
     listed = [name for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
               for name in re.findall(r"`(\w+)`", row)]  # fmt: skip
-    columns = list(lines_of(decompress(cells(sections(entries()), SuiteParts())).decode())[0])
+    columns = list(lines_of(decompress(cells(sections(entries()))).decode())[0])
     own = [c for c in columns if re.sub(r"_(low|high)$", "", c) not in catalogue.NAMES]
     assert sorted(own) == sorted(name for name in listed if not name.startswith("_"))
     assert len(own) < len(columns)

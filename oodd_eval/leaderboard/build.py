@@ -66,7 +66,12 @@ class SuiteParts(NamedTuple):
 @without_collector()
 def suite_parts(place: Path) -> SuiteParts:
     """Return what a leaderboard's directory has of further test suites, ready to be shown."""
-    suites = suite_sections(place)
+    own = suite_sections(place)
+    return SuiteParts([*map(_suite, own)], power_of(own), suite_cells(own), suite_lines(own))
+
+
+def suite_cells(suites: Sequence[SuiteSection]) -> str:
+    """Return the lines that further test suites have in the table of all cells."""
     lines: list[tuple[dict[str, str], Record]] = []
     for suite in suites:
         first = primary_settings(suite.board.records)
@@ -75,8 +80,7 @@ def suite_parts(place: Path) -> SuiteParts:
             about = {"board": suite.name, "entry": "", "trust": "",
                      "primary": str(r.setting in first).lower(), "trivial": trivial}  # fmt: skip
             lines.append((about, r))
-    table = rendering.cells_csv(lines, header=False)
-    return SuiteParts([*map(_suite, suites)], power_of(suites), table, suite_lines(suites))
+    return rendering.cells_csv(lines, header=False)
 
 
 @without_collector()
@@ -104,7 +108,7 @@ def build(
         files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
     on_part("published board")
     files[PUBLISHED] = published_bytes(found, further.published)
-    files[CELLS] = cells(found, further)
+    files[CELLS] = cells(found, further.cells)
     on_part("site")
     files |= {f"{SITE}/{name}": content for name, content in beside().items()}
     for name, content in files.items():
@@ -148,8 +152,8 @@ def started(function: Callable[[], Made]) -> Callable[[], Made]:
     return wait
 
 
-def cells(sections: Sequence[LeaderboardSection], suites: SuiteParts) -> bytes:
-    """Return all cells of boards and suites as one table (compressed CSV)."""
+def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
+    """Return all cells of boards as one table (compressed CSV), the lines of `suites` last."""
     lines: list[tuple[dict[str, str], Record]] = []
     for section in sections:
         for row in section.ranks.standings:
@@ -158,7 +162,7 @@ def cells(sections: Sequence[LeaderboardSection], suites: SuiteParts) -> bytes:
             about = {"board": "leaderboard", "entry": entry.meta.id, "trust": entry.trust,
                      "primary": primary, "trivial": trivial}  # fmt: skip
             lines += [(about, r) for r in row.records]
-    return compress((rendering.cells_csv(lines) + suites.cells).encode())
+    return compress((rendering.cells_csv(lines) + suites).encode())
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -201,9 +205,7 @@ def page(
 ) -> str:
     """Return the whole page with the sections of suites; it names the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
-    parts = [TEXTS["introduction"]]
-    if site:
-        parts.append(TEXTS["site"].format(site=site))
+    parts = [TEXTS["introduction"], *([TEXTS["site"].format(site=site)] if site else [])]
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
     parts += suites

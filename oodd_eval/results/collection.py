@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 from tabulate import tabulate
 
-from oodd_eval.data.parts import TWINS
+from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
@@ -185,7 +187,19 @@ class Results(Sequence[Record]):
         ResultsError
             When the cell failed, or its scores were not kept.
         """
-        found = self._scored(environment, anomaly, row=row, seed=seed)
+        setting = self._row(row)
+        own = [r for r in self.records if r.setting == setting]
+        check_known("environment of these results", {r.environment for r in own}, environment)
+        own = [r for r in own if r.environment == environment]
+        what = f"anomaly of these results in {environment}"
+        check_known(what, {r.condition for r in own}, anomaly)
+        own = sorted((r for r in own if r.condition == anomaly), key=lambda r: r.seed)
+        record = next((r for r in own if seed in (None, r.seed)), None)
+        if record is None:
+            raise UsageError(f"no detector seed {seed}: expected one of {[r.seed for r in own]}")
+        if not record.ok:
+            raise ResultsError(f"{record.cell} has no scores, it failed: {record.reason}")
+        (found,) = self._episodes([record])
         if not 0 <= i < len(found):
             cell = f"{environment}/{anomaly}"
             raise UsageError(f"{cell} has no episode {i}: expected 0 to {len(found) - 1}")
@@ -229,10 +243,7 @@ class Results(Sequence[Record]):
         curves = {}
         for setting in chosen:
             own = [r for r in self.records if r.setting == setting and r.ok]
-            curves[str(setting)] = [
-                e for r in own
-                for e in self._scored(r.environment, r.condition, row=str(setting), seed=r.seed)
-            ]  # fmt: skip
+            curves[str(setting)] = [e for episodes in self._episodes(own) for e in episodes]
         return plots.power(curves)
 
     def plot_ladder(
@@ -276,34 +287,23 @@ class Results(Sequence[Record]):
             return row_named(self.records, name or self.rows[0])
         raise UsageError(f"{len(self.rows)} rows, expected the name of one: {', '.join(self.rows)}")
 
-    def _scored(
-        self, environment: str, anomaly: str, *, row: str, seed: int | None
-    ) -> list[ScoredEpisode]:
-        """Return all episodes of a cell."""
-        own = [r for r in self.records if r.setting == self._row(row)]
-        check_known("environment of these results", {r.environment for r in own}, environment)
-        own = [r for r in own if r.environment == environment]
-        check_known(
-            f"anomaly of these results in {environment}", {r.condition for r in own}, anomaly
-        )
-        own = sorted((r for r in own if r.condition == anomaly), key=lambda r: r.seed)
-        record = next((r for r in own if seed in (None, r.seed)), None)
-        if record is None:
-            raise UsageError(f"no detector seed {seed}: expected one of {[r.seed for r in own]}")
-        if not record.ok:
-            raise ResultsError(f"{record.cell} has no scores, it failed: {record.reason}")
-        if self._directory is None:
-            raise ResultsError(f"{record.cell}: the scores of these results were not kept")
-        split = self._split or load_split(record.split.partition("@")[0])
-        must_be_of(split, record)
-        with split.opened() as opened:
-            data = opened(environment)
-            file = stored_scores([record], self._directory, data)
-            known, sensors = data.anomalous(anomaly), tuple(s.name for s in data.sensors)
-            rule = Rules.fit(file.parts["calibration"], record.alarm).guaranteed.get(HEADLINE)
-            pairs = zip(file.parts[f"test/{anomaly}"], file.parts[TWINS], strict=True)
-            return [
-                ScoredEpisode(record.cell, i, scores, twin, known[i], data.twins[i], sensors,
-                              int(known.onsets[i]), int(known.effects[i]), rule)
-                for i, (scores, twin) in enumerate(pairs)
-            ]  # fmt: skip
+    def _episodes(self, records: Sequence[Record]) -> Iterator[list[ScoredEpisode]]:
+        """Yield all episodes of each record; to open an environment takes long: once for all."""
+        with contextlib.ExitStack() as stack:
+            opened = functools.cache(lambda split: stack.enter_context(split.opened()))
+            for record in records:
+                if self._directory is None:
+                    raise ResultsError(f"{record.cell}: the scores of these results were not kept")
+                split = self._split or load_split(record.split.partition("@")[0])
+                must_be_of(split, record)
+                data: EnvironmentData = opened(split)(record.environment)
+                file = stored_scores([record], self._directory, data)
+                known = data.anomalous(record.condition)
+                sensors = tuple(sensor.name for sensor in data.sensors)
+                rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
+                pairs = zip(file.parts[f"test/{record.condition}"], file.parts[TWINS], strict=True)
+                yield [
+                    ScoredEpisode(record.cell, i, scores, twin, known[i], data.twins[i], sensors,
+                                  int(known.onsets[i]), int(known.effects[i]), rule)
+                    for i, (scores, twin) in enumerate(pairs)
+                ]  # fmt: skip
