@@ -150,6 +150,8 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
         (tmp_path / file).write_text(text_of(source, path))
     for folder in known["folders"]:
         shutil.copytree(ROOT / folder, tmp_path / Path(folder).name)
+    # As with the rules for commands: one episode shows what twenty do.
+    monkeypatch.setattr("oodd_training.train.SELECTION_EPISODES", 1)
     session = Session(tmp_path, monkeypatch)
     request.addfinalizer(session.forget)
     for command in (*known["before"], *commands(path.read_text())):

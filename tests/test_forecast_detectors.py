@@ -114,7 +114,7 @@ def learned():
     made = Ensemble(
         Architecture(features=1), [torch.Generator().manual_seed(0)], *linear_forecast(episodes, 1)
     )
-    schedule = Schedule(updates=1500, batch=32, chunk=10, levels=16, widths=(0.1,))
+    schedule = Schedule(updates=500, batch=32, chunk=10, levels=16, widths=(0.1,))
     train(made, episodes[:108], episodes[108:], schedule, [np.random.default_rng(0)])
     return made.requires_grad_(requires_grad=False)
 
