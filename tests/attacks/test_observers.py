@@ -1,7 +1,9 @@
 """Observers that want to change a result, or to end the run: nothing of either happens."""
 
 import json
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 from helpers_plugins import install
@@ -18,8 +20,13 @@ from oodd_eval.scoring.runner import run
 VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
 
 
-def outcome(tiny_split, output, **settings):
-    """Records of a run of two detectors, as bytes, those that were written among them."""
+def outcome(tiny_split, output, scores=None, **settings):
+    """Records of a run of two detectors, as bytes, those that were written among them.
+
+    Where another run left scores, nothing is fitted: what observers see of cells is the same.
+    """
+    if scores is not None:
+        shutil.copytree(scores, Path(output) / "scores")
     split, plugins = load_split(tiny_split), discover()
     plan = make_plan(
         plugins, split=split, detectors=["clock", "persistence"], environments=["cartpole"],
@@ -34,7 +41,9 @@ def outcome(tiny_split, output, **settings):
 
 @pytest.fixture(scope="module")
 def undisturbed(tiny_split, tmp_path_factory):
-    return outcome(tiny_split, tmp_path_factory.mktemp("undisturbed"))[0]
+    """Records of a run without observers, and where its scores are."""
+    output = tmp_path_factory.mktemp("undisturbed")
+    return outcome(tiny_split, output)[0], output / "scores"
 
 
 SET = "object.__setattr__"
@@ -81,8 +90,11 @@ def test_an_observer_that_changes_what_it_gets_changes_nothing(
 ):
     install_observer(monkeypatch, tmp_path, *CHANGES[name])
     monkeypatch.chdir(tmp_path)
-    found, broken = outcome(tiny_split, "out")
-    assert found == undisturbed
+    records, scores = undisturbed
+    # Plans and units are observed before anything is fitted.
+    begins = "finished" not in CHANGES[name][0]
+    found, broken = outcome(tiny_split, "out", None if begins else scores)
+    assert found == records
     assert [b.reason for b in broken] == []
     assert (tmp_path / "out" / "records.jsonl").exists()
 
@@ -110,8 +122,9 @@ def test_an_observer_that_leaves_is_noted_and_all_cells_are_done(
     tiny_split, undisturbed, monkeypatch, tmp_path, hook, end
 ):
     install_observer(monkeypatch, tmp_path, f"{hook}()", f"import sys; {end}")
-    found, broken = outcome(tiny_split, tmp_path / "out")
-    assert found == undisturbed
+    records, scores = undisturbed
+    found, broken = outcome(tiny_split, tmp_path / "out", scores)
+    assert found == records
     assert [b.plugin for b in broken] == ["meddler"]
 
 
@@ -127,8 +140,9 @@ WRAPPERS = {
 def test_a_wrapper_of_a_hook_that_leaves(tiny_split, undisturbed, monkeypatch, tmp_path, name):
     install(monkeypatch, tmp_path / "plugin", "meddler", WRAPPERS[name],
             group="oodd_eval.observers")  # fmt: skip
-    found, broken = outcome(tiny_split, tmp_path / "out")
-    assert found == undisturbed
+    records, scores = undisturbed
+    found, broken = outcome(tiny_split, tmp_path / "out", scores)
+    assert found == records
     assert [b.plugin for b in broken] == ["meddler"]
 
 
