@@ -324,8 +324,7 @@ def _entry(entry: SubmittedEntry) -> str:
     granted = f", by {grant.by} on {grant.day}: {grant.how}" if grant else ""
     shown = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
     plugins = [shown.format(**plugin) for plugin in meta.plugins]
-    packages = meta.environment.get("packages", {})
-    versions = [f"{name} {packages[name]}" for name in sorted(packages)]
+    packages = sorted(meta.environment.get("packages", {}).items())
     python = f"Python {meta.environment.get('python', '')}"
     lines = [
         ("Detectors", ", ".join(sorted(meta.detectors))),
@@ -335,7 +334,7 @@ def _entry(entry: SubmittedEntry) -> str:
         ("Citation", meta.citation),
         ("Plug-ins", "; ".join(plugins)),
         ("Platform", f"{python}, {meta.environment.get('platform', '')}"),
-        ("Packages", ", ".join(versions)),
+        ("Packages", ", ".join(f"{name} {version}" for name, version in packages)),
         ("Note", meta.caption),
     ]
     listed = [f"- {name}: {escape(text)}" for name, text in lines if text]

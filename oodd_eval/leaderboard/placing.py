@@ -76,13 +76,9 @@ def place(
     found = {row: _lacking(own, expected) for row, own in new.items()}
     return Placement(
         ranks=ranked(used, first, board.rerun and board.rerun | new.keys()),
-        own=set(by_row),
-        published=same,
-        replaced=set(replaced),
-        cells=cells,
-        expected=expected,
+        own=set(by_row), published=same, replaced=set(replaced), cells=cells, expected=expected,
         lacking={row: text for row, text in found.items() if text},
-    )
+    )  # fmt: skip
 
 
 def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:

@@ -30,6 +30,8 @@ ALARMS: Final = tuple(
 RANKED_BY: Final = (RANKING, ALARM_RANKING, *ALARMS)
 """Metrics that the file has: those of the rankings, and those beside them."""
 
+_OF_SUITE: Final = '"provenance": {"suite": '  # in the line of a record of a further suite
+
 
 @dataclass(frozen=True, slots=True)
 class PublishedBoard:
@@ -55,10 +57,17 @@ class PublishedBoard:
 
 
 class Published(NamedTuple):
-    """All published boards, and the boards of further suites with several strengths, by name."""
+    """All published boards, and the file that they are from."""
 
     boards: list[PublishedBoard]
-    suites: dict[str, Board]
+    file: Path
+
+    @property
+    def suites(self) -> dict[str, Board]:
+        """The boards of further suites with several strengths, by name; reading them takes long."""
+        records = read_records(self.file, wanted=lambda line: _OF_SUITE in line)
+        by_suite = grouped(records, lambda r: str(r.provenance["suite"]))
+        return {name: Board(own) for name, own in by_suite.items()}
 
 
 def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
@@ -100,21 +109,15 @@ def published_file() -> Path:
 
 
 def read_published(file: Path | None = None) -> Published:
-    """Read the file, by default the one of this installation."""
-    records = read_records(file or published_file())
-    by_suite = grouped(records, lambda r: str(r.provenance.get("suite", "")))
+    """Read the boards of the file, by default the one of this installation."""
+    file = file or published_file()
     found = []
-    for board in boards(by_suite.pop("", [])):
+    for board in boards(read_records(file, wanted=lambda line: _OF_SUITE not in line)):
         origin = {r.setting: r.provenance for r in board.records}
-        found.append(
-            PublishedBoard(
-                board.records,
-                {row: own["entry"] for row, own in origin.items()},
-                {row: own["trust"] for row, own in origin.items()},
-                {row for row, own in origin.items() if own["primary"]},
-            )
-        )
-    return Published(found, {name: Board(own) for name, own in by_suite.items()})
+        entries, trust = ({row: own[k] for row, own in origin.items()} for k in ("entry", "trust"))
+        primary = {row for row, own in origin.items() if own["primary"]}
+        found.append(PublishedBoard(board.records, entries, trust, primary))
+    return Published(found, file)
 
 
 def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:
@@ -156,7 +159,5 @@ def _key(record: Record) -> tuple[str, int, int | None]:
 
 def _conditions(record: Record) -> str:
     limit = "" if record.limit is None else f", limit {record.limit}"
-    return (
-        f"split {record.split}, digest {record.split_digest[:12]}, protocol {record.protocol}"
-        f"{limit}"
-    )
+    digest = f"digest {record.split_digest[:12]}"
+    return f"split {record.split}, {digest}, protocol {record.protocol}{limit}"

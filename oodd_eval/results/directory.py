@@ -18,7 +18,7 @@ import hashlib
 import io
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -326,7 +326,9 @@ def without_collector() -> Iterator[None]:
 
 
 @without_collector()
-def read_records(file: Path, notes: list[str] | None = None) -> list[Record]:
+def read_records(
+    file: Path, notes: list[str] | None = None, *, wanted: Callable[[str], bool] = bool
+) -> list[Record]:
     """Read a file of records.
 
     Parameters
@@ -335,6 +337,8 @@ def read_records(file: Path, notes: list[str] | None = None) -> list[Record]:
         Lines of JSON, compressed or not.
     notes
         Where given, a last line that was cut short is left out, which is told there.
+    wanted
+        Tells which lines to read.
 
     Raises
     ------
@@ -354,7 +358,7 @@ def read_records(file: Path, notes: list[str] | None = None) -> list[Record]:
     return [
         Record.from_json(line, f"{file}:{number}")
         for number, line in enumerate(lines, start=1)
-        if line.strip()
+        if line.strip() and wanted(line)
     ]
 
 
