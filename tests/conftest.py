@@ -35,11 +35,11 @@ def pytest_addoption(parser):
 
 
 LONGEST = (
-    ("test_walk", "test_packaging", "test_python_versions", "test_examples", "test_site_browser"),
-    ("test_docs", "test_committed_board"),
-    ("test_docs_commands",),
-)
-"""Modules that take longest, as three processes share them out to begin with."""
+    ("test_docs", "test_walk", "test_packaging", "test_python_versions", "test_examples",
+     "test_site_browser"),
+    ("test_committed_board", "test_docs_commands"),
+)  # fmt: skip
+"""Modules that take longest, as two processes share them out to begin with."""
 
 
 @pytest.hookimpl(trylast=True)  # when the tests of other marks are out
