@@ -44,10 +44,10 @@ LONGEST = (
 
 @pytest.hookimpl(trylast=True)  # when the tests of other marks are out
 def pytest_collection_modifyitems(items):
-    """Let every process begin with long tests.
+    """Let every process begin with long tests, so that those left at the end are short.
 
-    Each gets a stretch of the tests, and who has none left takes over some of the others' last
-    ones. None can take half a test: it would wait for a long one that came last.
+    pytest-xdist gives each process a stretch of the tests. A process that has finished its own
+    takes over the last ones of another process.
     """
     place = {name: i for i, names in enumerate(LONGEST) for name in names}
     heads = [[] for _ in LONGEST]

@@ -150,7 +150,7 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
         (tmp_path / file).write_text(text_of(source, path))
     for folder in known["folders"]:
         shutil.copytree(ROOT / folder, tmp_path / Path(folder).name)
-    # As with the rules for commands: one episode shows what twenty do.
+    # A policy is selected by one episode: that shows what a hundred do.
     monkeypatch.setattr("oodd_training.train.SELECTION_EPISODES", 1)
     session = Session(tmp_path, monkeypatch)
     request.addfinalizer(session.forget)

@@ -106,6 +106,18 @@ def run_of(records, directory):
 # The file
 
 
+def test_further_suites_are_read_apart_from_the_boards(board, tmp_path):
+    (one, *_) = row("good", 0.9, strength="half")
+    line = published.slim(one, ["auc_matched"], suite="graded").to_json() + "\n"
+    place = tmp_path / published.PUBLISHED
+    place.write_bytes(published_bytes([board], line))
+    found = read_published(place)
+    (own,) = found.boards
+    assert len(own.records) == sum(len(s.records) for s in board.ranks.standings)
+    assert [*found.suites] == ["graded"]
+    assert [str(r.cell) for r in found.suites["graded"].records] == [str(one.cell)]
+
+
 def test_the_rankings_of_the_file_are_those_of_the_board(board, shipped):
     assert places(shipped.ranks()) == places(board.ranks)
     assert places(board.ranks)["fair[h=5]"][3]  # as its entry declares

@@ -288,7 +288,7 @@ class Results(Sequence[Record]):
         raise UsageError(f"{len(self.rows)} rows, expected the name of one: {', '.join(self.rows)}")
 
     def _episodes(self, records: Sequence[Record]) -> Iterator[list[ScoredEpisode]]:
-        """Yield all episodes of each record; to open an environment takes long: once for all."""
+        """Yield all episodes of each record. An environment is opened once, which takes long."""
         with contextlib.ExitStack() as stack:
             opened = functools.cache(lambda split: stack.enter_context(split.opened()))
             for record in records:
