@@ -18,6 +18,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from helpers_split import make_split
 
+# Until the tests are collected, nothing is garbage. `pytest_collection_finish` ends this.
+gc.disable()
+
 # Begun in the background of a shell, a process ignores interrupts, and so would those it starts:
 # the tests of interrupted commands would wait in vain. So it is with hang-ups under nohup.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -70,6 +73,7 @@ def pytest_collection_finish():
     """Spare the garbage collector what stays until the end: all modules, and thousands of tests."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

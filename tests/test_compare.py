@@ -629,7 +629,7 @@ def own_check():
 def test_the_check_of_this_project_parses_and_is_two_sided():
     runs = [o for o in own_check() if o.command == "run"]
     comparisons = [o for o in own_check() if o.command == "compare"]
-    assert [o.detector for o in runs] == ["pe-a", "rf", "riqn,npn"]
+    assert [o.detector for o in runs] == ["rf", "riqn,npn", "pe-a"]
     assert len(comparisons) == 3
     for options in comparisons:
         assert options.two_sided

@@ -57,6 +57,13 @@ KNOWN = dict(
                 "oodd-eval run --detector persistence,random --env cartpole",
                 "oodd-eval leaderboard submit oodd-results --detector persistence",
             ),
+            rules=(
+                Rule(
+                    r"leaderboard show$",
+                    "one board shows what all do",
+                    "leaderboard show --split mini",
+                ),
+            ),
         ),
         page(
             "docs/how-to/release.md",
@@ -99,6 +106,10 @@ KNOWN = dict(
             rules=(Rule(r"(\w+_\w+\.py)", "fits in no time", r"\1 --detector mewma"),),
         ),
         page("examples/oodd-swimmer/README.md", folders=("examples/oodd-swimmer",)),
+        page(
+            "detectors/pe/README.md",
+            rules=(Rule(r"(?<=fresh --detector )pe,pe-a", "the first command fits them", "mewma"),),
+        ),
         page("docs/reproduce.md", rules=(Rule(r"--tier reduced", "it is built", "--tier mini"),)),
         page(
             "docs/submitting.md",

@@ -214,7 +214,8 @@ def _open_archive(path: Path) -> Iterator[Source]:
     """Open a tar or zip archive that holds the files of one split, in its root or one folder."""
     with contextlib.ExitStack() as stack:
         try:
-            kind: Any = zipfile.ZipFile if zipfile.is_zipfile(path) else _open_tar
+            tar = functools.partial(tarfile.open, tarinfo=_TarInfo)
+            kind: Any = zipfile.ZipFile if zipfile.is_zipfile(path) else tar
             members = _members(path.name, stack.enter_context(kind(path)))
         except SplitError:
             raise
@@ -248,10 +249,6 @@ class _TarInfo(tarfile.TarInfo):
         if not found.isreg() and found.size > _MIB:
             raise tarfile.HeaderError(f"a header of {found.size} bytes, expected at most {_MIB}")
         return found
-
-
-def _open_tar(path: Path) -> tarfile.TarFile:
-    return tarfile.open(path, tarinfo=_TarInfo)
 
 
 def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:

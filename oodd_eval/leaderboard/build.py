@@ -339,11 +339,7 @@ def _entry(entry: SubmittedEntry) -> str:
     ]
     listed = [f"- {name}: {escape(text)}" for name, text in lines if text]
     if meta.url:
-        listed.append(f"- Page: {_link(meta.url)}")
+        plain = re.fullmatch(r"https?://[^\s<>|\\`]+", meta.url)
+        listed.append(f"- Page: <{meta.url}>" if plain else f"- Page: {escape(meta.url)}")
     made = ["", "To run it again:", "", *(f"    {command}" for command in entry.commands)]
     return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, *made, ""])
-
-
-def _link(url: str) -> str:
-    """Return a link to a plain web address, and anything else as text."""
-    return f"<{url}>" if re.fullmatch(r"https?://[^\s<>|\\`]+", url) else escape(url)

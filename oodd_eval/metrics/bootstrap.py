@@ -308,7 +308,11 @@ def mean_over_cells(values: Iterable[tuple[int, float]]) -> float:
 
 def cell_samples(environment: str, contribution: Contribution) -> Samples:
     """Return the resamples of one cell, with the weights that its environment shares."""
-    return resampled(contribution, shared_weights(environment, len(contribution.numerator)))
+    weights = shared_weights(environment, len(contribution.numerator))
+    if contribution.median:
+        return _medians(contribution, weights)
+    numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
+    return numerator / _shared(environment, contribution.denominator.tobytes())
 
 
 def mean_samples(parts: Sequence[Samples]) -> Samples:

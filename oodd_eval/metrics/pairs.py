@@ -202,8 +202,10 @@ class PairTests:
         tested = [(g, self._terms(g)) for g in groups if g.observed.any()]
         if not tested:
             return
+        own = ((r.key, r.own.size) for r in self._rows if r.own.size)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(lambda key: _draws(*key, self.resamples), self._drawn_keys()))
+            drawn = {*self._sizes.items(), *own}
+            list(pool.map(lambda key: _draws(*key, self.resamples), drawn))
 
             def block(begin: int) -> list[NDArray[np.int64]]:
                 part = self._part(begin, min(begin + _BLOCK, stop))
@@ -213,10 +215,6 @@ class PairTests:
             for found in pool.map(block, range(start, stop, _BLOCK)):
                 for (group, _), counts in zip(tested, found, strict=True):
                     group.counts += counts
-
-    def _drawn_keys(self) -> set[tuple[str, int]]:
-        """Return what is drawn: by name, how many."""
-        return {*self._sizes.items(), *((r.key, r.own.size) for r in self._rows if r.own.size)}
 
     def _counted(
         self, group: _Group, terms: tuple[Singles, Singles, Singles], part: _Part, single: _Part

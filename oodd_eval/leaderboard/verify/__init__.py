@@ -32,7 +32,7 @@ from oodd_eval.leaderboard.verify.records import (
 )
 from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
 from oodd_eval.metrics.catalogue import RANKING
-from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.directory import RECORDS, without_collector
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
@@ -40,6 +40,7 @@ Seen = dict[object, tuple[str, str]]  # by row or detector: its entry, a detecto
 _Numbers = dict[object, tuple[str, str]]  # by place and numbers of a cell: its entry and row
 
 
+@without_collector()
 def verify_entry(
     directory: Path, *, name: str = "", split: str | Path | None = None,
     rerun: Sequence[Record] = (), order: RerunOrder | None = None,

@@ -39,9 +39,8 @@ MOST_ROWS: Final = 64  # rows of one entry; the paper's comparisons are some twe
 
 def same(first: float, second: float) -> bool:
     """Tell whether two values agree, both undefined included."""
-    if math.isnan(first) or math.isnan(second):
-        return math.isnan(first) and math.isnan(second)
-    return math.isclose(first, second, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+    near = math.isclose(first, second, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+    return near or (math.isnan(first) and math.isnan(second))
 
 
 def check_record(where: str, record: Record, findings: Findings) -> Sums | None:
