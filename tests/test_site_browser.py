@@ -538,6 +538,27 @@ def test_an_address_opens_a_cell_directly(browser, url):
     assert browser.run("return document.title").startswith("riqn")
 
 
+@pytest.mark.parametrize("before", ["/hopper/iid", ""])
+def test_another_cell_of_a_row_makes_the_page_that_its_address_opens(browser, url, before):
+    content = """
+        const page = document.querySelector("#detector");
+        return [page.textContent, page.querySelector(".heat [aria-current]").href];
+        """
+    open_row(browser, "riqn")
+    address = browser.run("return location.hash")
+    browser.open("about:blank")
+    browser.open(f"{url}{address}/hopper/drift")
+    opened = browser.run(content)
+    browser.open("about:blank")
+    browser.open(url + address + before)
+    assert browser.text("#cell h2") != "Hopper, Sensor Drift"
+    browser.run("document.querySelector('#metrics').dataset.seen = 'yes'")
+    browser.run("location.hash = arguments[0]", f"{address}/hopper/drift")
+    browser.wait_for("document.querySelector('#cell h2').textContent === 'Hopper, Sensor Drift'")
+    assert browser.run(content) == opened
+    assert browser.run("return document.querySelector('#metrics').dataset.seen") == "yes"
+
+
 # -- weaker anomalies -----------------------------------------------------------------------------
 
 

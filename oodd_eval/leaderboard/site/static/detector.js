@@ -1,7 +1,6 @@
 // The page of one row: facts, all cells, curves of the chosen cell, comparisons, the paper's digits.
 
 function detectorPage(board, row, chosen) {
-  const cell = chosenCell(row, chosen);
   const others = board.rows.filter((other) => other !== row).map((other) => [other.id, other.label]);
   return [
     element("p", { class: "back" }, element("a", { href: tableAddress() }, "\u2190 All detectors")),
@@ -10,13 +9,21 @@ function detectorPage(board, row, chosen) {
     summary(board, row),
     others.length ? element("form", { class: "choices", autocomplete: "off" },
       dropdown("against", "Beside", [["", "choose a detector"], ...others], "", (id) => { if (id) location.hash = address("compare", row.id, id); })) : null,
-    section("Cells", "cells", heat(board, row, cell),
-      element("p", { class: "note" }, "Choose a cell to see its curves below.")),
-    section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell", cellPart(board, row, cell)),
+    ...cellSections(board, row, chosen),
     comparisons(board, row),
     paperPart(board, row),
     section("All metrics", "metrics", metricsTable(board, row)),
     section("Where it is from", "source", facts(row)),
+  ];
+}
+
+/** All cells, and numbers and drawings of the one that an address names. */
+function cellSections(board, row, chosen) {
+  const cell = chosenCell(row, chosen);
+  return [
+    section("Cells", "cells", heat(board, row, cell),
+      element("p", { class: "note" }, "Choose a cell to see its curves below.")),
+    section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell", cellPart(board, row, cell)),
   ];
 }
 

@@ -2,7 +2,10 @@
 // `#/compare/ROW/ROW[/PLACE/ANOMALY]` two rows, `#/power`, `#/cost` and `#/heat` the overviews.
 
 const PAGES = {
-  detector: { find: ([id]) => ROWS.get(id), parts: ({ row }) => [row.part], draw: ({ board, row }, [, ...cell]) => detectorPage(board, row, cell), title: ({ row }) => row.label },
+  detector: {
+    find: ([id]) => ROWS.get(id), parts: ({ row }) => [row.part], draw: ({ board, row }, [, ...cell]) => detectorPage(board, row, cell),
+    again: ({ board, row }, [, ...cell]) => cellSections(board, row, cell), title: ({ row }) => row.label,
+  },
   compare: {
     find: ([one, other]) => pairOf(one, other), parts: ({ rows }) => rows.map((row) => row.part),
     draw: ({ board, rows }, [, , ...cell]) => pairPage(board, rows, cell), title: ({ rows }) => rows.map((row) => row.label).join(" and "),
@@ -51,7 +54,10 @@ async function route() {
     }
     if (own !== turn) return;
   }
-  place.replaceChildren(...[page.draw(found, rest)].flat().filter(Boolean));
+  if (page.again && shown === rest[0] && document.getElementById("cell")) {
+    // Another cell of the same row: what is below stays, which with hundreds of rows is long.
+    for (const node of page.again(found, rest)) document.getElementById(node.id).replaceWith(node);
+  } else place.replaceChildren(...[page.draw(found, rest)].flat().filter(Boolean));
   const id = [view, ...rest.slice(0, view === "compare" ? 2 : 1)].join("/");
   if (shown !== id && shown !== rest[0]) {
     window.scrollTo(0, 0);
