@@ -181,6 +181,7 @@ class NetworkDetector(StorableWindowDetector):
             mean_sampling=False,
             seed=self.seed,
             scale=still,
+            longest=max(map(len, held_out)) - 1,
         )
         found = np.concatenate(forecaster.distances(held_out)).mean(0)
         residual: NDArray[np.float32] = np.maximum(found, LEAST).astype(np.float32)

@@ -51,7 +51,8 @@ def arrange(rows: Sequence[NDArray[np.float32]], window: int) -> Tensor:
 class Forecaster:
     """Forecasts at horizon h by M samples, with or without mean sampling; the seed keys levels.
 
-    With `scale`, (D,), the distance is that of a point forecast, in these units.
+    With `scale`, (D,), the distance is that of a point forecast, in these units. Episodes of up to
+    `longest` transitions are forecast quickest.
     """
 
     @torch.no_grad()
@@ -64,6 +65,7 @@ class Forecaster:
         mean_sampling: bool,
         seed: int,
         scale: NDArray[np.float32] | None = None,
+        longest: int = LONGEST,
     ) -> None:
         self.network, self.horizon, self.samples, self.seed = network, horizon, samples, seed
         self.scale = None if scale is None else torch.from_numpy(scale).to(network.device)
@@ -72,7 +74,7 @@ class Forecaster:
         alone = mean_sampling or horizon == 1 or self.table is None
         self.width = 1 if alone else samples
         """Rollouts of every time, R."""
-        self.kept = self._kept() if horizon == 1 and self.table is not None else None
+        self.kept = self._kept(longest) if horizon == 1 and self.table is not None else None
 
     @torch.no_grad()
     def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:
@@ -147,11 +149,11 @@ class Forecaster:
             return None
         return self.network.heads_from(levels[0], self.table)
 
-    def _kept(self) -> Tensor:
+    def _kept(self, longest: int) -> Tensor:
         """Output layers of the first times, as many as `KEPT` holds: (C, K, H, N * P)."""
         a, k = self.network.architecture, len(self.network.first)
         width = self.samples * a.outputs
-        count = min(LONGEST, KEPT // (4 * k * width * a.units))
+        count = min(longest, KEPT // (4 * k * width * a.units))
         # As `heads_from` lays them out: other layouts round otherwise.
         kept = torch.empty(count, k, width, a.units, device=self.network.device).transpose(2, 3)
         for start in range(0, count, 32):
