@@ -52,7 +52,7 @@ class Forecaster:
     """Forecasts at horizon h by M samples, with or without mean sampling; the seed keys levels.
 
     With `scale`, (D,), the distance is that of a point forecast, in these units. Episodes of up to
-    `longest` transitions are forecast quickest.
+    `longest` transitions, by default `LONGEST`, are forecast quickest.
     """
 
     @torch.no_grad()
@@ -65,7 +65,7 @@ class Forecaster:
         mean_sampling: bool,
         seed: int,
         scale: NDArray[np.float32] | None = None,
-        longest: int = LONGEST,
+        longest: int | None = None,
     ) -> None:
         self.network, self.horizon, self.samples, self.seed = network, horizon, samples, seed
         self.scale = None if scale is None else torch.from_numpy(scale).to(network.device)
@@ -149,11 +149,11 @@ class Forecaster:
             return None
         return self.network.heads_from(levels[0], self.table)
 
-    def _kept(self, longest: int) -> Tensor:
+    def _kept(self, longest: int | None) -> Tensor:
         """Output layers of the first times, as many as `KEPT` holds: (C, K, H, N * P)."""
         a, k = self.network.architecture, len(self.network.first)
         width = self.samples * a.outputs
-        count = min(longest, KEPT // (4 * k * width * a.units))
+        count = min(longest or LONGEST, KEPT // (4 * k * width * a.units))
         # As `heads_from` lays them out: other layouts round otherwise.
         kept = torch.empty(count, k, width, a.units, device=self.network.device).transpose(2, 3)
         for start in range(0, count, 32):
