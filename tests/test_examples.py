@@ -99,11 +99,14 @@ def test_the_notebook_prints_what_is_stored_in_it(capsys):
     for library in ("matplotlib", "pandas", "torch"):
         pytest.importorskip(library)
     notebook = json.loads((EXAMPLE.parent / "notebook.ipynb").read_text(encoding="utf-8"))
+    # One network of three, with two fifths of its updates, tells the same.
+    quicker = '"updates": 500}', '"updates": 200, "members": 1}'
+    assert any(quicker[0] in line for cell in notebook["cells"] for line in cell["source"])
     space = {}
     for cell in notebook["cells"]:
         if cell["cell_type"] != "code":
             continue
-        *body, last = ast.parse("".join(cell["source"])).body
+        *body, last = ast.parse("".join(cell["source"]).replace(*quicker)).body
         shown = isinstance(last, ast.Expr)
         exec(compile(ast.Module([*body, *([] if shown else [last])], []), "cell", "exec"), space)  # noqa: S102
         value = eval(compile(ast.Expression(last.value), "cell", "eval"), space) if shown else None  # noqa: S307
