@@ -177,7 +177,7 @@ def _end_children() -> None:
 
 
 def _made(request: dict[str, Any]) -> Detector:
-    gc.disable()  # It would visit all that PyTorch consists of, a tenth of the time to import it.
+    gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
     spec = offer_of(request["plugin"], request["detector"]).spec
     given = {name: request[name] for name in ("seed", "horizon", "parameters")}
     detector = make_detector(spec.factory, **given)
