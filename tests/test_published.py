@@ -19,6 +19,7 @@ from oodd_eval.leaderboard.placing import neighbours, place, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.ladder import FOUND
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
@@ -116,6 +117,22 @@ def test_further_suites_are_read_apart_from_the_boards(board, tmp_path):
     assert len(own.records) == sum(len(s.records) for s in board.ranks.standings)
     assert [*found.suites] == ["graded"]
     assert [str(r.cell) for r in found.suites["graded"].records] == [str(one.cell)]
+
+
+def test_show_prints_further_suites_unless_one_board_is_asked_for(
+    board, tmp_path, monkeypatch, capsys
+):
+    rung = row("graded-one", 0.9, strength="kept99")
+    lines = (published.slim(r, ["auc_matched", FOUND], suite="graded").to_json() for r in rung)
+    place = tmp_path / published.PUBLISHED
+    place.write_bytes(published_bytes([board], "".join(f"{line}\n" for line in lines)))
+    monkeypatch.setattr(published, "published_file", lambda: place)
+    assert main(["leaderboard", "show"]) == 0
+    boards, suite = capsys.readouterr().out.split("Suite graded, digest")
+    assert "graded-one" in suite
+    assert "graded-one" not in boards
+    assert main(["leaderboard", "show", "--split", "mini"]) == 0
+    assert "graded" not in capsys.readouterr().out
 
 
 def test_the_rankings_of_the_file_are_those_of_the_board(board, shipped):
