@@ -61,9 +61,11 @@ def timed(place):
         suites = started(lambda: suite_parts(place))
         entries = read_entries(place / "results")
         build(
-            entries, Path(output), suites,
+            entries,
+            Path(output),
+            suites,
             on_part=lambda name: marks.append((name, time.perf_counter())),
-        )  # fmt: skip
+        )
     marks.append(("", time.perf_counter()))
     parts = {name: marks[i + 1][1] - at for i, (name, at) in enumerate(marks[:-1])}
     return marks[-1][1] - marks[0][1], _cpu() - cpu, parts

@@ -81,8 +81,18 @@ def measured(split, environment, updates):
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     at_fit = of_update * whole / fit / np.mean(rates)
     at_batch = of_row / (batch * 1e-6) / double
-    return [environment, fit, of_update / 1e9, at_fit, batch, of_row / 1e6, at_batch, stream,
-            1e6 * float(np.quantile(waits, 0.99)), memory]  # fmt: skip
+    return [
+        environment,
+        fit,
+        of_update / 1e9,
+        at_fit,
+        batch,
+        of_row / 1e6,
+        at_batch,
+        stream,
+        1e6 * float(np.quantile(waits, 0.99)),
+        memory,
+    ]
 
 
 def main():
@@ -94,10 +104,25 @@ def main():
     torch.set_num_threads(1)
     chosen = select("environment", args.env, ENVIRONMENTS)
     rows = [measured(args.split, e, args.updates) for e in chosen]
-    heads = ["", "fit, s", "GFLOP an update", "of peak", "batch, us a row", "MFLOP a row",
-             "of peak", "streamed, us", "99 %, us", "memory, MB"]  # fmt: skip
-    print(tabulate(rows, heads, floatfmt=("", ".0f", ".2f", ".2f", ".0f", ".2f", ".2f", ".0f",
-                                          ".0f", ".0f")))  # fmt: skip
+    heads = [
+        "",
+        "fit, s",
+        "GFLOP an update",
+        "of peak",
+        "batch, us a row",
+        "MFLOP a row",
+        "of peak",
+        "streamed, us",
+        "99 %, us",
+        "memory, MB",
+    ]
+    print(
+        tabulate(
+            rows,
+            heads,
+            floatfmt=("", ".0f", ".2f", ".2f", ".0f", ".2f", ".2f", ".0f", ".0f", ".0f"),
+        )
+    )
     worst = {"fit": 1, "batch": 4, "stream": 7, "memory": 9}
     above = [n for n, column in worst.items() if max(r[column] for r in rows) > LIMITS[n]]
     print("above the limit:", ", ".join(f"{n} ({LIMITS[n]:g})" for n in above) or "nothing")

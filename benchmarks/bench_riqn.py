@@ -129,9 +129,14 @@ def line(name, rounds, work, released, *, slow=False):
     times = f"{statistics.median(r[0] / r[1] for r in rounds):,.0f}" if slow else ""
     gigaflops = f"{fast * work / 1e9:.1f}"
     return [
-        name, f"{fast:,.0f}", times, f"{fast / released:,.1f}",
-        f"{work / 1e6:.2f}", gigaflops, f"{share:.0%}",
-    ]  # fmt: skip
+        name,
+        f"{fast:,.0f}",
+        times,
+        f"{fast / released:,.1f}",
+        f"{work / 1e6:.2f}",
+        gigaflops,
+        f"{share:.0%}",
+    ]
 
 
 def main():
@@ -139,11 +144,14 @@ def main():
     architecture = Architecture(SENSORS)
     rows = [
         line(
-            f"score, Δ = {h}", list(scoring(h)), flops_scoring(architecture, h), RELEASED[h],
+            f"score, Δ = {h}",
+            list(scoring(h)),
+            flops_scoring(architecture, h),
+            RELEASED[h],
             slow=True,
         )
         for h in (1, 10)
-    ]  # fmt: skip
+    ]
     rounds = list(training())
     # A backward pass costs two forward passes.
     work = 3 * flops_forward(architecture, riqn(seed=0, horizon=1).schedule.levels)

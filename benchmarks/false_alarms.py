@@ -29,8 +29,10 @@ from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.fits import FitStore
 from oodd_eval.scoring.plan import make_unit
 
-ROWS = ("random,clock,comb,persistence,range,mahalanobis,mewma,mewma-a,rf,rf-ewma,"
-        "npn,n-riqn,riqn,riqn-r,pe,pe-a,pe-step,pe-step-a")  # fmt: skip
+ROWS = (
+    "random,clock,comb,persistence,range,mahalanobis,mewma,mewma-a,rf,rf-ewma,"
+    "npn,n-riqn,riqn,riqn-r,pe,pe-a,pe-step,pe-step-a"
+)
 
 
 def fresh_episodes(environment, n, base, cap):
@@ -95,19 +97,26 @@ def main():
                     alarms, rank, n, _ = found
                     most = betabinom.ppf(0.975, options.episodes, n + 1 - rank, rank)
                     share = alarms / options.episodes
-                    print(f"{environment:12} {name:12} {suffix:9} {share:.3f} "
-                          f"(at most {most / options.episodes:.3f})", flush=True)  # fmt: skip
+                    print(
+                        f"{environment:12} {name:12} {suffix:9} {share:.3f} "
+                        f"(at most {most / options.episodes:.3f})",
+                        flush=True,
+                    )
     wrong = []
     rng = np.random.default_rng(0)
     print("\nmean over environments")
     for (name, suffix), cells in table.items():
         m = options.episodes
-        drawn = sum(betabinom.rvs(m, n + 1 - k, k, size=200_000, random_state=rng)
-                    for _, k, n, _ in cells.values()) / (m * len(cells))  # fmt: skip
+        drawn = sum(
+            betabinom.rvs(m, n + 1 - k, k, size=200_000, random_state=rng)
+            for _, k, n, _ in cells.values()
+        ) / (m * len(cells))
         most = float(np.quantile(drawn, 1 - 0.025 / len(table)))
         mean = float(np.mean([found[0] for found in cells.values()])) / m
-        above = sum(found[0] > betabinom.ppf(0.975, m, found[2] + 1 - found[1], found[1])
-                    for found in cells.values())  # fmt: skip
+        above = sum(
+            found[0] > betabinom.ppf(0.975, m, found[2] + 1 - found[1], found[1])
+            for found in cells.values()
+        )
         many = above > binom.ppf(1 - 0.025 / len(table), len(cells), 0.025)
         wrong += [(name, suffix)] if mean > most or many else []
         print(

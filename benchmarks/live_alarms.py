@@ -80,12 +80,27 @@ def main():
         inside = most_often <= promised.high and least_often >= promised.low
         wrong |= alarms > most or not inside
         mean = f"{60 * hours / count:.1f}" if count else f"above {60 * hours:.0f}"
-        table.append([environment, f"{100 * alarms / n:.1f}", f"{100 * most / n:.1f}", count, mean,
-                      f"{60 * most_often:.1f} to {60 * least_often:.1f}",
-                      f"{60 * promised.low:.1f} to {60 * promised.high:.1f}"])  # fmt: skip
+        table.append(
+            [
+                environment,
+                f"{100 * alarms / n:.1f}",
+                f"{100 * most / n:.1f}",
+                count,
+                mean,
+                f"{60 * most_often:.1f} to {60 * least_often:.1f}",
+                f"{60 * promised.low:.1f} to {60 * promised.high:.1f}",
+            ]
+        )
         print(table[-1], flush=True)
-    heads = ["", "episodes with an alarm (%)", "at most", "alarms without end",
-             "minutes between them", "their interval", "promised: 3, within"]  # fmt: skip
+    heads = [
+        "",
+        "episodes with an alarm (%)",
+        "at most",
+        "alarms without end",
+        "minutes between them",
+        "their interval",
+        "promised: 3, within",
+    ]
     print(tabulate(table, heads, tablefmt="github"))
     return int(wrong)
 

@@ -88,8 +88,10 @@ def main():
         shares, false = measured(
             environment, options.detector, options.kept, options.split, options.stamps
         )
-        cells = [f"{100 * f:.0f}" + ("" if np.isnan(n) else f" / {100 * n:.0f}")
-                 for f, n in shares.values()]  # fmt: skip
+        cells = [
+            f"{100 * f:.0f}" + ("" if np.isnan(n) else f" / {100 * n:.0f}")
+            for f, n in shares.values()
+        ]
         table.append([environment, *cells, f"{100 * false:.0f}"])
         named = [n for kind, (_, n) in shares.items() if kind != "swapped" and not np.isnan(n)]
         worst = min(worst, *(f for f, _ in shares.values()), *named)

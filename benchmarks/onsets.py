@@ -46,10 +46,16 @@ def main():
                             near[record.detector, place, group].append(found)
     groups = [*GROUPS, "all"]
     rows = [
-        [detector, place, *(100 * np.mean(near[detector, place, g]) if near[detector, place, g]
-                            else None for g in groups)]
+        [
+            detector,
+            place,
+            *(
+                100 * np.mean(near[detector, place, g]) if near[detector, place, g] else None
+                for g in groups
+            ),
+        ]
         for detector, place in dict.fromkeys(key[:2] for key in list(near))
-    ]  # fmt: skip
+    ]
     print(tabulate(rows, ["detector", "environment", *groups], floatfmt=".1f", tablefmt="github"))
 
 

@@ -28,11 +28,17 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
 
 ELSEWHERE = (
-    "CHANGELOG.md", "CONTRIBUTING.md", "detectors/**/*.md", "examples/**/*.md",
-    "leaderboard/README.md", "leaderboard/reproduction/*/README.md",
-    "leaderboard/reproduction/*/figures/*", "leaderboard/reproduction/*/*.csv",
-    "leaderboard/reproduction/*/tables/*.csv", "training/README.md",
-)  # fmt: skip
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "detectors/**/*.md",
+    "examples/**/*.md",
+    "leaderboard/README.md",
+    "leaderboard/reproduction/*/README.md",
+    "leaderboard/reproduction/*/figures/*",
+    "leaderboard/reproduction/*/*.csv",
+    "leaderboard/reproduction/*/tables/*.csv",
+    "training/README.md",
+)
 """Files outside docs/ that are part of the site, under the same paths."""
 
 BOARD = "leaderboard/site"

@@ -120,8 +120,11 @@ def draw(path, watchdog, onset, anomalous, nominal):
     # The pole soon falls far outside: what matters is where the threshold is passed.
     below.set(ylabel="statistic, alarm at ▾", yscale="symlog")
     above.set(ylabel="score", yscale="symlog")
-    handles = {label: line for axes in (above, below)
-               for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}  # fmt: skip
+    handles = {
+        label: line
+        for axes in (above, below)
+        for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=120)
 
@@ -193,9 +196,13 @@ def main(arguments=None):
     monitor = TerminalMonitor(options.detector) if options.monitor else contextlib.nullcontext()
     with monitor as shown:
         anomalous = run(
-            watchdog, policy, **episode, onset=options.onset,
-            render=bool(options.plot or options.gif), show=shown and shown.update,
-        )  # fmt: skip
+            watchdog,
+            policy,
+            **episode,
+            onset=options.onset,
+            render=bool(options.plot or options.gif),
+            show=shown and shown.update,
+        )
     micros = 1e6 * np.median(anomalous.seconds)
     print(f"{len(anomalous.readings)} observations, {micros:.0f} µs for a step and its reading")
     if options.plot:

@@ -20,16 +20,38 @@ if TYPE_CHECKING:
     from oodd_eval.plugins.explanations import Explanation
     from oodd_eval.testing import check_detector
 
-__all__ = ["AnomalySpec", "Attribute", "Detector", "DetectorSpec", "EnvironmentSpec",
-           "Explanation", "Quantity", "Trajectory", "__version__", "check_detector", "evaluate",
-           "hookimpl", "load_results", "load_split"]  # fmt: skip
+__all__ = [
+    "AnomalySpec",
+    "Attribute",
+    "Detector",
+    "DetectorSpec",
+    "EnvironmentSpec",
+    "Explanation",
+    "Quantity",
+    "Trajectory",
+    "__version__",
+    "check_detector",
+    "evaluate",
+    "hookimpl",
+    "load_results",
+    "load_split",
+]
 
-_HOMES = {"AnomalySpec": "data.own", "Attribute": "data.own", "EnvironmentSpec": "data.own",
-          "Quantity": "data.facts",
-          "Detector": "plugins.contract", "DetectorSpec": "plugins.contract",
-          "Explanation": "plugins.explanations", "Trajectory": "data.trajectory",
-          "check_detector": "testing", "evaluate": "api", "hookimpl": "plugins",
-          "load_results": "api", "load_split": "data.split"}  # fmt: skip
+_HOMES = {
+    "AnomalySpec": "data.own",
+    "Attribute": "data.own",
+    "EnvironmentSpec": "data.own",
+    "Quantity": "data.facts",
+    "Detector": "plugins.contract",
+    "DetectorSpec": "plugins.contract",
+    "Explanation": "plugins.explanations",
+    "Trajectory": "data.trajectory",
+    "check_detector": "testing",
+    "evaluate": "api",
+    "hookimpl": "plugins",
+    "load_results": "api",
+    "load_split": "data.split",
+}
 
 
 def __getattr__(name: str) -> object:

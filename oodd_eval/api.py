@@ -29,12 +29,19 @@ Tried: TypeAlias = str | DetectorSpec | Detector | Callable[..., Detector]
 
 
 def evaluate(
-    detector: Tried | Sequence[Tried], split: str | Path | Split = "mini", *,
-    environments: str | Sequence[str] = "all", anomalies: str | Sequence[str] = "all",
-    horizon: int = 1, seed: int | Sequence[int] = 0,
-    parameters: Mapping[str, Any] | None = None, limit: int | None = None,
-    output: str | Path | None = None, jobs: int | None = None, progress: bool = False,
-) -> Results:  # fmt: skip
+    detector: Tried | Sequence[Tried],
+    split: str | Path | Split = "mini",
+    *,
+    environments: str | Sequence[str] = "all",
+    anomalies: str | Sequence[str] = "all",
+    horizon: int = 1,
+    seed: int | Sequence[int] = 0,
+    parameters: Mapping[str, Any] | None = None,
+    limit: int | None = None,
+    output: str | Path | None = None,
+    jobs: int | None = None,
+    progress: bool = False,
+) -> Results:
     """Evaluate detectors and return a record per cell, with the scores behind them.
 
     Parameters
@@ -97,10 +104,16 @@ def evaluate(
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
     where, kinds = opened.select(_listed(environments), _listed(anomalies))
     plan = make_plan(
-        plugins, split=opened, detectors=names, environments=where, anomalies=kinds,
+        plugins,
+        split=opened,
+        detectors=names,
+        environments=where,
+        anomalies=kinds,
         horizons=[horizon],
-        seeds=[seed] if isinstance(seed, int) else list(seed), parameters=given, limit=limit,
-    )  # fmt: skip
+        seeds=[seed] if isinstance(seed, int) else list(seed),
+        parameters=given,
+        limit=limit,
+    )
     place = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)
     directory = ResultsDirectory(place)
     try:

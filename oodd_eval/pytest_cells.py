@@ -176,9 +176,13 @@ def _plan(
         environments = select("environment", envs, split.environments)
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
     plan = make_plan(
-        plugins, split=split, detectors=names, environments=environments,
-        horizons=sorted(horizons) or [1], seeds=sorted(seeds) or [0],
-    )  # fmt: skip
+        plugins,
+        split=split,
+        detectors=names,
+        environments=environments,
+        horizons=sorted(horizons) or [1],
+        seeds=sorted(seeds) or [0],
+    )
     labels = {cell.label for cell in cells}
     wanted = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
     return plan.matching(wanted.__contains__)
@@ -186,7 +190,13 @@ def _plan(
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
     found = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
-    options = {"detector": record.detector, "env": record.environment, "anomaly": record.condition,
-               "split": record.split, "horizon": record.horizon, "seed": record.seed}  # fmt: skip
+    options = {
+        "detector": record.detector,
+        "env": record.environment,
+        "anomaly": record.condition,
+        "split": record.split,
+        "horizon": record.horizon,
+        "seed": record.seed,
+    }
     command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
     return f"{found}\nthe reference is {where}; to run this cell alone:\n{command}"

@@ -20,9 +20,20 @@ from oodd_eval.names import check_known
 from oodd_eval.plugins.conformance import CHECKS, Check, Report, Result, carry_out, expected
 from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
 
-__all__ = ["Check", "CheckFailedError", "CheckSkipped", "NonConformingError", "Report", "Result",
-           "Trial", "check_detector", "detector_checks", "pytest_generate_tests", "run_checks",
-           "test_contract"]  # fmt: skip
+__all__ = [
+    "Check",
+    "CheckFailedError",
+    "CheckSkipped",
+    "NonConformingError",
+    "Report",
+    "Result",
+    "Trial",
+    "check_detector",
+    "detector_checks",
+    "pytest_generate_tests",
+    "run_checks",
+    "test_contract",
+]
 
 
 class NonConformingError(ContractError, AssertionError):

@@ -37,9 +37,15 @@ NOMINAL, ANOMALOUS, ONSET, ALARM = GREY, "#D55E00", GREY, "#2E86C1"
 
 LADDER = Path(__file__).parents[2] / "leaderboard" / "suites" / "ladder"
 DRAWN = {
-    "pe-a": "#D55E00", "pe": "#C9820A", "mewma-a": "#2E86C1", "riqn-r": "#B0569B", "npn": "#13916B",
-    "riqn": "#7A6FD0", "rf": "#A0703C", "persistence": GREY,
-}  # fmt: skip
+    "pe-a": "#D55E00",
+    "pe": "#C9820A",
+    "mewma-a": "#2E86C1",
+    "riqn-r": "#B0569B",
+    "npn": "#13916B",
+    "riqn": "#7A6FD0",
+    "rf": "#A0703C",
+    "persistence": GREY,
+}
 """Rows of the README's figure: the best, those of the paper, and one that knows nothing."""
 
 STYLE = {
@@ -97,9 +103,13 @@ def mark_onset(axes: Axes, onset: int, name: str = "onset") -> None:
     """Draw the line that separates nominal from anomalous."""
     axes.axvline(onset, color=ONSET, linewidth=1, linestyle="--")
     axes.annotate(
-        name, (onset, 1), xycoords=("data", "axes fraction"), xytext=(4, 1),
-        textcoords="offset points", fontsize=8,
-    )  # fmt: skip
+        name,
+        (onset, 1),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, 1),
+        textcoords="offset points",
+        fontsize=8,
+    )
 
 
 def widest_gap(found: AnomalousSet, data: EnvironmentData) -> int:
@@ -161,17 +171,28 @@ def draw_alarms(data: EnvironmentData, mewma: Scored) -> Figure:
             early, late = raised[raised < onset], raised[raised >= onset]
             for at, style, name in ((early, "none", "false alarm"), (late, ALARM, "alarm")):
                 below.scatter(
-                    at, np.full(len(at), -0.8), marker="^", s=26, edgecolors=ALARM,
-                    facecolors=style, linewidths=0.9, label=name,
-                )  # fmt: skip
+                    at,
+                    np.full(len(at), -0.8),
+                    marker="^",
+                    s=26,
+                    edgecolors=ALARM,
+                    facecolors=style,
+                    linewidths=0.9,
+                    label=name,
+                )
             delay = int(first_delay(alarms, onset))
     above.axhline(rule.drift / UNIT, color=GREY, lw=0.8, ls=":")
     below.axhline(rule.threshold / UNIT, color=GREY, lw=0.8, ls=":")
     for axes, name, height in ((above, "drift", rule.drift), (below, "threshold", rule.threshold)):
         axes.annotate(
-            name, (0, height / UNIT), xycoords=("axes fraction", "data"), fontsize=8,
-            xytext=(3, 2), textcoords="offset points", color=GREY,
-        )  # fmt: skip
+            name,
+            (0, height / UNIT),
+            xycoords=("axes fraction", "data"),
+            fontsize=8,
+            xytext=(3, 2),
+            textcoords="offset points",
+            color=GREY,
+        )
         mark_onset(axes, onset)
     above.set_title("Standardized score of the detector mewma", pad=14)
     above.set_ylabel("standard deviations")
@@ -203,8 +224,13 @@ def draw_clock(data: EnvironmentData, mewma: Scored) -> Figure:
         left.plot(before, anomalous[:onset], color=ALARM, lw=1.6, label="before the onset")
         left.plot(after, anomalous[onset:stop], color=ANOMALOUS, lw=1.6, label="from the onset on")
         left.set_title(f"{name}: paper's AUC {own:.0f} %", pad=14)
-        right.plot(after, twin[onset:stop], color=NOMINAL, lw=3.2 if name == "clock" else 1.6,
-                   label="nominal twin")  # fmt: skip
+        right.plot(
+            after,
+            twin[onset:stop],
+            color=NOMINAL,
+            lw=3.2 if name == "clock" else 1.6,
+            label="nominal twin",
+        )
         right.plot(after, anomalous[onset:stop], color=ANOMALOUS, lw=1.6, label="anomalous")
         right.set_title(f"{name}: matched AUC {matched:.0f} %", pad=14)
         left.set_ylabel("score")
@@ -255,11 +281,22 @@ def draw_power() -> Figure:
     for name, colour in DRAWN.items():
         own = [r for r in records if str(r.setting) == name]
         points = curve(own, FOUND)
-        axes.plot([p.strength for p in points], [100 * p.value for p in points],
-                  color=colour, lw=1.8, label=name)  # fmt: skip
+        axes.plot(
+            [p.strength for p in points],
+            [100 * p.value for p in points],
+            color=colour,
+            lw=1.8,
+            label=name,
+        )
     axes.axvline(1, color=GREY, lw=1, ls="--")
-    axes.annotate("costs 1 % of the return", (1, 0.02), xycoords=("data", "axes fraction"),
-                  xytext=(4, 0), textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.annotate(
+        "costs 1 % of the return",
+        (1, 0.02),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, 0),
+        textcoords="offset points",
+        fontsize=8,
+    )
     axes.set_xscale("log")
     axes.set_ylim(0, 100)
     axes.set_xlabel("strength of the anomaly")

@@ -60,9 +60,15 @@ class Parser(argparse.ArgumentParser):
         add("-q", action="store_const", const=-1, help="print less")
         add("-v", action="store_const", const=1, help="print more, and tracebacks of errors")
         if plugins:
-            self.add_argument("-p", dest="disabled", action="append", default=[], metavar="no:NAME",
-                              type=value(left_out),
-                              help="leave a plug-in out (see also OODD_EVAL_PLUGINS)")  # fmt: skip
+            self.add_argument(
+                "-p",
+                dest="disabled",
+                action="append",
+                default=[],
+                metavar="no:NAME",
+                type=value(left_out),
+                help="leave a plug-in out (see also OODD_EVAL_PLUGINS)",
+            )
         return self.add_argument
 
     def error(self, message: str) -> NoReturn:
@@ -113,25 +119,49 @@ def at_least(least: int) -> Callable[[str], int]:
 
 def add_detector(add: Add) -> None:
     """Add the options that say how detectors are made."""
-    add("--param", action="append", default=[], metavar="K=V", type=value(parameter),
-        help="a parameter of the detector, V in JSON or plain text")  # fmt: skip
-    add("--horizon", default="1", metavar="N,...", type=value(partial(whole_numbers, least=1)),
-        help="prediction horizons (default: 1)")  # fmt: skip
+    add(
+        "--param",
+        action="append",
+        default=[],
+        metavar="K=V",
+        type=value(parameter),
+        help="a parameter of the detector, V in JSON or plain text",
+    )
+    add(
+        "--horizon",
+        default="1",
+        metavar="N,...",
+        type=value(partial(whole_numbers, least=1)),
+        help="prediction horizons (default: 1)",
+    )
 
 
 def add_limits(add: Add, what: str, timeout: str) -> None:
     """Add the options that limit a process."""
-    add("--timeout", default=timeout, type=value(seconds), metavar="TIME",
-        help=f"wall-clock time of {what} (default: {timeout})")  # fmt: skip
-    add("--memory", default="8GB", type=value(memory_bytes),
-        help=f"resident memory of {what} (default: 8GB)")  # fmt: skip
+    add(
+        "--timeout",
+        default=timeout,
+        type=value(seconds),
+        metavar="TIME",
+        help=f"wall-clock time of {what} (default: {timeout})",
+    )
+    add(
+        "--memory",
+        default="8GB",
+        type=value(memory_bytes),
+        help=f"resident memory of {what} (default: 8GB)",
+    )
 
 
 def add_resources(add: Add, *, timeout: str) -> None:
     """Add the options that say where fits are carried out and within which limits."""
     add("--jobs", type=at_least(1), metavar="N", help="fits at a time (default: one per core)")
-    add("--device", choices=("auto", "cpu", "cuda"), metavar="auto|cpu|cuda",
-        help="where networks compute: the parameter device of detectors that have it")  # fmt: skip
+    add(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        metavar="auto|cpu|cuda",
+        help="where networks compute: the parameter device of detectors that have it",
+    )
     add_limits(add, "a fit with its scores", timeout)
 
 

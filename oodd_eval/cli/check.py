@@ -14,8 +14,13 @@ from oodd_eval.plugins.conformance.supervise import supervise
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
 
-_STYLES: Final = {"passed": "green", "failed": "bold red", "skipped": "dim",
-                  "xfailed": "yellow", "xpassed": "bold red"}  # fmt: skip
+_STYLES: Final = {
+    "passed": "green",
+    "failed": "bold red",
+    "skipped": "dim",
+    "xfailed": "yellow",
+    "xpassed": "bold red",
+}
 
 
 def define(parser: Parser) -> None:

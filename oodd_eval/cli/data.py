@@ -133,17 +133,24 @@ def build(options: argparse.Namespace) -> int:
 
 
 def record_split(
-    definition: SplitDefinition, options: argparse.Namespace,
-    environments: Sequence[str] = tuple(ENVIRONMENTS), output: Path | None = None,
-) -> None:  # fmt: skip
+    definition: SplitDefinition,
+    options: argparse.Namespace,
+    environments: Sequence[str] = tuple(ENVIRONMENTS),
+    output: Path | None = None,
+) -> None:
     """Record a split, by default of all environments and where splits are found."""
     # Other actions need no simulators.
     from oodd_eval.data.simulate.build import build_split
 
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
-    build_split(definition, directory, environments=environments, jobs=options.jobs,
-                progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"))  # fmt: skip
+    build_split(
+        definition,
+        directory,
+        environments=environments,
+        jobs=options.jobs,
+        progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"),
+    )
     split = load_split(directory)
     make_console().print(f"split {split.name}, digest {split.digest}, in {directory}")
 
@@ -151,8 +158,12 @@ def record_split(
 def _definition(options: argparse.Namespace) -> SplitDefinition:
     """Return the definition of a published split, or of one with sizes of its own."""
     name, cap = options.name, options.cap
-    sizes = {"train": options.train, "calibration": options.calibration, "test": options.test,
-             "seed-base": options.seed_base}  # fmt: skip
+    sizes = {
+        "train": options.train,
+        "calibration": options.calibration,
+        "test": options.test,
+        "seed-base": options.seed_base,
+    }
     others, strengths = {"cap": cap, "noise": options.noise}, dict(chain(*options.strength))
     given = [n for n, size in {**sizes, **others}.items() if size is not None]
     if name in SPLITS:
@@ -187,9 +198,15 @@ def _definition(options: argparse.Namespace) -> SplitDefinition:
             f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
     return SplitDefinition(
-        name, train, calibration, test, cap, seed_base, noise=options.noise or 0.0,
+        name,
+        train,
+        calibration,
+        test,
+        cap,
+        seed_base,
+        noise=options.noise or 0.0,
         strengths=strengths,
-    )  # fmt: skip
+    )
 
 
 def _strengths(text: str) -> list[tuple[str, float]]:
@@ -208,11 +225,19 @@ def import_logs(options: argparse.Namespace) -> int:
     """Carry out ``data import``."""
     notes = make_console(quiet=options.verbosity < 0)
     split = import_data(
-        options.name, options.env, form=options.format, train=options.train,
-        calibration=options.calibration, test=options.test, sensors=options.sensors,
-        actions=options.actions, discrete=options.discrete, groups=dict(options.group),
-        output=options.output, progress=lambda part: notes.print(f"{options.env} {part}"),
-    )  # fmt: skip
+        options.name,
+        options.env,
+        form=options.format,
+        train=options.train,
+        calibration=options.calibration,
+        test=options.test,
+        sensors=options.sensors,
+        actions=options.actions,
+        discrete=options.discrete,
+        groups=dict(options.group),
+        output=options.output,
+        progress=lambda part: notes.print(f"{options.env} {part}"),
+    )
     make_console().print(f"split {split.name}, digest {split.digest}, in {split.path}")
     return 0
 
@@ -242,10 +267,14 @@ def calibrate(options: argparse.Namespace) -> int:
     notes = make_console(quiet=options.verbosity < 0)
     work = options.work or options.output.with_name(options.output.name + ".work")
     found = find_strengths(
-        options.output, work, environments=select("environment", options.env, ENVIRONMENTS),
-        kinds=select("anomaly", options.anomaly, ANOMALIES), whole=options.whole,
-        jobs=options.jobs, progress=notes.print,
-    )  # fmt: skip
+        options.output,
+        work,
+        environments=select("environment", options.env, ENVIRONMENTS),
+        kinds=select("anomaly", options.anomaly, ANOMALIES),
+        whole=options.whole,
+        jobs=options.jobs,
+        progress=notes.print,
+    )
     count = sum(map(len, found.values()))
     make_console().print(
         f"strengths of {count} kinds in {len(found)} environments: {options.output}"
@@ -256,8 +285,12 @@ def calibrate(options: argparse.Namespace) -> int:
 def fetch(options: argparse.Namespace) -> int:
     """Carry out ``data fetch``; what an earlier call has brought is kept."""
     notes = make_console(quiet=options.verbosity < 0)
-    found = fetch_split(options.place, output=options.output, digest=options.digest,
-                        progress=lambda file: notes.print(f"{file}  verified"))  # fmt: skip
+    found = fetch_split(
+        options.place,
+        output=options.output,
+        digest=options.digest,
+        progress=lambda file: notes.print(f"{file}  verified"),
+    )
     split, there = found.split, " already" if found.already else ""
     make_console().print(f"split {split.name}, digest {split.digest}, is{there} in {split.path}")
     return 0

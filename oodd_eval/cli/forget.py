@@ -29,8 +29,7 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError("nothing to forget: expected --failed or -k EXPR")
     wanted = expression(options.expression)
     results = ResultsDirectory(options.directory)
-    gone = [r for r in results.records()
-            if wanted(str(r.cell)) and not (options.failed and r.ok)]  # fmt: skip
+    gone = [r for r in results.records() if wanted(str(r.cell)) and not (options.failed and r.ok)]
     if not gone:
         return say(f"no cell of {options.directory} is selected: nothing was removed", 5)
     results.forget(gone)

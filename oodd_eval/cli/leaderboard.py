@@ -209,8 +209,9 @@ def verify_pull_request(console: Console, results: Path, options: argparse.Names
             console.print(f"and {len(others) - MOST_SHOWN} more files")
         return say(
             f"a pull request of an entry changes {results}/NAME/ and nothing else: take the files "
-            "above out of it", 1,
-        )  # fmt: skip
+            "above out of it",
+            1,
+        )
     if refused:
         return say(f"{refused} of {len(entries)} entries are refused", 1)
     with tempfile.TemporaryDirectory() as fresh:

@@ -34,14 +34,20 @@ def run(options: argparse.Namespace) -> int:
             rows = list(_detectors(plugins))
             code = int(bool(plugins.broken))
         case "envs":
-            rows = [(e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy")
-                    for e in ENVIRONMENTS.values()]  # fmt: skip
-            rows += [(s.name, origin, f"{len(s.sensors)} sensors, its own policy")
-                     for s, origin in _own(options, EnvironmentSpec)]  # fmt: skip
+            rows = [
+                (e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy")
+                for e in ENVIRONMENTS.values()
+            ]
+            rows += [
+                (s.name, origin, f"{len(s.sensors)} sensors, its own policy")
+                for s, origin in _own(options, EnvironmentSpec)
+            ]
         case "anomalies":
             rows = [(a.id, a.group, a.summary) for a in ANOMALIES.values()]
-            rows += [(s.name, s.group, f"{s.summary} ({origin})")
-                     for s, origin in _own(options, AnomalySpec)]  # fmt: skip
+            rows += [
+                (s.name, s.group, f"{s.summary} ({origin})")
+                for s, origin in _own(options, AnomalySpec)
+            ]
         case "splits":
             rows = _splits()
         case "metrics":

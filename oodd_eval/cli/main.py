@@ -34,10 +34,13 @@ COMMANDS: Final = (
     ("leaderboard", "leaderboard", "submit, verify and show entries of the board"),
     ("data", "data", "build, import, verify, fetch and export splits"),
     ("policies", "policies", "train and evaluate nominal policies"),
-    ("reproduce", "reproduce",
-     "regenerate the paper's tables, figures and claims; resumes where it was"),
+    (
+        "reproduce",
+        "reproduce",
+        "regenerate the paper's tables, figures and claims; resumes where it was",
+    ),
     ("new", "new", "write a ready plug-in project"),
-)  # fmt: skip
+)
 
 
 def build_parser(named: Container[str] | None = None) -> Parser:

@@ -39,8 +39,13 @@ def train(options: argparse.Namespace) -> int:
     """Carry out ``policies train``, going on from a checkpoint if there is one."""
     _must_know(options)
     tell = make_console(quiet=options.verbosity < 0).print
-    best = train_policy(options.environment, out=Path(options.output), steps=options.steps,
-                        seed=options.seed, progress=tell)  # fmt: skip
+    best = train_policy(
+        options.environment,
+        out=Path(options.output),
+        steps=options.steps,
+        seed=options.seed,
+        progress=tell,
+    )
     make_console().print(f"best policy in {best}")
     return 0
 
@@ -49,8 +54,9 @@ def evaluate(options: argparse.Namespace) -> int:
     """Carry out ``policies evaluate``: mean return over fresh nominal episodes."""
     name = options.environment
     _must_know(options)
-    found = evaluate_policy(name, load_policy(name, options.policy), episodes=options.episodes,
-                            noise=options.noise)  # fmt: skip
+    found = evaluate_policy(
+        name, load_policy(name, options.policy), episodes=options.episodes, noise=options.noise
+    )
     paper = f" (paper: {ENVIRONMENTS[name].paper_return})" if name in ENVIRONMENTS else ""
     mean = f"{found.mean():.1f} ± {found.std():.1f}"
     make_console().print(f"{name}: return {mean} over {options.episodes} episodes{paper}")

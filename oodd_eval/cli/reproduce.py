@@ -96,8 +96,13 @@ def _run(options: argparse.Namespace) -> int:
     progress = Progress(left, rows, jobs, console.print if options.verbosity >= 0 else None, fitted)
     if left:
         limits = Limits(options.timeout, options.memory)
-        settings = RunSettings(jobs=jobs, limits=limits, fresh=options.fresh,
-                               deadline=options.budget, command=options.invocation)  # fmt: skip
+        settings = RunSettings(
+            jobs=jobs,
+            limits=limits,
+            fresh=options.fresh,
+            deadline=options.budget,
+            command=options.invocation,
+        )
         plan = Plan(split.name, split.digest, tuple(left), split.groups)
         outcome = carry_out(plan, split, plugins, settings, results, observers=[progress])
     say_notes(results.notes)

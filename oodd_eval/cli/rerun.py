@@ -67,9 +67,10 @@ def run(options: argparse.Namespace) -> int:
     plan = plan_of(entry, split, plugins, options.seed).matching(expression(options.expression))
     hidden = (*split_places(split), options.output) if boxed else None
     settings = RunSettings(
-        jobs=options.jobs, limits=Limits(options.timeout, options.memory, hidden),
+        jobs=options.jobs,
+        limits=Limits(options.timeout, options.memory, hidden),
         command=options.invocation,
-    )  # fmt: skip
+    )
     results, console = ResultsDirectory(place), make_console()
     reporter = TerminalReporter(console, verbosity=options.verbosity, log=results.log_path)
     done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
@@ -114,13 +115,18 @@ def plan_of(
         fits.setdefault((record.environment, record.setting, record.seed), record)
     plans = [
         make_plan(
-            plugins, split=split, detectors=[record.detector], environments=[environment],
-            horizons=[record.horizon], seeds=[seed], parameters=record.parameters,
+            plugins,
+            split=split,
+            detectors=[record.detector],
+            environments=[environment],
+            horizons=[record.horizon],
+            seeds=[seed],
+            parameters=record.parameters,
         )
         for environment in split.environments
         for (own, _, seed), record in fits.items()
         if own == environment and (seeds is None or seed in seeds)
-    ]  # fmt: skip
+    ]
     units = tuple(unit for plan in plans for unit in plan.units)
     if not units:
         raise UsageError(f"{entry.meta.id} has none of seeds {', '.join(map(str, seeds or ()))}")

@@ -68,11 +68,17 @@ def run(options: argparse.Namespace) -> int:
     split = load_split(options.split)
     environments, anomalies = split.select(options.env, options.anomaly)
     plan = make_plan(
-        plugins, split=split, detectors=plugins.select(options.detector),
-        environments=environments, anomalies=anomalies,
-        horizons=options.horizon, seeds=options.seed, parameters=dict(options.param),
-        device=options.device, limit=options.limit,
-    )  # fmt: skip
+        plugins,
+        split=split,
+        detectors=plugins.select(options.detector),
+        environments=environments,
+        anomalies=anomalies,
+        horizons=options.horizon,
+        seeds=options.seed,
+        parameters=dict(options.param),
+        device=options.device,
+        limit=options.limit,
+    )
     plan = plan.matching(expression(options.expression))
     if not plan.cells:
         return cli.say(f"no cell matches -k {options.expression!r}", 5)
@@ -89,9 +95,14 @@ def run(options: argparse.Namespace) -> int:
         require_sandbox()
         hidden = (*split_places(split), options.output)
     limits = Limits(options.timeout, options.memory, hidden)
-    settings = RunSettings(jobs=options.jobs, limits=limits, fresh=options.fresh,
-                           stop_on_failure=options.stop, executor=options.executor,
-                           command=options.invocation)  # fmt: skip
+    settings = RunSettings(
+        jobs=options.jobs,
+        limits=limits,
+        fresh=options.fresh,
+        stop_on_failure=options.stop,
+        executor=options.executor,
+        command=options.invocation,
+    )
     results = ResultsDirectory(options.output)
     reporter = TerminalReporter(
         console, verbosity=options.verbosity, intervals=options.intervals, log=results.log_path

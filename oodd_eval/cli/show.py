@@ -62,8 +62,10 @@ def run(options: argparse.Namespace) -> int:
     code = int(not all(r.ok for r in records))
     if options.csv or options.json:
         # Neither has a NaN: null in JSON, nothing in CSV.
-        rows = [{name: None if v != v else v for name, v in row.items()}  # noqa: PLR0124
-                for row in Results(records).to_rows()]  # fmt: skip
+        rows = [
+            {name: None if v != v else v for name, v in row.items()}  # noqa: PLR0124
+            for row in Results(records).to_rows()
+        ]
         print(json.dumps(rows, indent=1) + "\n" if options.json else csv_rows(rows), end="")
         return code
     if options.markdown:

@@ -64,9 +64,13 @@ class TerminalReporter:
     """
 
     def __init__(
-        self, console: Console, *, verbosity: int = 0, intervals: bool = False,
+        self,
+        console: Console,
+        *,
+        verbosity: int = 0,
+        intervals: bool = False,
         log: Callable[[str], Path] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.console, self.verbosity, self.intervals = console, verbosity, intervals
         self._log = log
         self._start = time.perf_counter()
@@ -93,9 +97,12 @@ class TerminalReporter:
         self._print(f"{len(plan.units)} fits, {len(plan.cells)} cells\n")
         if self.console.is_terminal:
             columns = (
-                BarColumn(20), MofNCompleteColumn(), TextColumn("cells, left"),
-                TimeRemainingColumn(), TextColumn("{task.description}"),
-            )  # fmt: skip
+                BarColumn(20),
+                MofNCompleteColumn(),
+                TextColumn("cells, left"),
+                TimeRemainingColumn(),
+                TextColumn("{task.description}"),
+            )
             # A fit may take minutes: the speed is that of the whole run.
             self._progress = Progress(
                 *columns, console=self.console, transient=True, speed_estimate_period=1e9

@@ -27,9 +27,12 @@ NAMESPACE: Final = "oodd"
 
 
 def export(
-    split: Split, directory: Path, *, environments: Sequence[str],
+    split: Split,
+    directory: Path,
+    *,
+    environments: Sequence[str],
     progress: Callable[[str], None] = lambda _identity: None,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Write all parts of some environments below Minari's root; return the ids of the datasets.
 
     Ids are such as ``oodd/mini/hopper/test-iid-v0``; `progress` is called with each when written.
@@ -37,8 +40,11 @@ def export(
     """
     name = re.sub(r"[^-\w]", "-", str(split.manifest["name"]))
     entries = split.manifest["environments"]
-    found = [directory / NAMESPACE / name / e / _dataset(part)
-             for e in environments for part in entries[e]["groups"]]  # fmt: skip
+    found = [
+        directory / NAMESPACE / name / e / _dataset(part)
+        for e in environments
+        for part in entries[e]["groups"]
+    ]
     if there := next((str(place) for place in found if place.exists()), None):
         raise OutputError(f"{there!r} exists: remove it, or export to another directory")
     written = []
@@ -87,18 +93,23 @@ def _write(
         if data.discrete:
             action = {"type": "Discrete", "dtype": "int64", "start": 0, "n": len(data.actions)}
         metadata = {
-            "dataset_id": identity, "minari_version": "0.5.0", "data_format": "hdf5",
-            "total_episodes": len(trajectories), "total_steps": int(trajectories.lengths.sum()),
+            "dataset_id": identity,
+            "minari_version": "0.5.0",
+            "data_format": "hdf5",
+            "total_episodes": len(trajectories),
+            "total_steps": int(trajectories.lengths.sum()),
             "dataset_size": round(file.stat().st_size / 1e6, 1),
             "observation_space": json.dumps(_box(len(data.sensors), -infinity, infinity)),
-            "action_space": json.dumps(action), "algorithm_name": policy,
+            "action_space": json.dumps(action),
+            "algorithm_name": policy,
             "author": ["The oodd-eval developers"],
             "description": f"{title_of(data.id)}, {what}: trajectories of a fixed policy "
             f"({policy}), from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
-            "oodd_eval_version": __version__, "split_digest": split.digest,
+            "oodd_eval_version": __version__,
+            "split_digest": split.digest,
             "sensors": [dataclasses.asdict(quantity) for quantity in data.sensors],
             "actions": [dataclasses.asdict(quantity) for quantity in data.actions],
-        }  # fmt: skip
+        }
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
         made.chmod(0o755)  # temporary directories are their maker's alone
         made.rename(place)

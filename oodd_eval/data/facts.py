@@ -133,8 +133,11 @@ class SplitDefinition:
 
 
 _LATER: Final[dict[str, Any]] = {
-    "suite": "table1", "base": "", "noise": 0.0, "strengths": {},
-}  # fmt: skip  # older manifests lack these
+    "suite": "table1",
+    "base": "",
+    "noise": 0.0,
+    "strengths": {},
+}  # older manifests lack these
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 

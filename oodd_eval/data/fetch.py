@@ -38,8 +38,17 @@ PATIENCE: Final = 60.0
 SLOWEST: Final = 4096
 """Seconds in which a download may be slow, and the bytes a second that it must have later."""
 _MIB: Final = 2**20
-_DAMAGED: Final = (EOFError, ValueError, OverflowError, RuntimeError, NotImplementedError,
-                   zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)  # fmt: skip
+_DAMAGED: Final = (
+    EOFError,
+    ValueError,
+    OverflowError,
+    RuntimeError,
+    NotImplementedError,
+    zlib.error,
+    lzma.LZMAError,
+    tarfile.TarError,
+    zipfile.BadZipFile,
+)
 
 Progress = Callable[[str], None]
 Source = Callable[[str, Path, int], None]
@@ -54,9 +63,12 @@ class Fetched(NamedTuple):
 
 
 def fetch(
-    place: str, *, output: Path | None = None, digest: str | None = None,
+    place: str,
+    *,
+    output: Path | None = None,
+    digest: str | None = None,
     progress: Progress = lambda _file: None,
-) -> Fetched:  # fmt: skip
+) -> Fetched:
     """Fetch a split and install it in `output`, by default its name below `data_home`.
 
     One with another digest than a given one is refused. `progress` is called with the name of each
@@ -175,8 +187,10 @@ def _open_source(place: str, archive: Path) -> Iterator[Source]:
     try:
         parts = urlsplit(place)
     except ValueError as error:
-        raise UsageError(f"{_plain(place)} is no address ({error}): expected such as "
-                         "https://example.org/split.tar") from None  # fmt: skip
+        raise UsageError(
+            f"{_plain(place)} is no address ({error}): expected such as "
+            "https://example.org/split.tar"
+        ) from None
     path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(place)
     if parts.scheme in {"http", "https"}:
         address = place.rstrip("/")
@@ -283,8 +297,9 @@ def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
-                         ) -> urllib.request.Request | None:  # fmt: skip
+    def redirect_request(
+        self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
         old, new = urlsplit(req.full_url).scheme, urlsplit(newurl).scheme
         if new not in {old, "https"}:
             raise SplitError(f"{req.full_url} leads to {_plain(newurl)}, expected {old}: refused")

@@ -132,9 +132,10 @@ def decompress(content: bytes, most: int = MAX_BYTES) -> bytes:
     """Undo gzip or xz, never holding more than `most` bytes; anything else is a `ResultsError`."""
     by_xz = content.startswith(b"\xfd7zXZ\0")
     decompressor = (
-        lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MEMORY) if by_xz
+        lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MEMORY)
+        if by_xz
         else zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
-    )  # fmt: skip
+    )
     try:
         plain = decompressor.decompress(content, most + 1)
     except (zlib.error, lzma.LZMAError) as error:

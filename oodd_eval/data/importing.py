@@ -59,11 +59,20 @@ class _Episode(NamedTuple):
 
 
 def import_data(
-    name: str, environment: str, *, form: str, train: Path, calibration: Path,
-    test: Path | None = None, sensors: Sequence[Quantity] = (), actions: Sequence[Quantity] = (),
-    discrete: int = 0, groups: Mapping[str, str] | None = None, output: Path | None = None,
+    name: str,
+    environment: str,
+    *,
+    form: str,
+    train: Path,
+    calibration: Path,
+    test: Path | None = None,
+    sensors: Sequence[Quantity] = (),
+    actions: Sequence[Quantity] = (),
+    discrete: int = 0,
+    groups: Mapping[str, str] | None = None,
+    output: Path | None = None,
     progress: Callable[[str], None] = lambda _part: None,
-) -> Split:  # fmt: skip
+) -> Split:
     """Import logs as one environment of a split; one of that name gets it as a further one.
 
     `name` and `environment` are one's own: no published split, no environment of the benchmark.
@@ -110,9 +119,13 @@ def import_data(
 
     own = layout.own_facts(environment, discrete=columns.discrete, groups=kinds)
     entries[environment] = layout.write_environment(
-        directory / f"{environment}.h5", parts(), IMPORTED, sensors=columns.sensors,
-        actions=columns.actions, own=own,
-    )  # fmt: skip
+        directory / f"{environment}.h5",
+        parts(),
+        IMPORTED,
+        sensors=columns.sensors,
+        actions=columns.actions,
+        own=own,
+    )
     ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
     versions = {"oodd-eval": __version__, "numpy": np.__version__}
     layout.write_manifest(directory, _recipe(name), ordered, 0, versions)
@@ -191,10 +204,16 @@ def _columns(
     count = number or (commands.shape[1] if commands.ndim == 2 else 1)
     return Columns(
         _named("sensor", "--sensors", width, sensors, logs.sensors),
-        _named("action", "--actions", count if log.actions is not None else 0, actions,
-               logs.actions if len(logs.actions) == count else ()),
-        bool(number), logs.start,
-    )  # fmt: skip
+        _named(
+            "action",
+            "--actions",
+            count if log.actions is not None else 0,
+            actions,
+            logs.actions if len(logs.actions) == count else (),
+        ),
+        bool(number),
+        logs.start,
+    )
 
 
 def _named(kind: str, option: str, count: int, *named: Sequence[Quantity]) -> tuple[Quantity, ...]:

@@ -14,8 +14,17 @@ from oodd_eval.data.layout import part_sizes
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData
 from oodd_eval.data.split import Split
 
-HEADER: Final = ("group", "trajectories", "transitions", "length", "onset", "effect", "tail",
-                 "redraws", "return")  # fmt: skip
+HEADER: Final = (
+    "group",
+    "trajectories",
+    "transitions",
+    "length",
+    "onset",
+    "effect",
+    "tail",
+    "redraws",
+    "return",
+)
 Rows = list[list[str]]
 Returns = Mapping[str, NDArray[np.float64]]  # by kind: ``nominal`` and anomalies
 

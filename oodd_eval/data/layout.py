@@ -234,16 +234,22 @@ def pack_parameters(parameters: Sequence[Mapping[str, Any]]) -> NDArray[np.bytes
 
 
 def write_environment(
-    path: Path, groups: Iterable[tuple[str, Arrays]], policy: str, *,
-    sensors: Sequence[Quantity], actions: Sequence[Quantity],
+    path: Path,
+    groups: Iterable[tuple[str, Arrays]],
+    policy: str,
+    *,
+    sensors: Sequence[Quantity],
+    actions: Sequence[Quantity],
     own: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Write an environment's groups, one at a time, in one step; return its manifest entry.
 
     `own` is what `own_facts` returns.
     """
-    names = {"sensors": [dataclasses.asdict(q) for q in sensors],
-             "actions": [dataclasses.asdict(q) for q in actions]}  # fmt: skip
+    names = {
+        "sensors": [dataclasses.asdict(q) for q in sensors],
+        "actions": [dataclasses.asdict(q) for q in actions],
+    }
     entries: dict[str, dict[str, Any]] = {}
     with replacing(path) as partial, h5py.File(partial, "w", libver="v110") as file:
         file.attrs["schema"] = SCHEMA
@@ -302,8 +308,14 @@ def _manifest_schema() -> Any:
     names = core_schema.list_schema(record(name=text, unit=text))
     kinds = by_name(name, core_schema.literal_schema([*GROUPS]))
     own = record(discrete=core_schema.bool_schema(), anomalies=kinds)
-    environment = record(file=text, policy=text, digest=text, groups=by_name(parts, group),
-                         sensors=names, actions=names)  # fmt: skip
+    environment = record(
+        file=text,
+        policy=text,
+        digest=text,
+        groups=by_name(parts, group),
+        sensors=names,
+        actions=names,
+    )
     environment["fields"]["own"] = core_schema.typed_dict_field(own, required=False)
     environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
     named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
@@ -322,19 +334,26 @@ def part_sizes(manifest: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write_manifest(
-    directory: Path, definition: SplitDefinition | Mapping[str, Any],
-    environments: Mapping[str, Any], generator: int, versions: Mapping[str, str],
-) -> None:  # fmt: skip
+    directory: Path,
+    definition: SplitDefinition | Mapping[str, Any],
+    environments: Mapping[str, Any],
+    generator: int,
+    versions: Mapping[str, str],
+) -> None:
     """Write ``manifest.json`` in one step from the entries of environments, in their order.
 
     A split that was not recorded has no definition, but a mapping with its name.
     """
     recipe = definition.recipe if isinstance(definition, SplitDefinition) else dict(definition)
     manifest = {
-        "schema": SCHEMA, "name": recipe["name"], "definition": recipe, "generator": generator,
-        "environments": environments, "digest": split_digest(environments, recipe),
+        "schema": SCHEMA,
+        "name": recipe["name"],
+        "definition": recipe,
+        "generator": generator,
+        "environments": environments,
+        "digest": split_digest(environments, recipe),
         "versions": versions,
-    }  # fmt: skip
+    }
     write_text(directory / MANIFEST, json.dumps(manifest, indent=1) + "\n")
 
 
@@ -369,19 +388,27 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         said = entry["own"]["anomalies"] if "own" in entry else {}
         kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
         if environment not in ENVIRONMENTS and "own" not in entry:
-            raise SplitError(f"{file} has an unknown environment {environment!r}, of which it says "
-                             "nothing: build or import it again")  # fmt: skip
+            raise SplitError(
+                f"{file} has an unknown environment {environment!r}, of which it says "
+                "nothing: build or import it again"
+            )
         if lacking := [part for part in NOMINAL if part not in entry["groups"]]:
-            raise SplitError(f"{file} has no group {lacking[0]!r} of {environment}, expected "
-                             f"{', '.join(NOMINAL)}: build or fetch it again")  # fmt: skip
+            raise SplitError(
+                f"{file} has no group {lacking[0]!r} of {environment}, expected "
+                f"{', '.join(NOMINAL)}: build or fetch it again"
+            )
         if unknown := sorted(kinds - {*ANOMALIES, *said}):
-            raise SplitError(f"{file} has an unknown anomaly {unknown[0]!r} in {environment}, of "
-                             "which it says nothing: build or import it again")  # fmt: skip
+            raise SplitError(
+                f"{file} has an unknown anomaly {unknown[0]!r} in {environment}, of "
+                "which it says nothing: build or import it again"
+            )
     try:
         expected = split_digest(manifest["environments"], manifest["definition"])
     except (ValueError, RecursionError) as error:
-        raise SplitError(f"{file} has no digest, as its entries are no plain JSON ({error}): "
-                         "build or fetch it again") from None  # fmt: skip
+        raise SplitError(
+            f"{file} has no digest, as its entries are no plain JSON ({error}): "
+            "build or fetch it again"
+        ) from None
     if manifest["digest"] != expected:
         raise SplitError(
             f"{file} names the digest {manifest['digest']}, but its entries make {expected}: "

@@ -262,8 +262,10 @@ def _table(path: Path, columns: list[str]) -> dict[str, Array]:
         raise TrajectoryError(
             f"{path} has the columns {header}, expected those of the other files: {columns}"
         )
-    own = {kind: [i for i, c in enumerate(columns) if c.partition(":")[0] == kind]
-           for kind in ("obs", "action", "reward")}  # fmt: skip
+    own = {
+        kind: [i for i, c in enumerate(columns) if c.partition(":")[0] == kind]
+        for kind in ("obs", "action", "reward")
+    }
     found = {kind: array.array("d") for kind in own}
     before: tuple[list[str], int] | None = None
     for row, number in rows:
@@ -327,9 +329,17 @@ def _group(where: str, name: str, group: Any) -> Log:
     number = {k: int(np.asarray(said[k]).item()) for k in ("onset", "seed") if k in said}
     drawn = json.loads(said["parameters"]) if "parameters" in said else {}
     ended = bool(np.any(found["terminations"])) if "terminations" in found else False
-    return Log(name, where, found["observations"], found.get("actions"), found.get("rewards"),
-               number.get("onset"), number.get("seed"), ended,
-               drawn if isinstance(drawn, dict) else {})  # fmt: skip
+    return Log(
+        name,
+        where,
+        found["observations"],
+        found.get("actions"),
+        found.get("rewards"),
+        number.get("onset"),
+        number.get("seed"),
+        ended,
+        drawn if isinstance(drawn, dict) else {},
+    )
 
 
 def _open_minari(place: Path) -> Logs:
@@ -349,8 +359,9 @@ def _open_minari(place: Path) -> Logs:
             tuple(Quantity(str(row["name"]), str(row["unit"])) for row in said.get(kind, ()))
             for kind in ("sensors", "actions")
         ]
-        discrete, start = (int(spaces[1].get(k, 0)) if types[1] == "Discrete" else 0
-                           for k in ("n", "start"))  # fmt: skip
+        discrete, start = (
+            int(spaces[1].get(k, 0)) if types[1] == "Discrete" else 0 for k in ("n", "start")
+        )
     except (*_BROKEN, AttributeError) as error:
         raise _broken(str(metadata), error) from error
     if types[0] != "Box" or types[1] not in {"Box", "Discrete"}:

@@ -118,9 +118,19 @@ class Measured(NamedTuple):
     sensors: tuple[int, ...]
 
 
-_SENSORS: Final = ("iid", "calibration", "drift", "shutdown", "ar1", "varma", "delay", "stuck",
-                   "iid-intermittent", "calibration-intermittent",
-                   "shutdown-intermittent")  # fmt: skip
+_SENSORS: Final = (
+    "iid",
+    "calibration",
+    "drift",
+    "shutdown",
+    "ar1",
+    "varma",
+    "delay",
+    "stuck",
+    "iid-intermittent",
+    "calibration-intermittent",
+    "shutdown-intermittent",
+)
 _COMMANDS: Final = ("stuck-joint", "latency", "action-noise")
 _ROWS: Final = ("gain", "bias", "wind-l2r", "wind-r2l", "wind-intermittent", "gain-intermittent")
 _NEEDS: Final = {"gravity": "gravity", "mass": "body_mass", "friction": "friction"}
@@ -264,7 +274,16 @@ def _seen(spec: EnvironmentSpec) -> EnvironmentInfo:
             f"{len(spec.actions)} actions"
         )
     return EnvironmentInfo(
-        spec.name, spec.title or spec.name, spec.name, "own", len(spec.sensors), len(spec.actions),
-        "IQN" if discrete else "TD3", float("nan"), spec.episode_cap, spec.sensors, spec.actions,
+        spec.name,
+        spec.title or spec.name,
+        spec.name,
+        "own",
+        len(spec.sensors),
+        len(spec.actions),
+        "IQN" if discrete else "TD3",
+        float("nan"),
+        spec.episode_cap,
+        spec.sensors,
+        spec.actions,
         discrete,
-    )  # fmt: skip
+    )

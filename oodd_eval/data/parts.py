@@ -164,7 +164,7 @@ class TwinCheck:
 
     def __init__(
         self, part: Mapping[str, Any], twins: Mapping[str, Any], *, recorded: bool
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._part, self._twins, self._recorded = part, twins, recorded
         self._pairs = min(len(part["seeds"]), len(twins["seeds"]))
         self._first = np.full(len(part["seeds"]), -1)  # rows that differ first
@@ -175,8 +175,9 @@ class TwinCheck:
         if name not in {"observations", "actions"}:
             return
         seen = name == "observations"
-        mine, others = (p["offsets"] + seen * np.arange(len(p["offsets"]))
-                        for p in (self._part, self._twins))  # fmt: skip
+        mine, others = (
+            p["offsets"] + seen * np.arange(len(p["offsets"])) for p in (self._part, self._twins)
+        )
         i = int(np.searchsorted(mine, start, side="right")) - 1
         while i < self._pairs and mine[i] < start + len(block):
             begin = int(mine[i]) - start
@@ -204,24 +205,34 @@ class TwinCheck:
         """Raise `SplitError` unless all episodes are as they must be."""
         part, twins = self._part, self._twins
         if len(part["seeds"]) != len(twins["seeds"]):
-            raise SplitError(f"{where} has {len(part['seeds'])} trajectories, expected "
-                             f"{len(twins['seeds'])}, one for each twin")  # fmt: skip
+            raise SplitError(
+                f"{where} has {len(part['seeds'])} trajectories, expected "
+                f"{len(twins['seeds'])}, one for each twin"
+            )
         onsets, effects = part["onsets"], part["effects"]
         found = np.where(self._first < 0, onsets, self._first)
         for i in np.flatnonzero(part["seeds"] != twins["seeds"]) if self._recorded else ():
-            raise SplitError(f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
-                             f"{twins['seeds'][i]}, expected the same")  # fmt: skip
+            raise SplitError(
+                f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
+                f"{twins['seeds'][i]}, expected the same"
+            )
         for i in np.flatnonzero(onsets < FIRST_ONSET) if self._recorded else ():
-            raise SplitError(f"{where}: trajectory {i} has its onset at row {onsets[i]}, expected "
-                             f"{FIRST_ONSET} or a later row")  # fmt: skip
+            raise SplitError(
+                f"{where}: trajectory {i} has its onset at row {onsets[i]}, expected "
+                f"{FIRST_ONSET} or a later row"
+            )
         for i in np.flatnonzero(effects > np.diff(twins["offsets"])):
-            raise SplitError(f"{where}: trajectory {i} has its effect at row {effects[i]}, behind "
-                             "the end of its twin")  # fmt: skip
+            raise SplitError(
+                f"{where}: trajectory {i} has its effect at row {effects[i]}, behind "
+                "the end of its twin"
+            )
         if self._early:
             raise SplitError(f"{where}: {self._early} before its onset: build or fetch it again")
         for i in np.flatnonzero(found != effects):
-            raise SplitError(f"{where}: trajectory {i} first differs from its twin at row "
-                             f"{found[i]}, expected its effect, row {effects[i]}")  # fmt: skip
+            raise SplitError(
+                f"{where}: trajectory {i} first differs from its twin at row "
+                f"{found[i]}, expected its effect, row {effects[i]}"
+            )
 
 
 class EnvironmentData:
@@ -235,9 +246,14 @@ class EnvironmentData:
     """
 
     def __init__(
-        self, environment: str, file: StoredFile, parts: Mapping[str, Mapping[str, Any]],
-        digest: str, *, discrete: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        environment: str,
+        file: StoredFile,
+        parts: Mapping[str, Mapping[str, Any]],
+        digest: str,
+        *,
+        discrete: bool = False,
+    ) -> None:
         self.id, self.digest, self.discrete = environment, digest, discrete
         self._file, self._parts = file, parts
         nominal = (TrajectorySet(parts, part) for part in NOMINAL)

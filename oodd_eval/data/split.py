@@ -273,8 +273,10 @@ class Split:
         entry = self.manifest["environments"][name]
         recorded = "seed_base" in self.manifest["definition"]
         # Twins are compared with every other part.
-        twins = {key: rows[:] if rows.nbytes <= _MOST_TWINS else rows
-                 for key, rows in parts[TWINS].items()}  # fmt: skip
+        twins = {
+            key: rows[:] if rows.nbytes <= _MOST_TWINS else rows
+            for key, rows in parts[TWINS].items()
+        }
         for group, part in parts.items():
             names = layout.names_digest(entry) if group == NAMES else ""
             expected = names or str(entry["groups"][group]["sha256"])

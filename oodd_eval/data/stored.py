@@ -22,8 +22,16 @@ from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError
 ROWS: Final = frozenset({"observations", "actions", "rewards"})
 """Datasets with a row for each step. All others are small, and are in memory once they are read."""
 
-BROKEN: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError,
-                 OverflowError, MemoryError)  # fmt: skip
+BROKEN: Final = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    RuntimeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+)
 """Errors that h5py raises for a damaged file."""
 
 _MOST_LABELS: Final = 2**27  # bytes of all small datasets of a file
@@ -171,16 +179,20 @@ def check_plain(dataset: h5py.Dataset) -> None:
         raise SplitError(f"{_place(dataset)} keeps its content in another file: refused")
     filters = [layout.get_filter(i)[0] for i in range(layout.get_nfilters())]
     if {*filters} - _FILTERS or len(filters) > len({*filters}):
-        raise SplitError(f"{_place(dataset)} is packed by the filters {filters}, expected gzip and "
-                         "shuffle: repack it, as with h5repack -f SHUF -f GZIP=4")  # fmt: skip
+        raise SplitError(
+            f"{_place(dataset)} is packed by the filters {filters}, expected gzip and "
+            "shuffle: repack it, as with h5repack -f SHUF -f GZIP=4"
+        )
     size = os.fstat(h5py.h5i.get_file_id(dataset.id).get_vfd_handle()).st_size
     pieces, longest, found, large = 1, held, [dataset.id.get_storage_size()], []
     if chunks := dataset.chunks:
         pairs = zip(dataset.shape, chunks, strict=True)
         pieces, longest = math.prod(-(-n // c) for n, c in pairs), math.prod(chunks) * item
         if longest > _MOST_CHUNK:
-            raise SplitError(f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
-                             f"{_MOST_CHUNK}: repack it, as with h5repack")  # fmt: skip
+            raise SplitError(
+                f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
+                f"{_MOST_CHUNK}: repack it, as with h5repack"
+            )
         found = []
 
         def note(chunk: Any) -> None:

@@ -77,17 +77,25 @@ def suite_cells(suites: Sequence[SuiteSection]) -> str:
         first = primary_settings(suite.board.records)
         for r in suite.board.records:
             trivial = str(suite.board.is_trivial(r.setting)).lower()
-            about = {"board": suite.name, "entry": "", "trust": "",
-                     "primary": str(r.setting in first).lower(), "trivial": trivial}  # fmt: skip
+            about = {
+                "board": suite.name,
+                "entry": "",
+                "trust": "",
+                "primary": str(r.setting in first).lower(),
+                "trivial": trivial,
+            }
             lines.append((about, r))
     return rendering.cells_csv(lines, header=False)
 
 
 @without_collector()
 def build(
-    entries: Sequence[SubmittedEntry], output: Path,
-    suites: Callable[[], SuiteParts] = SuiteParts, *, on_part: Callable[[str], object] = str,
-) -> list[str]:  # fmt: skip
+    entries: Sequence[SubmittedEntry],
+    output: Path,
+    suites: Callable[[], SuiteParts] = SuiteParts,
+    *,
+    on_part: Callable[[str], object] = str,
+) -> list[str]:
     """Write page, tables, site and the published file, the same for the same entries.
 
     Returns their names, the page first. A compressed file with the same content stays as it is,
@@ -159,8 +167,13 @@ def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
         for row in section.ranks.standings:
             entry, flags = section.sources[row.entry], (row.primary, row.trivial)
             primary, trivial = (str(flag).lower() for flag in flags)
-            about = {"board": "leaderboard", "entry": entry.meta.id, "trust": entry.trust,
-                     "primary": primary, "trivial": trivial}  # fmt: skip
+            about = {
+                "board": "leaderboard",
+                "entry": entry.meta.id,
+                "trust": entry.trust,
+                "primary": primary,
+                "trivial": trivial,
+            }
             lines += [(about, r) for r in row.records]
     return compress((rendering.cells_csv(lines) + suites).encode())
 

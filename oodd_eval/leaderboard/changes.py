@@ -45,8 +45,11 @@ def _git(directory: Path, *arguments: str) -> str:
     try:
         done = subprocess.run(  # noqa: S603
             ["git", "-C", str(directory), *arguments],  # noqa: S607
-            capture_output=True, check=False, text=True, errors="surrogateescape",
-        )  # fmt: skip
+            capture_output=True,
+            check=False,
+            text=True,
+            errors="surrogateescape",
+        )
     except OSError as error:
         raise UsageError(f"--changed-against needs git: {error.strerror}") from None
     if done.returncode:

@@ -76,9 +76,13 @@ def place(
     found = {row: _lacking(own, expected) for row, own in new.items()}
     return Placement(
         ranks=ranked(used, first, board.rerun and board.rerun | new.keys()),
-        own=set(by_row), published=same, replaced=set(replaced), cells=cells, expected=expected,
+        own=set(by_row),
+        published=same,
+        replaced=set(replaced),
+        cells=cells,
+        expected=expected,
         lacking={row: text for row, text in found.items() if text},
-    )  # fmt: skip
+    )
 
 
 def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:
@@ -132,10 +136,13 @@ def rankings(
         return [f"{place} {ties}".rstrip(), f"{OWN * (one.entry in own)}{one.entry}{marks}"]
 
     first = [
-        [*labels(one, one.rank, ranks.ranking), *texts(one, [RANKING]),
-         trust.get(one.entry, UNDEFINED)]
+        [
+            *labels(one, one.rank, ranks.ranking),
+            *texts(one, [RANKING]),
+            trust.get(one.entry, UNDEFINED),
+        ]
         for one in ranks.standings
-    ]  # fmt: skip
+    ]
     names = [ALARM_RANKING, *ALARMS]
     order = {row: i for i, row in enumerate(ranks.alarms.ranks)}
     by_alarms = sorted(ranks.standings, key=lambda one: order.get(str(one.entry), len(order)))
@@ -143,15 +150,22 @@ def rankings(
     second = [[*labels(one, one.alarm_rank, ranks.alarms), *texts(one, names)] for one in by_alarms]
     level = metric_info(ALARM_RANKING).level
     return [
-        Table("Ranking by separability: matched AUC (%), higher is better",
-              ["rank", "row", "matched AUC", "trust"], first, labels=2),
-        Table(f"Ranking by guaranteed alarms at {level}: censored delay (steps), lower is better",
-              ["rank", "row", "delay", f"found in {FOUND_WITHIN[0]}", "missed", "false"],
-              second, labels=2,
-              note="The delay counts a miss as the rest of its episode. The shares (%) are of "
-              "episodes found within so many steps, of those missed, and of nominal episodes with "
-              "an alarm."),
-    ]  # fmt: skip
+        Table(
+            "Ranking by separability: matched AUC (%), higher is better",
+            ["rank", "row", "matched AUC", "trust"],
+            first,
+            labels=2,
+        ),
+        Table(
+            f"Ranking by guaranteed alarms at {level}: censored delay (steps), lower is better",
+            ["rank", "row", "delay", f"found in {FOUND_WITHIN[0]}", "missed", "false"],
+            second,
+            labels=2,
+            note="The delay counts a miss as the rest of its episode. The shares (%) are of "
+            "episodes found within so many steps, of those missed, and of nominal episodes with "
+            "an alarm.",
+        ),
+    ]
 
 
 def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:

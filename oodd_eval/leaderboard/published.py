@@ -73,10 +73,17 @@ class Published(NamedTuple):
 def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
     """Return the bytes of the file: the same ones for the same entries and `suite_lines`."""
     lines = [
-        slim(record, RANKED_BY, entry=section.sources[one.entry].meta.id,
-              trust=section.trust[one.entry], primary=one.primary)
-        for section in sections for one in section.ranks.standings for record in one.records
-    ]  # fmt: skip
+        slim(
+            record,
+            RANKED_BY,
+            entry=section.sources[one.entry].meta.id,
+            trust=section.trust[one.entry],
+            primary=one.primary,
+        )
+        for section in sections
+        for one in section.ranks.standings
+        for record in one.records
+    ]
     return compress((_text(lines) + suites).encode())
 
 
@@ -84,8 +91,10 @@ def suite_lines(suites: Iterable[SuiteSection]) -> str:
     """Return the lines of further test suites, of those that are graded."""
     return _text(
         slim(record, (FOUND,), suite=suite.name)
-        for suite in suites if suite.graded for record in suite.board.records
-    )  # fmt: skip
+        for suite in suites
+        if suite.graded
+        for record in suite.board.records
+    )
 
 
 def _text(records: Iterable[Record]) -> str:
@@ -147,10 +156,19 @@ def slim(record: Record, metrics: Iterable[str] = RANKED_BY, **provenance: objec
     """Return a record with the terms of some metrics alone, from which their values follow."""
     terms = {name: record.per_trajectory[name] for name in metrics if name in record.per_trajectory}
     return replace(
-        record, parameters={}, plugin_source="", scores="", provenance=provenance, reason="",
-        per_trajectory=terms, metrics={name: Metric(NAN) for name in terms},
-        seconds_fit=NAN, seconds_score=NAN, peak_rss_mb=NAN, steps_scored=None,
-    )  # fmt: skip
+        record,
+        parameters={},
+        plugin_source="",
+        scores="",
+        provenance=provenance,
+        reason="",
+        per_trajectory=terms,
+        metrics={name: Metric(NAN) for name in terms},
+        seconds_fit=NAN,
+        seconds_score=NAN,
+        peak_rss_mb=NAN,
+        steps_scored=None,
+    )
 
 
 def _key(record: Record) -> tuple[str, int, int | None]:

@@ -56,10 +56,17 @@ class Submission(NamedTuple):
 
 
 def submit(
-    results: Path | str, root: Path | str, statement: Statement, *, detectors: str = "all",
-    cells: str = "", complete: bool = False, scores: bool = False, curves: Extent = "rows",
+    results: Path | str,
+    root: Path | str,
+    statement: Statement,
+    *,
+    detectors: str = "all",
+    cells: str = "",
+    complete: bool = False,
+    scores: bool = False,
+    curves: Extent = "rows",
     split: str | Path | None = None,
-) -> Submission:  # fmt: skip
+) -> Submission:
     """Write an entry from a results directory, verify it, and move it to its place in `root`."""
     source, root = ResultsDirectory(results), Path(root)
     records, left_out = selected(source.records(), detectors, cells, complete=complete)
@@ -84,10 +91,13 @@ def submit(
             evaluated = [record for record in records if record.ok]
             for file in _score_files(evaluated, source, "leave out --scores, or"):
                 shutil.copyfile(file, directory / SCORES / file.name)
-        entry = replace(entry, files={
-            name: {"sha256": digest, "bytes": (directory / name).stat().st_size}
-            for name, digest in digests(directory).items()
-        })  # fmt: skip
+        entry = replace(
+            entry,
+            files={
+                name: {"sha256": digest, "bytes": (directory / name).stat().st_size}
+                for name, digest in digests(directory).items()
+            },
+        )
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
@@ -204,8 +214,11 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     packages = {r.plugin.partition(":")[0]: r.detector_version for r in records}
     packages |= stored.recorded_versions(records)
     platforms = sorted({r.provenance.get("platform", "") for r in records})
-    environment = {"python": packages.pop("python"), "platform": "+".join(platforms)[:200],
-                   "packages": dict(sorted(packages.items()))}  # fmt: skip
+    environment = {
+        "python": packages.pop("python"),
+        "platform": "+".join(platforms)[:200],
+        "packages": dict(sorted(packages.items())),
+    }
     stated = asdict(statement) | {
         "id": name,
         "title": statement.title or f"{shown} on {first.split}",

@@ -14,8 +14,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Reading", "TerminalMonitor", "VectorWatchdogWrapper", "Watchdog", "WatchdogWrapper"]
 
-_HOMES = {"Reading": "reading", "TerminalMonitor": "terminal", "Watchdog": "watchdog",
-          "VectorWatchdogWrapper": "wrappers", "WatchdogWrapper": "wrappers"}  # fmt: skip
+_HOMES = {
+    "Reading": "reading",
+    "TerminalMonitor": "terminal",
+    "Watchdog": "watchdog",
+    "VectorWatchdogWrapper": "wrappers",
+    "WatchdogWrapper": "wrappers",
+}
 
 
 def __getattr__(name: str) -> object:

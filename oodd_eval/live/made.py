@@ -36,9 +36,13 @@ class Made:
 
     @classmethod
     def make(
-        cls, detector: str | Detector, statistic: str | None, seed: int, horizon: int,
+        cls,
+        detector: str | Detector,
+        statistic: str | None,
+        seed: int,
+        horizon: int,
         parameters: Mapping[str, Any],
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Make the detector of that name, or take an instance."""
         if statistic not in {None, "cusum", "score"}:
             raise UsageError(f"statistic={statistic!r}, expected 'cusum' or 'score'")
@@ -62,9 +66,12 @@ class Made:
     def told(self) -> dict[str, Any]:
         """Return what `of` reads: JSON values."""
         return {
-            "name": self.name, "statistic": self.alarm, "seed": self.seed,
-            "horizon": self.horizon, "parameters": dict(self.parameters),
-        }  # fmt: skip
+            "name": self.name,
+            "statistic": self.alarm,
+            "seed": self.seed,
+            "horizon": self.horizon,
+            "parameters": dict(self.parameters),
+        }
 
     @classmethod
     def of(cls, told: Mapping[str, Any], detector: Detector | None) -> Self:
@@ -75,9 +82,12 @@ class Made:
                 "with the same parameters"
             )
         return cls.make(
-            detector or told["name"], told["statistic"], int(told["seed"]), int(told["horizon"]),
+            detector or told["name"],
+            told["statistic"],
+            int(told["seed"]),
+            int(told["horizon"]),
             told["parameters"],
-        )  # fmt: skip
+        )
 
 
 def streaming(detector: Detector) -> StreamingDetector:

@@ -160,9 +160,12 @@ class Stream:
         self._since = np.full(len(limits.mean), NEVER)
 
     def take(
-        self, observation: ArrayLike | None, action: ArrayLike | None = None,
-        time: float | None = None, acted: float | None = None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:  # fmt: skip
+        self,
+        observation: ArrayLike | None,
+        action: ArrayLike | None = None,
+        time: float | None = None,
+        acted: float | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Take the next row; return finite values for a detector: (D,), and (A,) or None.
 
         `time` and `acted` are the time stamps of the two in seconds, compared with the rate.

@@ -43,18 +43,18 @@ class TerminalMonitor:
         self._past: deque[float] = deque(maxlen=HISTORY)
         self._reading: Reading | None = None
         # It asks for the picture when it draws one, so that readings in between cost nothing.
-        self._live = Live(
-            console=console, refresh_per_second=REFRESH, get_renderable=self.picture
-        )  # fmt: skip
+        self._live = Live(console=console, refresh_per_second=REFRESH, get_renderable=self.picture)
 
     def __enter__(self) -> Self:
         self._live.start()
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
         trace: TracebackType | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._live.stop()
 
     def update(self, reading: Reading) -> None:

@@ -57,9 +57,14 @@ class Watchdog:
     """
 
     def __init__(
-        self, made: Made, rule: GuaranteedAlarm, limits: StreamLimits, sensors: Sequence[str],
-        settings: Settings, run_length: RunLength | None,
-    ) -> None:  # fmt: skip
+        self,
+        made: Made,
+        rule: GuaranteedAlarm,
+        limits: StreamLimits,
+        sensors: Sequence[str],
+        settings: Settings,
+        run_length: RunLength | None,
+    ) -> None:
         self._made, self.rule, self._limits, self.sensors = made, rule, limits, list(sensors)
         self.settings, self.run_length = settings, run_length
         self._live = streaming(made.detector)
@@ -69,13 +74,23 @@ class Watchdog:
 
     @classmethod
     def fit(
-        cls, detector: str | Detector, train: Sequence[Trajectory],
-        calibration: Sequence[Trajectory], alpha: float = 0.05, *,
-        confidence: float | None = None, hours: float | None = None, rate: float | None = None,
-        sensors: Sequence[Any] | None = None, latch: bool = True, hold_off: int = 0,
-        statistic: str | None = None, seed: int = 0, horizon: int = 1,
+        cls,
+        detector: str | Detector,
+        train: Sequence[Trajectory],
+        calibration: Sequence[Trajectory],
+        alpha: float = 0.05,
+        *,
+        confidence: float | None = None,
+        hours: float | None = None,
+        rate: float | None = None,
+        sensors: Sequence[Any] | None = None,
+        latch: bool = True,
+        hold_off: int = 0,
+        statistic: str | None = None,
+        seed: int = 0,
+        horizon: int = 1,
         parameters: Mapping[str, Any] | None = None,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Fit a detector on nominal episodes and find its threshold on others.
 
         Parameters
@@ -151,8 +166,10 @@ class Watchdog:
         if hours is None:
             faulty = [limits.faulty(x) for x in others]
             # An episode with a fault alarms at any threshold. Those that standardize stay.
-            scores = [np.array([np.inf]) if f and (made.alarm == "score" or i % 2) else s
-                      for i, (f, s) in enumerate(zip(faulty, scores, strict=True))]  # fmt: skip
+            scores = [
+                np.array([np.inf]) if f and (made.alarm == "score" or i % 2) else s
+                for i, (f, s) in enumerate(zip(faulty, scores, strict=True))
+            ]
             rule = GuaranteedAlarm.fit(scores, alpha, made.alarm, confidence)
         else:
             unbounded = GuaranteedAlarm(
@@ -204,9 +221,12 @@ class Watchdog:
             self._monitor.reset()
 
     def update(
-        self, observation: ArrayLike | Mapping[str, float] | None, action: ArrayLike | None = None,
-        time: float | None = None, acted: float | None = None,
-    ) -> Reading:  # fmt: skip
+        self,
+        observation: ArrayLike | Mapping[str, float] | None,
+        action: ArrayLike | None = None,
+        time: float | None = None,
+        acted: float | None = None,
+    ) -> Reading:
         """Judge the next row.
 
         Parameters
@@ -243,8 +263,11 @@ class Watchdog:
         row, command = self._stream.take(observation, action, time, acted)
         score = float(self._live.update(row, command if self._made.actions else None))
         above = self._monitor.update(score)
-        faults = {str(d): fault for d, fault in self._stream.faults.items()
-                  if d != ACTION or self._made.actions}  # fmt: skip
+        faults = {
+            str(d): fault
+            for d, fault in self._stream.faults.items()
+            if d != ACTION or self._made.actions
+        }
         self._causes = frozenset(faults) | ({"statistic"} if above else set())
         self._known &= self._causes
         new = bool(self._causes - self._known) and not self._held
@@ -254,10 +277,15 @@ class Watchdog:
         alarm = bool(new or self.raised)
         sensors, onset = self._blamed() if alarm else ({}, None)  # takes as long as a score
         reading = Reading(
-            self._t, math.nan if math.isnan(score) else score, self._monitor.statistic,
-            self.rule.threshold, alarm, sensors, onset,
+            self._t,
+            math.nan if math.isnan(score) else score,
+            self._monitor.statistic,
+            self.rule.threshold,
+            alarm,
+            sensors,
+            onset,
             {self._name(d): fault for d, fault in self._stream.faults.items() if str(d) in faults},
-        )  # fmt: skip
+        )
         if new and not self.raised:
             self.raised = reading
         return reading
@@ -309,12 +337,13 @@ class Watchdog:
         save_state(place, kind=KIND, settings={}, arrays=self._limits.arrays())
         nominal = self.rule.standardization
         told = {
-            "made": self._made.told(), "sensors": self.sensors,
+            "made": self._made.told(),
+            "sensors": self.sensors,
             "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
             "standardization": nominal and [nominal.mean, nominal.std],
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
-        }  # fmt: skip
+        }
         (place / FILE).write_text(json.dumps(told, indent=1), encoding="utf-8")
 
     @classmethod

@@ -102,9 +102,13 @@ class VectorWatchdogWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
         return observations, rewards, terminated, truncated, info
 
     def _with_readings(
-        self, info: dict[str, Any], observations: Any, actions: Any, new: NDArray[np.bool_],
+        self,
+        info: dict[str, Any],
+        observations: Any,
+        actions: Any,
+        new: NDArray[np.bool_],
         skipped: NDArray[np.bool_],
-    ) -> dict[str, Any]:  # fmt: skip
+    ) -> dict[str, Any]:
         readings = np.empty(self.num_envs, dtype=object)
         for i, watchdog in enumerate(self.watchdogs):
             if skipped[i]:

@@ -52,9 +52,12 @@ class GuaranteedAlarm:
 
     @classmethod
     def fit(
-        cls, calibration: Sequence[Floats], level: float, kind: AlarmKind = "cusum",
+        cls,
+        calibration: Sequence[Floats],
+        level: float,
+        kind: AlarmKind = "cusum",
         confidence: float | None = None,
-    ) -> "GuaranteedAlarm":  # fmt: skip
+    ) -> "GuaranteedAlarm":
         """Find the threshold on the scores of nominal episodes, kept apart from the fit.
 
         Parameters
@@ -74,9 +77,12 @@ class GuaranteedAlarm:
 
     @classmethod
     def fits(
-        cls, calibration: Sequence[Floats], levels: Sequence[float], kind: AlarmKind = "cusum",
+        cls,
+        calibration: Sequence[Floats],
+        levels: Sequence[float],
+        kind: AlarmKind = "cusum",
         confidence: float | None = None,
-    ) -> "list[GuaranteedAlarm]":  # fmt: skip
+    ) -> "list[GuaranteedAlarm]":
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
         unbounded, episodes = cls(None, math.inf), calibration
         if kind == "cusum":
@@ -85,10 +91,12 @@ class GuaranteedAlarm:
         largest = np.sort([unbounded.largest(scores) for scores in episodes])
         ranks = [quantile_rank(len(largest), level, confidence) for level in levels]
         return [
-            cls(unbounded.standardization,
-                float(largest[rank - 1]) if rank <= len(largest) else math.inf)
+            cls(
+                unbounded.standardization,
+                float(largest[rank - 1]) if rank <= len(largest) else math.inf,
+            )
             for rank in ranks
-        ]  # fmt: skip
+        ]
 
     def statistic(self, scores: Floats) -> Floats:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
@@ -163,9 +171,11 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
 
 
 def guaranteed_contributions(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], effects: Sequence[int],
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    effects: Sequence[int],
     rule: GuaranteedAlarm,
-) -> dict[str, Contribution]:  # fmt: skip
+) -> dict[str, Contribution]:
     """Return the metrics of guaranteed alarms of one cell, in the order of the catalogue.
 
     Only the first alarm of an episode counts. Where it precedes the effect the episode is
@@ -197,9 +207,11 @@ def guaranteed_contributions(
 
 
 def _from_effect(
-    firsts: Sequence[int | None], lengths: Sequence[int], ends: Sequence[int],
+    firsts: Sequence[int | None],
+    lengths: Sequence[int],
+    ends: Sequence[int],
     effects: Sequence[int],
-) -> dict[str, Contribution]:  # fmt: skip
+) -> dict[str, Contribution]:
     """Return the share of early episodes, and delays and shares of all others.
 
     `ends` are the numbers of rows that an episode and its partner both have.
@@ -225,9 +237,12 @@ def _from_effect(
 
 
 def attribution_contributions(
-    anomalous: Sequence[Floats], explained: Sequence[NDArray[np.int32]],
-    corrupted: Sequence[Collection[int]], effects: Sequence[int], rule: GuaranteedAlarm,
-) -> dict[str, Contribution]:  # fmt: skip
+    anomalous: Sequence[Floats],
+    explained: Sequence[NDArray[np.int32]],
+    corrupted: Sequence[Collection[int]],
+    effects: Sequence[int],
+    rule: GuaranteedAlarm,
+) -> dict[str, Contribution]:
     """Return what explanations of one cell are worth, in the order of the catalogue.
 
     An explanation is taken at the row of an episode's first alarm; without one, or where that

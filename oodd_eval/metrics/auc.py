@@ -140,9 +140,12 @@ def first_delay(alarms: NDArray[np.bool_], onset: int) -> float:
 
 
 def auc_contributions(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
-    effects: Sequence[int], standardization: Standardization,
-) -> dict[str, Contribution]:  # fmt: skip
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    onsets: Sequence[int],
+    effects: Sequence[int],
+    standardization: Standardization,
+) -> dict[str, Contribution]:
     """Return the AUCs of one cell, from scores of the anomalous trajectories and of their twins.
 
     The standardization, of the calibration scores, is for ``auc_smoothed``.
@@ -155,9 +158,15 @@ def auc_contributions(
     """
     found: dict[str, list[float]] = {
         name: []
-        for name in ("auc", "auc_null", "auc_matched", "auc_placebo", "auc_unpaired",
-                     "auc_smoothed")
-    }  # fmt: skip
+        for name in (
+            "auc",
+            "auc_null",
+            "auc_matched",
+            "auc_placebo",
+            "auc_unpaired",
+            "auc_smoothed",
+        )
+    }
     for i, (a, b, onset, effect) in enumerate(
         zip(anomalous, twins, map(int, onsets), map(int, effects), strict=True)
     ):
@@ -200,9 +209,12 @@ def alarm_contributions(
 
 
 def cell_contributions(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
-    effects: Sequence[int], rule: AlarmRule,
-) -> dict[str, Contribution]:  # fmt: skip
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    onsets: Sequence[int],
+    effects: Sequence[int],
+    rule: AlarmRule,
+) -> dict[str, Contribution]:
     """Return all metrics of one cell that need no level, in the order of the catalogue."""
     found = auc_contributions(anomalous, twins, onsets, effects, rule.standardization)
     return found | alarm_contributions(anomalous, twins, onsets, rule)

@@ -57,10 +57,16 @@ def clopper_pearson(successes: float, trials: float, level: float = 0.95) -> tup
     [0.0013, 0.2487]
     """
     tail = (1 - level) / 2
-    low = _root(lambda x: incomplete_beta(successes, trials - successes + 1, x) - tail) \
-        if successes > 0 else 0.0  # fmt: skip
-    high = _root(lambda x: incomplete_beta(successes + 1, trials - successes, x) - (1 - tail)) \
-        if successes < trials else 1.0  # fmt: skip
+    low = (
+        _root(lambda x: incomplete_beta(successes, trials - successes + 1, x) - tail)
+        if successes > 0
+        else 0.0
+    )
+    high = (
+        _root(lambda x: incomplete_beta(successes + 1, trials - successes, x) - (1 - tail))
+        if successes < trials
+        else 1.0
+    )
     return low, high
 
 

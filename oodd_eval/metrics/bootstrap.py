@@ -120,9 +120,12 @@ class DrawnCells:
         """Return some of the cells."""
         at = list(places)
         return replace(
-            self, seeds=[self.seeds[i] for i in at], values=[self.values[i] for i in at],
-            numerators=self.numerators[at], denominators=self.denominators[at],
-        )  # fmt: skip
+            self,
+            seeds=[self.seeds[i] for i in at],
+            values=[self.values[i] for i in at],
+            numerators=self.numerators[at],
+            denominators=self.denominators[at],
+        )
 
     @functools.lru_cache(maxsize=512)  # noqa: B019  bounded: means over several environments share
     def sums(self) -> list[CellSum]:
@@ -164,9 +167,13 @@ def _shared(environment: str, terms: bytes) -> Samples:
 
 
 def drawn_cells(
-    environment: str, seeds: Sequence[int], numerators: Floats, denominators: Floats, *,
+    environment: str,
+    seeds: Sequence[int],
+    numerators: Floats,
+    denominators: Floats,
+    *,
     median: bool = False,
-) -> DrawnCells:  # fmt: skip
+) -> DrawnCells:
     """Return cells with the weights that their environment shares."""
     values: Sequence[float]
     if median:

@@ -89,8 +89,10 @@ ATTRIBUTION: Final = tuple(f"{name}_{HEADLINE}" for name in _EXPLAINED)
 """Metrics of detectors that explain, at the headline level alone."""
 
 NAMES: Final = (
-    *METRICS, *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL), *ATTRIBUTION,
-)  # fmt: skip
+    *METRICS,
+    *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL),
+    *ATTRIBUTION,
+)
 """Every metric that a record can have."""
 
 

@@ -47,9 +47,11 @@ def roc(positives: Floats, negatives: Floats, fpr: Floats) -> Floats:
 
 
 def mean_matched_roc(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], effects: Sequence[int],
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    effects: Sequence[int],
     fpr: Floats | Sequence[float] = FPR,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Return the matched ROC curve of a cell: averaged over trajectories at equal rates.
 
     Scores are compared at the times of ``auc_matched``. NaN when no trajectory has a curve.
@@ -110,8 +112,15 @@ def delay_far(
         loud = [rule.alarms(a) for a in anomalous]
         missed = [math.isnan(first_delay(x, t)) for x, t in zip(loud, onsets, strict=True)]
         far = sum(int(alarms.sum()) for alarms in quiet) / steps
-        rows.append((rule.threshold, far, _censored(loud, onsets), sum(missed) / len(missed),
-                     _censored(quiet, onsets)))  # fmt: skip
+        rows.append(
+            (
+                rule.threshold,
+                far,
+                _censored(loud, onsets),
+                sum(missed) / len(missed),
+                _censored(quiet, onsets),
+            )
+        )
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
@@ -122,9 +131,12 @@ def _censored(alarms: Sequence[Alarms], onsets: Sequence[int]) -> float:
 
 
 def example(
-    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int],
-    effects: Sequence[int], rule: AlarmRule,
-) -> dict[str, Any]:  # fmt: skip
+    anomalous: Sequence[Floats],
+    twins: Sequence[Floats],
+    onsets: Sequence[int],
+    effects: Sequence[int],
+    rule: AlarmRule,
+) -> dict[str, Any]:
     """Return the trajectory with the median matched AUC of a cell, around its onset.
 
     Of an even number it is the lower median, of equals the first. All lists begin at the row
@@ -140,8 +152,13 @@ def example(
     onset = int(onsets[index])
     start = max(0, onset - BEFORE)
     matched = None if math.isnan(area) else area
-    found: dict[str, Any] = {"index": index, "auc_matched": matched, "onset": onset,
-                             "length": len(anomalous[index]), "start": start}  # fmt: skip
+    found: dict[str, Any] = {
+        "index": index,
+        "auc_matched": matched,
+        "onset": onset,
+        "length": len(anomalous[index]),
+        "start": start,
+    }
     for prefix, scores, name in (("", anomalous[index], "scores"), ("twin_", twins[index], "twin")):
         x = rule.standardization(scores)
         statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
@@ -153,17 +170,22 @@ def example(
 
 
 def cell_curves(
-    sweep: Sweep, rule: AlarmRule, anomalous: Sequence[Floats], onsets: Sequence[int],
+    sweep: Sweep,
+    rule: AlarmRule,
+    anomalous: Sequence[Floats],
+    onsets: Sequence[int],
     effects: Sequence[int],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
     tpr = mean_matched_roc(anomalous, sweep.twins, effects)
     defined = not np.isnan(tpr).any()
-    found: dict[str, Any] = rounded({
-        "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
-        "delay_far": delay_far(sweep, anomalous, onsets),
-        "example": example(anomalous, sweep.twins, onsets, effects, rule),
-    })  # fmt: skip
+    found: dict[str, Any] = rounded(
+        {
+            "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
+            "delay_far": delay_far(sweep, anomalous, onsets),
+            "example": example(anomalous, sweep.twins, onsets, effects, rule),
+        }
+    )
     return found
 
 

@@ -147,12 +147,14 @@ class PairTests:
             group.counts[0, places] += more.counts[0]
             p = np.maximum((1 + group.counts) / (totals + 1), self._floor)
             own = shifts[group.row] - shifts[group.others]
-            found.append([
-                Tested(*bounds(d + one, d, sizes), *(both if side >= 0 else both[::-1]))
-                for d, one, both, side in zip(
-                    differences, own, p.T.tolist(), group.observed, strict=True
-                )
-            ])  # fmt: skip
+            found.append(
+                [
+                    Tested(*bounds(d + one, d, sizes), *(both if side >= 0 else both[::-1]))
+                    for d, one, both, side in zip(
+                        differences, own, p.T.tolist(), group.observed, strict=True
+                    )
+                ]
+            )
         return found
 
     def _group(self, row: str, others: Sequence[str], differences: Floats) -> _Group:

@@ -75,9 +75,8 @@ class Ranking:
 
 
 def rank(
-    rows: Mapping[str, Row], primary: Collection[str] | None = None, *,
-    resamples: int | None = None,
-) -> Ranking:  # fmt: skip
+    rows: Mapping[str, Row], primary: Collection[str] | None = None, *, resamples: int | None = None
+) -> Ranking:
     """Rank the rows of one table, in the same way for any order of rows, seeds and cells.
 
     Parameters

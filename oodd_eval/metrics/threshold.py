@@ -170,9 +170,14 @@ def geometric_mean(
     logs = np.mean(ratios, axis=0)
     low, high = _ends(logs)
     return MeanThreshold(
-        math.exp(logs[0]), math.exp(low), math.exp(high), len(ratios), censored.count(-1),
-        censored.count(1), "~" if {-1, 1} <= sides else "≤" * (-1 in sides) + ">" * (1 in sides),
-    )  # fmt: skip
+        math.exp(logs[0]),
+        math.exp(low),
+        math.exp(high),
+        len(ratios),
+        censored.count(-1),
+        censored.count(1),
+        "~" if {-1, 1} <= sides else "≤" * (-1 in sides) + ">" * (1 in sides),
+    )
 
 
 def _drawn(environment: str, terms: Floats) -> Floats:

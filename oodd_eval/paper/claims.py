@@ -77,8 +77,14 @@ class Claim:
     note: str = ""
 
     @classmethod
-    def of(cls, *, metric: str, plus: Mapping[str, Any], minus: Mapping[str, Any] | None = None,
-           **others: Any) -> "Claim":  # fmt: skip
+    def of(
+        cls,
+        *,
+        metric: str,
+        plus: Mapping[str, Any],
+        minus: Mapping[str, Any] | None = None,
+        **others: Any,
+    ) -> "Claim":
         """Make a claim from a table of ``claims.toml``."""
         ends = {k: others.pop(k) for k in ("above", "below", "negligible") if k in others}
         sides = (Side.of(1.0, **plus), *([Side.of(-1.0, **minus)] if minus else []))
@@ -89,8 +95,9 @@ class Claim:
             raise ValueError("expected settings on every side, unless the metric is 'return'")
         if (settled := others.get("settled")) not in (None, *get_args(Settled)):
             raise ValueError(f"settled is {settled!r}, expected {' or '.join(get_args(Settled))}")
-        return cls(metric=metric, sides=sides, region=Region(**ends), environments=environments,
-                   **others)  # fmt: skip
+        return cls(
+            metric=metric, sides=sides, region=Region(**ends), environments=environments, **others
+        )
 
 
 CLAIMS: Final = read_tables(Path(__file__).with_name("claims.toml"), "claim", Claim.of)
@@ -193,8 +200,15 @@ def changed(made: Sequence[Ruling], other: Other) -> str:
 
 def claims_table(made: Sequence[Ruling], other: Other | None = None) -> Table:
     """Return one row per claim, with the verdicts of another reproduction if there is one."""
-    header = ["Claim", "By the paper's measure", "By matched AUC or censored delay", "Number",
-              "True if", "Seeds", "Place in the paper"]  # fmt: skip
+    header = [
+        "Claim",
+        "By the paper's measure",
+        "By matched AUC or censored delay",
+        "Number",
+        "True if",
+        "Seeds",
+        "Place in the paper",
+    ]
     header[3:3] = [f"On {other.name}"] if other else []
     rows = []
     for r in made:
@@ -211,14 +225,27 @@ def claims_table(made: Sequence[Ruling], other: Other | None = None) -> Table:
 
 def claims_csv(made: Sequence[Ruling]) -> str:
     """Return a line per claim and measure."""
-    return csv_rows([
-        {"claim": r.claim.id, "text": r.claim.text, "place": r.claim.place,
-         "number": r.claim.number, "metric": j.metric, "kind": kind,
-         "region": r.claim.region.describe(r.claim.metric), **j.estimate.columns,
-         "verdict": j.verdict,
-         "by_environment": " ".join(f"{e}={verdict}" for e, verdict in j.by_environment.items())}
-        for r in made for kind, j in (("paper", r.own), ("fair", r.fair)) if j
-    ])  # fmt: skip
+    return csv_rows(
+        [
+            {
+                "claim": r.claim.id,
+                "text": r.claim.text,
+                "place": r.claim.place,
+                "number": r.claim.number,
+                "metric": j.metric,
+                "kind": kind,
+                "region": r.claim.region.describe(r.claim.metric),
+                **j.estimate.columns,
+                "verdict": j.verdict,
+                "by_environment": " ".join(
+                    f"{e}={verdict}" for e, verdict in j.by_environment.items()
+                ),
+            }
+            for r in made
+            for kind, j in (("paper", r.own), ("fair", r.fair))
+            if j
+        ]
+    )
 
 
 def _shown(judged: Judgement) -> str:

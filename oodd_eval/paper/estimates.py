@@ -112,17 +112,23 @@ class Estimator:
         return any(setting in wanted for setting, _ in self._cells)
 
     def combine(
-        self, sides: Sequence[Side], metric: str, environments: Sequence[str],
+        self,
+        sides: Sequence[Side],
+        metric: str,
+        environments: Sequence[str],
         same_seeds: Sequence[Setting] = (),
-    ) -> Estimate:  # fmt: skip
+    ) -> Estimate:
         """Return the mean over the environments where no side lacks a cell of a sum of sides.
 
         Only detector seeds count that all sides have, and those of `same_seeds` that were run.
         """
         found, counts, sizes = [], [], []
         for environment in environments:
-            held = [self._by_seed(setting, environment, side.anomalies)
-                    for side in sides for setting in side.settings]  # fmt: skip
+            held = [
+                self._by_seed(setting, environment, side.anomalies)
+                for side in sides
+                for setting in side.settings
+            ]
             for record in (r for by_seed in held for cells in by_seed.values() for r in cells):
                 if not record.ok:
                     return Estimate(expected=len(environments), state=record.status)
@@ -160,9 +166,14 @@ class Estimator:
     ) -> Samples:
         cells = [self._cells[setting, environment][a][seed] for a in anomalies]
         none = np.full(1 + RESAMPLES, NAN)
-        return mean_samples([_samples(environment, contribution(cell, metric))
-                             if metric in cell.per_trajectory else none
-                             for cell in cells])  # fmt: skip
+        return mean_samples(
+            [
+                _samples(environment, contribution(cell, metric))
+                if metric in cell.per_trajectory
+                else none
+                for cell in cells
+            ]
+        )
 
 
 def _samples(environment: str, own: Contribution | ArrayLike) -> Samples:

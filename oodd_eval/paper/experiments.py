@@ -49,9 +49,11 @@ class Grid(NamedTuple):
 
 
 _CHOICES: Final = {
-    "across": ("series", "scopes"), "rows": ("both", "environments", "mean"),
-    "axis": ("rows", "scopes", "horizons"), "share": ("row", "all", "none"),
-}  # fmt: skip
+    "across": ("series", "scopes"),
+    "rows": ("both", "environments", "mean"),
+    "axis": ("rows", "scopes", "horizons"),
+    "share": ("row", "all", "none"),
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,8 +98,9 @@ class Other(NamedTuple):
         named = ("environment", "series", "anomalies", "metric")
         numbers = {
             (e.id, *(line[column] for column in named)): line
-            for e in EXPERIMENTS for line in _lines(directory / "tables" / f"{e.id}.csv")
-        }  # fmt: skip
+            for e in EXPERIMENTS
+            for line in _lines(directory / "tables" / f"{e.id}.csv")
+        }
         claims = {(line["claim"], line["kind"]): line for line in _lines(directory / "claims.csv")}
         return cls(header.split, numbers, claims, load_returns(directory, header.split_digest))
 

@@ -57,9 +57,14 @@ def fill(name: str, /, **values: Any) -> str:
 
 
 def publish(
-    directory: Path, reproduction: Reproduction, records: Sequence[Record],
-    returns: Returns | None, *, figures: bool = True, other: Other | None = None,
-) -> None:  # fmt: skip
+    directory: Path,
+    reproduction: Reproduction,
+    records: Sequence[Record],
+    returns: Returns | None,
+    *,
+    figures: bool = True,
+    other: Other | None = None,
+) -> None:
     """Write every table and figure of what there is; what is missing says so.
 
     Without `figures` none is drawn, and those that are there already are linked. Tables and claims
@@ -139,9 +144,13 @@ def _of_returns(r: Reproduction, returns: Returns | None, other: Other | None) -
 
 
 def layout(
-    experiment: Experiment, numbers: Numbers, metrics: Sequence[str], *, intervals: bool = True,
+    experiment: Experiment,
+    numbers: Numbers,
+    metrics: Sequence[str],
+    *,
+    intervals: bool = True,
     other: Other | None = None,
-) -> list[Table]:  # fmt: skip
+) -> list[Table]:
     """Set numbers out as the paper does: a table per scope, or per metric where scopes go across.
 
     Rows are by environment and metric, or by environment and series, with the paper's digits below,
@@ -169,8 +178,10 @@ def layout(
                     rows.append(["", "", "paper", *theirs])
                 if other:
                     found = [_of_other(other, experiment, n) for n in own]
-                    texts = [show(e, n.metric, intervals=intervals)
-                             for e, n in zip(found, own, strict=True)]  # fmt: skip
+                    texts = [
+                        show(e, n.metric, intervals=intervals)
+                        for e, n in zip(found, own, strict=True)
+                    ]
                     rows.append(["", "", other.name, *texts])
         tables.append(Table(title, header, rows, labels=3))
     return tables
@@ -198,16 +209,42 @@ def show(estimate: Estimate, metric: str, *, intervals: bool = True) -> str:
 
 def numbers_csv(numbers: Numbers) -> list[list[str]]:
     """Return the numbers as lines of a CSV file, the header first; what was not run is empty."""
-    lines = [["environment", "series", "detectors", "horizon", "parameters", "anomalies", "metric",
-              "value", "low", "high", "environments", "seeds", "state", "paper"]]  # fmt: skip
+    lines = [
+        [
+            "environment",
+            "series",
+            "detectors",
+            "horizon",
+            "parameters",
+            "anomalies",
+            "metric",
+            "value",
+            "low",
+            "high",
+            "environments",
+            "seeds",
+            "state",
+            "paper",
+        ]
+    ]
     for n in numbers.values():
         first, e = n.series.settings[0], n.estimate
         detectors = "+".join(setting.detector for setting in n.series.settings)
         parameters = json.dumps(first.overrides) if first.overrides else ""
         told = [n.environment, n.series.label, detectors, str(first.horizon), parameters]
         state = e.state or ("" if e.environments else NOT_RUN)
-        lines.append([*told, n.scope.id, n.metric, *map(number, e.ends), str(e.environments),
-                      str(e.seeds), state, number(n.paper)])  # fmt: skip
+        lines.append(
+            [
+                *told,
+                n.scope.id,
+                n.metric,
+                *map(number, e.ends),
+                str(e.environments),
+                str(e.seeds),
+                state,
+                number(n.paper),
+            ]
+        )
     return lines
 
 
@@ -238,9 +275,12 @@ def _printed(e: Estimate) -> str:
 
 
 def front_page(
-    reproduction: Reproduction, records: Sequence[Record], made: Sequence[Ruling],
-    sections: Sequence[str], other: Other | None = None,
-) -> str:  # fmt: skip
+    reproduction: Reproduction,
+    records: Sequence[Record],
+    made: Sequence[Ruling],
+    sections: Sequence[str],
+    other: Other | None = None,
+) -> str:
     """Return the page: the run, the claims, the sections, and what failed."""
     tier = reproduction.tier
     done = {(r.setting, r.environment, r.seed) for r in records}
@@ -257,17 +297,24 @@ def front_page(
         failures = markdown_table(Table("What failed", header, rows, labels=5))
         sections = [*sections, "## Failures", "", failures]
     return fill(
-        "page", tier=tier.name, data=_data(reproduction), near=tier.seeds_near,
+        "page",
+        tier=tier.name,
+        data=_data(reproduction),
+        near=tier.seeds_near,
         far="" if tier.seeds_far == tier.seeds_near else tier.seeds_far,
-        done=len(done), units=reproduction.units, failed=len(failed),
+        done=len(done),
+        units=reproduction.units,
+        failed=len(failed),
         unfinished=len(done) < reproduction.units,
         split="" if reproduction.split == tier.split else reproduction.split,
         made="".join(f"- Made with {one}.\n" for one in software),
-        updates=" or ".join(map(str, updates)), summary=summary(made),
+        updates=" or ".join(map(str, updates)),
+        summary=summary(made),
         claims=markdown_table(claims_table(made, other)).split("\n", 2)[2],
-        other=other.name if other else "", changed=changed(made, other) if other else "",
+        other=other.name if other else "",
+        changed=changed(made, other) if other else "",
         sections="\n".join(sections),
-    )  # fmt: skip
+    )
 
 
 def caption(reproduction: Reproduction, experiment: Experiment, numbers: Numbers) -> str:
@@ -276,8 +323,13 @@ def caption(reproduction: Reproduction, experiment: Experiment, numbers: Numbers
     for n in numbers.values():
         if n.estimate.seeds:
             used.setdefault(n.series.label, set()).add(n.estimate.seeds)
-    return fill("caption", place=experiment.place, data=_data(reproduction), seeds=_seeds(used),
-                note=experiment.note)  # fmt: skip
+    return fill(
+        "caption",
+        place=experiment.place,
+        data=_data(reproduction),
+        seeds=_seeds(used),
+        note=experiment.note,
+    )
 
 
 def returns_caption(r: Reproduction) -> str:
@@ -288,21 +340,32 @@ def returns_caption(r: Reproduction) -> str:
 def _data(r: Reproduction) -> str:
     """Describe the data, and what it lacks beside split standard."""
     whole, own = SPLITS["standard"], SPLITS.get(r.split)
-    all_of = {"training trajectories": (r.train, whole.train),
-              "calibration trajectories": (r.calibration, whole.calibration),
-              "test seeds": (r.test, whole.test)}  # fmt: skip
+    all_of = {
+        "training trajectories": (r.train, whole.train),
+        "calibration trajectories": (r.calibration, whole.calibration),
+        "test seeds": (r.test, whole.test),
+    }
     part_of = own is not None and own.seed_base == whole.seed_base
-    fewer = [(f"{few} of " if part_of else "") + f"{most} {part}"
-             for part, (few, most) in all_of.items() if few < most]  # fmt: skip
+    fewer = [
+        (f"{few} of " if part_of else "") + f"{most} {part}"
+        for part, (few, most) in all_of.items()
+        if few < most
+    ]
     listed = " and ".join(filter(None, [", ".join(fewer[:-1]), *fewer[-1:]]))
     lacks = [f"split standard has {listed}"] if fewer else []
     if own and own.episode_cap:
         lacks.append(f"episodes end after {own.episode_cap} steps here")
     return fill(
-        "data", split=r.split, digest=r.split_digest[:12], protocol=r.protocol,
-        train=r.train, calibration=r.calibration, test=r.test,
-        first=listed if part_of else "", lacks="" if part_of else ", and ".join(lacks),
-    )  # fmt: skip
+        "data",
+        split=r.split,
+        digest=r.split_digest[:12],
+        protocol=r.protocol,
+        train=r.train,
+        calibration=r.calibration,
+        test=r.test,
+        first=listed if part_of else "",
+        lacks="" if part_of else ", and ".join(lacks),
+    )
 
 
 def _seeds(used: Mapping[str, set[int]]) -> str:

@@ -27,8 +27,14 @@ LOOK: Final = 1  # raise it when a change of this module changes how figures loo
 MARKERS: Final = "osD^vP*X"
 DRAWN: Final = ("auc", "auc_matched", "delay", "delay_censored", "far")
 # Labels that fit below an axis.
-SHORT: Final = {"calibration": "calibr.", "components": "compon.", "shutdown": "shutd.",
-                "wind-l2r": "wind →", "wind-r2l": "wind ←", "all": "mean"}  # fmt: skip
+SHORT: Final = {
+    "calibration": "calibr.",
+    "components": "compon.",
+    "shutdown": "shutd.",
+    "wind-l2r": "wind →",
+    "wind-r2l": "wind ←",
+    "all": "mean",
+}
 
 
 class Dots(NamedTuple):
@@ -81,8 +87,9 @@ def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) ->
     """
     axis, scopes = experiment.picture.axis, {s.id: s for s in experiment.scopes}
     titles = experiment.row_titles
-    labels = {s.label.rpartition(": ")[::2]: s.label for s in experiment.series
-              if len(s.settings) == 1}  # fmt: skip
+    labels = {
+        s.label.rpartition(": ")[::2]: s.label for s in experiment.series if len(s.settings) == 1
+    }
     horizons = list(dict.fromkeys(horizon for horizon, _ in labels))
     whole = {"rows": list(titles), "scopes": list(scopes), "horizons": horizons}
     outer = {key: names if key != axis else names[:1] for key, names in whole.items()}
@@ -99,8 +106,10 @@ def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) ->
             scale, chance, unit = 100.0, 50.0, f"{info.title} (%)"
         dots = []
         for label in (label for before, label in labels if before == horizon):
-            own = [numbers[p["rows"], labels[p["horizons"], label], p["scopes"], metric]
-                   for p in places]  # fmt: skip
+            own = [
+                numbers[p["rows"], labels[p["horizons"], label], p["scopes"], metric]
+                for p in places
+            ]
             run = [Estimate() if n.estimate.partial else n.estimate for n in own]
             dots.append(_dots(label, run, scale, [scale * n.paper for n in own]))
         over = scopes[scope].title.lower()
@@ -189,8 +198,15 @@ def _panel(axes: Any, panel: Panel) -> None:
         axes.vlines(x, dots.lows, dots.highs, color=f"C{i}", alpha=0.75)
         axes.plot(x, dots.values, **line, clip_on=False)
         if dots.paper:
-            axes.plot(x, dots.paper, **line, markersize=5.5, markerfacecolor="none",
-                      markeredgewidth=0.9, alpha=0.9)  # fmt: skip
+            axes.plot(
+                x,
+                dots.paper,
+                **line,
+                markersize=5.5,
+                markerfacecolor="none",
+                markeredgewidth=0.9,
+                alpha=0.9,
+            )
     if not math.isnan(panel.reference):
         axes.axhline(panel.reference, color="#888888", linewidth=0.9, linestyle=(0, (4, 3)))
     for k in places[1:]:
@@ -198,8 +214,13 @@ def _panel(axes: Any, panel: Panel) -> None:
         axes.axvline(k - 0.5, color="#888888" if strong else "#f0f0f0", linewidth=0.8, zorder=0)
     axes.set_xlim(-0.5, len(places) - 0.5)
     long = max(map(len, panel.categories), default=0) * len(places) > 34
-    axes.set_xticks(places, panel.categories, rotation=40 if long else 0,
-                    ha="right" if long else "center", rotation_mode="anchor")  # fmt: skip
+    axes.set_xticks(
+        places,
+        panel.categories,
+        rotation=40 if long else 0,
+        ha="right" if long else "center",
+        rotation_mode="anchor",
+    )
     axes.set_title(panel.title)
     axes.set_ylabel(panel.unit)
 
@@ -213,7 +234,16 @@ def _legend(picture: Picture) -> tuple[list[Any], list[str]]:
     markers = [MARKERS[i % len(MARKERS)] for i in range(len(labels))]
     handles = [Line2D([], [], color=f"C{i}", marker=marker) for i, marker in enumerate(markers)]
     if any(not math.isnan(x) for one in series for x in one.paper):
-        handles.append(Line2D([], [], color="#333333", marker="o", linestyle="none",
-                              markerfacecolor="none", markersize=5.5))  # fmt: skip
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color="#333333",
+                marker="o",
+                linestyle="none",
+                markerfacecolor="none",
+                markersize=5.5,
+            )
+        )
         labels.append("hollow: the paper's digits")
     return handles, labels

@@ -24,9 +24,15 @@ from oodd_eval.scoring.plan import Unit, make_unit
 
 # Units run stage after stage, and within a stage environment by environment.
 STAGES: Final = (
-    "controls", "models, Δ = 1", "variants of RIQN, Δ = 1", "Δ = 10", "Δ = 20",
-    "more seeds of RIQN, Δ = 1", "more seeds of others, Δ = 1", "more seeds, Δ > 1",
-)  # fmt: skip
+    "controls",
+    "models, Δ = 1",
+    "variants of RIQN, Δ = 1",
+    "Δ = 10",
+    "Δ = 20",
+    "more seeds of RIQN, Δ = 1",
+    "more seeds of others, Δ = 1",
+    "more seeds, Δ > 1",
+)
 
 COSTS: Final[Mapping[str, Mapping[str, tuple[float, float]]]] = json.loads(
     Path(__file__).with_name("costs.json").read_text(encoding="utf-8")
@@ -38,18 +44,25 @@ WORKER_START: Final = 3.0
 
 
 def lay_out(
-    experiments: Sequence[Experiment], tier: Tier, split: Split, plugins: Plugins,
+    experiments: Sequence[Experiment],
+    tier: Tier,
+    split: Split,
+    plugins: Plugins,
     device: str | None = None,
-) -> list[Unit]:  # fmt: skip
+) -> list[Unit]:
     """Return every unit that some experiments need, cheap and informative ones first."""
     found, names = [], list(split.environments)
     for setting in settings_of(experiments):
         offer, given = plugins.offer(setting.detector), setting.overrides
         if device is not None and "device" in parameters_of(offer.spec.parameters):
             given["device"] = device
-        found += [make_unit(offer, given, split, name, split.conditions(name), setting.horizon,
-                            seed, None)
-                  for name in names for seed in tier.seeds(setting)]  # fmt: skip
+        found += [
+            make_unit(
+                offer, given, split, name, split.conditions(name), setting.horizon, seed, None
+            )
+            for name in names
+            for seed in tier.seeds(setting)
+        ]
     return sorted(found, key=lambda unit: (stage_of(unit), names.index(unit.environment)))
 
 
@@ -103,9 +116,12 @@ def remaining_seconds(
 
 
 def stages(
-    wanted: Sequence[Unit], left: Sequence[Unit], rows: Mapping[str, int], fitted: Collection[str],
+    wanted: Sequence[Unit],
+    left: Sequence[Unit],
+    rows: Mapping[str, int],
+    fitted: Collection[str],
     jobs: int,
-) -> Table:  # fmt: skip
+) -> Table:
     """Return what remains of the wanted units, stage by stage, and how long it takes."""
     lines, seen = [], set(fitted)
     for stage, title in [*enumerate(STAGES), (None, "all")]:
@@ -132,9 +148,13 @@ class Progress:
     """An observer that tells of each finished unit, with the time that the others will take."""
 
     def __init__(
-        self, units: Sequence[Unit], rows: Mapping[str, int], jobs: int,
-        tell: Callable[[str], None] | None = None, fitted: Collection[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        units: Sequence[Unit],
+        rows: Mapping[str, int],
+        jobs: int,
+        tell: Callable[[str], None] | None = None,
+        fitted: Collection[str] = (),
+    ) -> None:
         self._open = {(u.environment, u.setting.label(u.seed)): u for u in units}
         self._total, self._rows, self._jobs = len(units), rows, jobs
         self._tell, self._fitted = tell, set(fitted)

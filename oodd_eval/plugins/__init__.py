@@ -19,8 +19,11 @@ PROJECT: Final = "oodd_eval"
 """Name of the pluggy project and of the entry-point group."""
 
 OBSERVER_HOOKS: Final = (
-    "oodd_run_started", "oodd_unit_started", "oodd_cell_finished", "oodd_run_finished",
-)  # fmt: skip
+    "oodd_run_started",
+    "oodd_unit_started",
+    "oodd_cell_finished",
+    "oodd_run_finished",
+)
 """Hooks that `oodd_eval.scoring.observers` specifies and calls."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)

@@ -15,15 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Final,
-    Literal,
-    Protocol,
-    TypeAlias,
-    runtime_checkable,
-)  # fmt: skip
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, runtime_checkable
 
 from oodd_eval.errors import ContractError
 
@@ -242,9 +234,14 @@ def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]
 
 
 def check_scores(
-    scores: object, trajectory: Trajectory | int, *, horizon: int, warm_up: object, detector: str,
+    scores: object,
+    trajectory: Trajectory | int,
+    *,
+    horizon: int,
+    warm_up: object,
+    detector: str,
     where: str,
-) -> Scores:  # fmt: skip
+) -> Scores:
     """Return the scores as a float64 array if they honour the contract.
 
     Parameters

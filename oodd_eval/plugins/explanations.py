@@ -104,9 +104,13 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
     known = (onsets >= 0) & (onsets <= np.arange(rows))
     for name, array, fine, expected in (
         ("shares", shares, undefined | parts, "parts of 1, or NaN alone where it is undefined"),
-        ("onset", onsets, np.where(undefined, onsets == -1, known),
-         "a row from 0 to t, or -1 where the shares are NaN"),
-    ):  # fmt: skip
+        (
+            "onset",
+            onsets,
+            np.where(undefined, onsets == -1, known),
+            "a row from 0 to t, or -1 where the shares are NaN",
+        ),
+    ):
         if not fine.all():
             t = int(fine.argmin())
             raise ContractError(f"explain gives the {name} {array[t]} at t = {t}: {expected}")

@@ -19,10 +19,15 @@ Declared = TypeVar("Declared")
 
 
 def parameter(
-    default: Any, *, low: float | None = None, above: float | None = None,
-    high: float | None = None, choices: tuple[Any, ...] = (), decides: Decides = "fit",
+    default: Any,
+    *,
+    low: float | None = None,
+    above: float | None = None,
+    high: float | None = None,
+    choices: tuple[Any, ...] = (),
+    decides: Decides = "fit",
     help: str = "",  # noqa: A002  argparse's word
-) -> Any:  # fmt: skip
+) -> Any:
     """Declare one parameter in a frozen dataclass of parameters.
 
     Values are at least `low`, more than `above`, at most `high`, and among the `choices`, where
@@ -32,8 +37,14 @@ def parameter(
     scores of the same fit, so that fits are shared over its values, and ``"nothing"`` for what
     changes neither, such as the device that computes: that is no part of a result's identity.
     """
-    facts = {"low": low, "above": above, "high": high, "choices": choices, "decides": decides,
-             "help": help}  # fmt: skip
+    facts = {
+        "low": low,
+        "above": above,
+        "high": high,
+        "choices": choices,
+        "decides": decides,
+        "help": help,
+    }
     # Dataclasses refuse defaults that all instances would share and could change.
     if isinstance(default, list | dict):
         made = functools.partial(copy.deepcopy, default)
@@ -81,8 +92,14 @@ class ParameterInfo:
         return "" if self.high is None or value <= self.high else f"expected at most {self.high:g}"
 
 
-_TYPE_NAMES = {int: "a whole number", float: "a number", str: "a text", bool: "true or false",
-               types.NoneType: "null", list: "a list"}  # fmt: skip
+_TYPE_NAMES = {
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    bool: "true or false",
+    types.NoneType: "null",
+    list: "a list",
+}
 
 
 def parameters_of(declared: type | None) -> dict[str, ParameterInfo]:

@@ -14,22 +14,38 @@ _TEXT: Final = "a printable line of at most 1000 characters"
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field that is wrong."""
     for name, expected, fits in (
-        ("name", "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
-         _matches(SPEC_NAME, spec.name)),
+        (
+            "name",
+            "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
+            _matches(SPEC_NAME, spec.name),
+        ),
         ("factory", "a function or class", callable(spec.factory)),
-        *((name, _TEXT, _is_line(getattr(spec, name)))
-          for name in ("summary", "reference", "extra", "fit_name")),
-        ("inputs", "observations or observations+actions",
-         spec.inputs in ("observations", "observations+actions")),
+        *(
+            (name, _TEXT, _is_line(getattr(spec, name)))
+            for name in ("summary", "reference", "extra", "fit_name")
+        ),
+        (
+            "inputs",
+            "observations or observations+actions",
+            spec.inputs in ("observations", "observations+actions"),
+        ),
         ("alarm", "cusum or score", spec.alarm in ("cusum", "score")),
-        *((name, "True or False", isinstance(getattr(spec, name), bool))
-          for name in ("deterministic", "other_parameters", "horizon_decides_fit")),
-        ("requires", "names of modules",
-         isinstance(spec.requires, tuple | list) and all(map(_is_line, spec.requires))),
+        *(
+            (name, "True or False", isinstance(getattr(spec, name), bool))
+            for name in ("deterministic", "other_parameters", "horizon_decides_fit")
+        ),
+        (
+            "requires",
+            "names of modules",
+            isinstance(spec.requires, tuple | list) and all(map(_is_line, spec.requires)),
+        ),
         ("version", "a version such as 1.2", _matches("[A-Za-z0-9.+!_-]{0,64}", spec.version)),
-        ("parameters", "a dataclass with fields of ASCII names, or None",
-         _declares(spec.parameters)),
-    ):  # fmt: skip
+        (
+            "parameters",
+            "a dataclass with fields of ASCII names, or None",
+            _declares(spec.parameters),
+        ),
+    ):
         if not fits:
             given = getattr(spec, name)
             raise PluginError(f"{name} of a DetectorSpec is {given!r:.80}, expected {expected}")

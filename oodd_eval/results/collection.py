@@ -49,9 +49,11 @@ class Results(Sequence[Record]):
     """
 
     def __init__(
-        self, records: Sequence[Record], directory: ResultsDirectory | None = None,
+        self,
+        records: Sequence[Record],
+        directory: ResultsDirectory | None = None,
         split: Split | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.records = list(records)
         self._directory, self._split = directory, split
 
@@ -85,11 +87,17 @@ class Results(Sequence[Record]):
         for board in boards(self.records):
             for table in (layout.separability(board), layout.guaranteed(board)):
                 if table:
-                    shown = tabulate(table.rows, table.header, "html", colalign=table.alignment,
-                                     disable_numparse=True)  # fmt: skip
+                    shown = tabulate(
+                        table.rows,
+                        table.header,
+                        "html",
+                        colalign=table.alignment,
+                        disable_numparse=True,
+                    )
                     parts.append(f"<p><b>{escape(table.title)}</b></p>{shown}")
-            parts += [f"<p>{escape(f'{r.status}: {r.cell}: {r.reason}')}</p>"
-                      for r in board.failures()]  # fmt: skip
+            parts += [
+                f"<p>{escape(f'{r.status}: {r.cell}: {r.reason}')}</p>" for r in board.failures()
+            ]
         return "\n".join(parts)
 
     @property
@@ -141,15 +149,30 @@ class Results(Sequence[Record]):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Return a flat mapping for each cell: what it is, its metrics, and what it cost."""
-        names = ("split", "environment", "anomaly", "strength", "group", "detector", "horizon",
-                 "seed", "status", "reason", "brief")  # fmt: skip
+        names = (
+            "split",
+            "environment",
+            "anomaly",
+            "strength",
+            "group",
+            "detector",
+            "horizon",
+            "seed",
+            "status",
+            "reason",
+            "brief",
+        )
         costs = ("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb")
         metrics = dict.fromkeys(name for r in self.records for name in r.metrics)
         return [
-            {**{n: getattr(r, n) for n in names}, "row": str(r.setting),
-             **{n: r.value(n) for n in metrics}, **{n: getattr(r, n) for n in costs}}
+            {
+                **{n: getattr(r, n) for n in names},
+                "row": str(r.setting),
+                **{n: r.value(n) for n in metrics},
+                **{n: getattr(r, n) for n in costs},
+            }
             for r in self.records
-        ]  # fmt: skip
+        ]
 
     def to_frame(self) -> Any:
         """Return `to_rows` as a ``pandas.DataFrame``; `MissingExtraError` without pandas."""
@@ -248,7 +271,7 @@ class Results(Sequence[Record]):
 
     def plot_ladder(
         self, *rows: str, metric: str = FOUND, environments: str = "all", anomalies: str = "all"
-    ) -> Figure:  # fmt: skip
+    ) -> Figure:
         """Draw a metric against the strength of anomalies and against the return that they cost.
 
         Parameters
@@ -303,7 +326,17 @@ class Results(Sequence[Record]):
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
                 pairs = zip(file.parts[f"test/{record.condition}"], file.parts[TWINS], strict=True)
                 yield [
-                    ScoredEpisode(record.cell, i, scores, twin, known[i], data.twins[i], sensors,
-                                  int(known.onsets[i]), int(known.effects[i]), rule)
+                    ScoredEpisode(
+                        record.cell,
+                        i,
+                        scores,
+                        twin,
+                        known[i],
+                        data.twins[i],
+                        sensors,
+                        int(known.onsets[i]),
+                        int(known.effects[i]),
+                        rule,
+                    )
                     for i, (scores, twin) in enumerate(pairs)
-                ]  # fmt: skip
+                ]

@@ -47,8 +47,9 @@ def make_curves(
             sweep, rule = fitted[record.scores]
             anomalous = scores[f"test/{record.condition}"]
             known = data.anomalous(record.condition)
-            onsets, effects = (part[: len(anomalous)].tolist()
-                               for part in (known.onsets, known.effects))  # fmt: skip
+            onsets, effects = (
+                part[: len(anomalous)].tolist() for part in (known.onsets, known.effects)
+            )
             curves = cell_curves(sweep, rule, anomalous, onsets, effects)
             units.append({"cell": str(record.cell), **identity(record), **curves})
     return {"schema": SCHEMA, "units": units}

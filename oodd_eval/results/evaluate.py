@@ -44,10 +44,16 @@ class Rules:
 
 
 def cell_metrics(
-    anomalous: Sequence[Scores], twins: Sequence[Scores], onsets: Sequence[int],
-    effects: Sequence[int], rules: Rules, *, environment: str,
-    explained: Sequence[NDArray[np.int32]] = (), corrupted: Sequence[Collection[int]] = (),
-) -> tuple[dict[str, Metric], dict[str, Contribution]]:  # fmt: skip
+    anomalous: Sequence[Scores],
+    twins: Sequence[Scores],
+    onsets: Sequence[int],
+    effects: Sequence[int],
+    rules: Rules,
+    *,
+    environment: str,
+    explained: Sequence[NDArray[np.int32]] = (),
+    corrupted: Sequence[Collection[int]] = (),
+) -> tuple[dict[str, Metric], dict[str, Contribution]]:
     """Compute all metrics of one cell with their intervals; attribution where it is explained."""
     found = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
     thresholds = {}
@@ -101,10 +107,15 @@ def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rule
     starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
     explained = scores.explained.get(f"test/{record.condition}", [])
     metrics, contributions = cell_metrics(
-        anomalous, scores.parts[TWINS], starts, effects, rules, environment=record.environment,
+        anomalous,
+        scores.parts[TWINS],
+        starts,
+        effects,
+        rules,
+        environment=record.environment,
         explained=explained,
         corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
-    )  # fmt: skip
+    )
     per_trajectory = {
         name: np.array([c.numerator, c.denominator]) for name, c in contributions.items()
     }

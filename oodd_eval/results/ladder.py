@@ -90,10 +90,12 @@ def thresholds(records: Sequence[Record]) -> Thresholds:
             places.setdefault(_place(r), {})[r.seed, r.strength] = r
     return {
         setting: {
-            place: threshold for place, own in places.items()
+            place: threshold
+            for place, own in places.items()
             if (threshold := _threshold(place, own, rungs[place]))
-        } for setting, places in cells.items()
-    }  # fmt: skip
+        }
+        for setting, places in cells.items()
+    }
 
 
 def _threshold(
@@ -113,11 +115,20 @@ def _threshold(
 def threshold_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
     """Return a flat mapping for each threshold: what it is of, its value, and its ladder."""
     return [
-        {"row": str(setting), "environment": place[0], "anomaly": place[1],
-         "threshold": own.value, "low": own.interval[0], "high": own.interval[1],
-         "weakest": own.weakest, "strongest": own.strongest, UNIT: unit(place)}
-        for setting, places in thresholds(records).items() for place, own in places.items()
-    ]  # fmt: skip
+        {
+            "row": str(setting),
+            "environment": place[0],
+            "anomaly": place[1],
+            "threshold": own.value,
+            "low": own.interval[0],
+            "high": own.interval[1],
+            "weakest": own.weakest,
+            "strongest": own.strongest,
+            UNIT: unit(place),
+        }
+        for setting, places in thresholds(records).items()
+        for place, own in places.items()
+    ]
 
 
 class Point(NamedTuple):

@@ -116,27 +116,46 @@ def compare(
     for setting in settings:
         seeds = grouped((r for r in records if r.setting == setting), lambda r: r.seed)
         rows[str(setting)] = {
-            seed: {r.place: _signed(contribution(r, metric), sign)
-                   for r in own if r.ok and metric in r.per_trajectory}
+            seed: {
+                r.place: _signed(contribution(r, metric), sign)
+                for r in own
+                if r.ok and metric in r.per_trajectory
+            }
             for seed, own in seeds.items()
-        }  # fmt: skip
-    common = set.intersection(*(
-        {place for place, c in cells.items() if not math.isnan(c.value)}
-        for row in rows.values() for cells in row.values()
-    ))  # fmt: skip
+        }
+    common = set.intersection(
+        *(
+            {place for place, c in cells.items() if not math.isnan(c.value)}
+            for row in rows.values()
+            for cells in row.values()
+        )
+    )
     if not common:
         raise ResultsError(f"{first} and {second} have no cell in common with a value of {metric}")
-    shared = {name: {seed: {place: cells[place] for place in sorted(common)}
-                     for seed, cells in row.items()} for name, row in rows.items()}  # fmt: skip
+    shared = {
+        name: {
+            seed: {place: cells[place] for place in sorted(common)} for seed, cells in row.items()
+        }
+        for name, row in rows.items()
+    }
     tests = rank(shared).comparisons
     one = next(t for t in tests if (t.first, t.second) == (str(settings[0]), str(settings[1])))
     low, high = sorted((sign * one.low, sign * one.high))
-    means = [sum(sum(c.value for c in cells.values()) / len(common) for cells in row.values())
-             / len(row) for row in shared.values()]  # fmt: skip
+    means = [
+        sum(sum(c.value for c in cells.values()) / len(common) for cells in row.values()) / len(row)
+        for row in shared.values()
+    ]
     return PairedComparison(
-        one.first, one.second, metric, (sign * means[0], sign * means[1]), sign * one.difference,
-        low, high, min(t.p_holm for t in tests), len(common),
-    )  # fmt: skip
+        one.first,
+        one.second,
+        metric,
+        (sign * means[0], sign * means[1]),
+        sign * one.difference,
+        low,
+        high,
+        min(t.p_holm for t in tests),
+        len(common),
+    )
 
 
 def _signed(own: Contribution, sign: float) -> Contribution:

@@ -46,8 +46,9 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
         mean = twin[:, d].mean()
         upper.plot((twin[:, d] - mean) / spread[d], "--", color=colour, linewidth=0.8, alpha=0.5)
-        upper.plot((own[:, d] - mean) / spread[d], color=colour, linewidth=0.8,
-                   label=episode.sensors[d])  # fmt: skip
+        upper.plot(
+            (own[:, d] - mean) / spread[d], color=colour, linewidth=0.8, label=episode.sensors[d]
+        )
     upper.set_ylabel("sensor (std. of twin)")
     upper.axvline(episode.onset, color="0.5", linewidth=1)
     _beside(upper)
@@ -71,8 +72,13 @@ def trajectory(episode: ScoredEpisode) -> Figure:
             least = np.nanmin([np.nanmin(line.get_ydata()) for line in lower.lines[:2]])
             lower.set_ylim(min(0.0, least) - 0.05 * top, top)
         if (alarm := episode.alarm) is not None:
-            lower.plot(alarm, min(own_statistic[alarm], 0.95 * top), "v", color=COLOURS[1],
-                       label=f"alarm at row {alarm}")  # fmt: skip
+            lower.plot(
+                alarm,
+                min(own_statistic[alarm], 0.95 * top),
+                "v",
+                color=COLOURS[1],
+                label=f"alarm at row {alarm}",
+            )
     _beside(lower)
     return figure
 
@@ -95,8 +101,14 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
         for twins, style in ((False, "-"), (True, ":")):
             delays = np.array([e.delay(of_twin=twins) for e in episodes])
             share = (delays[~np.isnan(delays), None] <= rows).mean(axis=0)
-            axis.step(rows + 1, 100 * share, style, where="post", color=colour,
-                      label=None if twins else name)  # fmt: skip
+            axis.step(
+                rows + 1,
+                100 * share,
+                style,
+                where="post",
+                color=colour,
+                label=None if twins else name,
+            )
     axis.set_xscale("log")
     axis.set_xlabel("rows from the effect on (dotted: alarms of the nominal twins)")
     axis.set_ylabel("episodes with an alarm (%)")
@@ -123,8 +135,15 @@ def ladder(
             ):
                 known = ~np.isnan(x)
                 y = percent * np.array([p.value for p in drawn])
-                axis.plot(np.array(x)[known], y[known], style, color=colour, markersize=3,
-                          linewidth=1.2 if label else 0.8, label=label)  # fmt: skip
+                axis.plot(
+                    np.array(x)[known],
+                    y[known],
+                    style,
+                    color=colour,
+                    markersize=3,
+                    linewidth=1.2 if label else 0.8,
+                    label=label,
+                )
     left.set_xscale("log")
     left.set_xlabel("strength (1: costs 1 % of the return)")
     right.set_xlabel("return lost (%)")

@@ -18,11 +18,15 @@ _HOME: Final = Path(__file__).parents[1]
 def gather(command: str = "") -> dict[str, Any]:
     """Return the provenance of results computed now, on this machine."""
     return {
-        "oodd_eval": __version__, **_commit(), "command": command,
-        "python": platform.python_version(), "packages": packages(),
-        "platform": platform.platform(), "cpu": _cpu(),
+        "oodd_eval": __version__,
+        **_commit(),
+        "command": command,
+        "python": platform.python_version(),
+        "packages": packages(),
+        "platform": platform.platform(),
+        "cpu": _cpu(),
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-    }  # fmt: skip
+    }
 
 
 def packages() -> dict[str, str]:

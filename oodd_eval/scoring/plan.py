@@ -89,24 +89,43 @@ class Plan:
         """Return the record of a cell with its identity filled in, and no metrics."""
         kind, strength = split_condition(anomaly)
         return Record(
-            detector=unit.setting.detector, horizon=unit.setting.horizon, seed=unit.seed,
-            detector_version=unit.version, plugin=f"{unit.distribution}:{unit.plugin}",
-            plugin_source=unit.source, parameters=dict(unit.shown),
-            overrides=unit.setting.overrides, inputs=unit.inputs, alarm=unit.alarm,
-            deterministic=unit.deterministic, environment=unit.environment, anomaly=kind,
-            strength=strength, group=self.groups[kind],
-            split=self.split, split_digest=self.split_digest, limit=self.limit,
-            scores=unit.scores_key, protocol=PROTOCOL, **outcome,
-        )  # fmt: skip
+            detector=unit.setting.detector,
+            horizon=unit.setting.horizon,
+            seed=unit.seed,
+            detector_version=unit.version,
+            plugin=f"{unit.distribution}:{unit.plugin}",
+            plugin_source=unit.source,
+            parameters=dict(unit.shown),
+            overrides=unit.setting.overrides,
+            inputs=unit.inputs,
+            alarm=unit.alarm,
+            deterministic=unit.deterministic,
+            environment=unit.environment,
+            anomaly=kind,
+            strength=strength,
+            group=self.groups[kind],
+            split=self.split,
+            split_digest=self.split_digest,
+            limit=self.limit,
+            scores=unit.scores_key,
+            protocol=PROTOCOL,
+            **outcome,
+        )
 
 
 def make_plan(
-    plugins: Plugins, *, split: Split, detectors: Sequence[str],
-    environments: Sequence[str], anomalies: Sequence[str] | None = None,
-    horizons: Sequence[int] = (1,), seeds: Sequence[int] = (0,),
-    parameters: Mapping[str, Any] | None = None, limit: int | None = None,
+    plugins: Plugins,
+    *,
+    split: Split,
+    detectors: Sequence[str],
+    environments: Sequence[str],
+    anomalies: Sequence[str] | None = None,
+    horizons: Sequence[int] = (1,),
+    seeds: Sequence[int] = (0,),
+    parameters: Mapping[str, Any] | None = None,
+    limit: int | None = None,
     device: str | None = None,
-) -> Plan:  # fmt: skip
+) -> Plan:
     """Lay out every unit, environments outermost; the cells are the product of all names.
 
     `anomalies` are kinds or conditions, as `Split.anomalies` has them; by default all. `device` is
@@ -143,9 +162,15 @@ def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str
 
 
 def make_unit(
-    offer: Offer, given: Mapping[str, Any], split: Split, environment: str,
-    anomalies: Sequence[str], horizon: int, seed: int, limit: int | None,
-) -> Unit:  # fmt: skip
+    offer: Offer,
+    given: Mapping[str, Any],
+    split: Split,
+    environment: str,
+    anomalies: Sequence[str],
+    horizon: int,
+    seed: int,
+    limit: int | None,
+) -> Unit:
     """Resolve one unit: its parameters, its setting and its keys."""
     spec = offer.spec
     declared = parameters_of(spec.parameters)
@@ -159,23 +184,44 @@ def make_unit(
     }
     source = source_digest(offer.module) if offer.plugin else ""
     identity: dict[str, Any] = {
-        "distribution": offer.distribution, "version": offer.version, "source": source,
-        "detector": spec.name, "parameters": shown, "seed": seed, "horizon": horizon,
-        "environment": environment, "split_digest": split.digest, "limit": limit,
-    }  # fmt: skip
+        "distribution": offer.distribution,
+        "version": offer.version,
+        "source": source,
+        "detector": spec.name,
+        "parameters": shown,
+        "seed": seed,
+        "horizon": horizon,
+        "environment": environment,
+        "split_digest": split.digest,
+        "limit": limit,
+    }
     scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
     fit = ""
     if offer.plugin:
         deciding = {name: value for name, value in shown.items() if kinds[name] == "fit"}
         # A fit serves all splits that have its training part.
-        same: dict[str, Any] = {"detector": spec.fit_name or spec.name, "parameters": deciding,
-                                "split_digest": split.train_digest(environment)}  # fmt: skip
+        same: dict[str, Any] = {
+            "detector": spec.fit_name or spec.name,
+            "parameters": deciding,
+            "split_digest": split.train_digest(environment),
+        }
         if not spec.horizon_decides_fit:
             same["horizon"] = None
         fit = fit_key(identity | same)
     return Unit(
-        environment=environment, setting=Setting.of(spec.name, horizon, overrides), seed=seed,
-        anomalies=tuple(anomalies), parameters=resolved, shown=shown, plugin=offer.plugin,
-        distribution=offer.distribution, version=offer.version, source=source, inputs=spec.inputs,
-        alarm=spec.alarm, deterministic=spec.deterministic, scores_key=scores, fit_key=fit,
-    )  # fmt: skip
+        environment=environment,
+        setting=Setting.of(spec.name, horizon, overrides),
+        seed=seed,
+        anomalies=tuple(anomalies),
+        parameters=resolved,
+        shown=shown,
+        plugin=offer.plugin,
+        distribution=offer.distribution,
+        version=offer.version,
+        source=source,
+        inputs=spec.inputs,
+        alarm=spec.alarm,
+        deterministic=spec.deterministic,
+        scores_key=scores,
+        fit_key=fit,
+    )

@@ -38,9 +38,13 @@ class RunOutcome:
 
 
 def run(
-    plan: Plan, split: Split, plugins: Plugins, settings: RunSettings,
-    results: ResultsDirectory | None = None, observers: Sequence[object] = (),
-) -> RunOutcome:  # fmt: skip
+    plan: Plan,
+    split: Split,
+    plugins: Plugins,
+    settings: RunSettings,
+    results: ResultsDirectory | None = None,
+    observers: Sequence[object] = (),
+) -> RunOutcome:
     """Fit and score every unit of a plan, which was made for the split.
 
     Scores and records are kept in `results`, from which a later run resumes; None keeps nothing.
@@ -89,9 +93,11 @@ def run(
 
 
 def _as_they_finish(
-    jobs: Sequence[UnitJob], executor: Executor, settings: RunSettings,
+    jobs: Sequence[UnitJob],
+    executor: Executor,
+    settings: RunSettings,
     results: ResultsDirectory | None,
-) -> Generator[tuple[int, Scored | None], None, None]:  # fmt: skip
+) -> Generator[tuple[int, Scored | None], None, None]:
     """Yield places of jobs, with None as they begin, and with their scores as they finish.
 
     Only a few more units are begun than are taken, so that few scores are in memory.
@@ -154,9 +160,11 @@ def _as_they_finish(
 
 
 def _in_dependence(
-    jobs: Sequence[UnitJob], executor: Executor, settings: RunSettings,
+    jobs: Sequence[UnitJob],
+    executor: Executor,
+    settings: RunSettings,
     results: ResultsDirectory | None,
-) -> TopologicalSorter[int]:  # fmt: skip
+) -> TopologicalSorter[int]:
     """Return the places of all jobs, those that share a fit behind the first, which makes it."""
     graph: TopologicalSorter[int] = TopologicalSorter()
     makers: dict[str, int] = {}
@@ -178,9 +186,12 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
     steps = int(cost["steps_scored"]) if "steps_scored" in cost else None
     device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
     outcome: dict[str, Any] = {
-        "status": scored.status, "reason": scored.reason, "steps_scored": steps,
+        "status": scored.status,
+        "reason": scored.reason,
+        "steps_scored": steps,
         "counts": {part: len(known.lengths[: plan.limit]) for part, known in counts.items()},
-        "provenance": {**origin, **device}, **{name: cost[name] for name in COSTS if name in cost},
-    }  # fmt: skip
+        "provenance": {**origin, **device},
+        **{name: cost[name] for name in COSTS if name in cost},
+    }
     records = [plan.blank(unit, anomaly, **outcome) for anomaly in unit.anomalies]
     return evaluated(records, scored.file, job.data) if scored.status == "ok" else records

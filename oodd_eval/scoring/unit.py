@@ -124,10 +124,15 @@ class _Work:
         unit, data = self._job.unit, self._job.data
         train = 0 if load else len(data.train.lengths[: self._job.plan.limit])
         request = {
-            "plugin": unit.plugin, "detector": unit.setting.detector, "seed": unit.seed,
-            "horizon": unit.setting.horizon, "parameters": dict(unit.parameters),
-            "train": train, "load": load, "save": save,
-        }  # fmt: skip
+            "plugin": unit.plugin,
+            "detector": unit.setting.detector,
+            "seed": unit.seed,
+            "horizon": unit.setting.horizon,
+            "parameters": dict(unit.parameters),
+            "train": train,
+            "load": load,
+            "save": save,
+        }
         nominal = map(self._shown, islice(data.train, train))
         parts, again = (map(self._members, g) for g in (self._groups, self._explained))
         return run_isolated(request, nominal, parts, again, limits=limits, stop=stop)
@@ -156,9 +161,11 @@ class _Work:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
         unit, limit = self._job.unit, self._job.plan.limit
         detector = contract.make_detector(
-            self._job.offer.spec.factory, seed=unit.seed, horizon=unit.setting.horizon,
+            self._job.offer.spec.factory,
+            seed=unit.seed,
+            horizon=unit.setting.horizon,
             parameters=unit.parameters,
-        )  # fmt: skip
+        )
         detector.fit([*map(self._shown, islice(self._job.data.train, limit))])
         shown = ([*self._members(group)] for group in self._groups)
         returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in shown]
@@ -205,8 +212,10 @@ class _Work:
         wanted = [probe for group in self._explained for probe in group]
         if returned and len(returned) != len(wanted):
             raise ContractError(f"{len(returned)} explanations came back, expected {len(wanted)}")
-        given = {(p.rows < len(parts[p.part][p.index]), p.part, p.index): (p.rows, one)
-                 for p, one in zip(wanted, returned, strict=False)}  # fmt: skip
+        given = {
+            (p.rows < len(parts[p.part][p.index]), p.part, p.index): (p.rows, one)
+            for p, one in zip(wanted, returned, strict=False)
+        }
         found: dict[str, list[Named]] = {}
         for cut, part, i in sorted(given):  # whole ones before those that are cut
             rows, one = given[cut, part, i]

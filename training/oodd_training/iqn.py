@@ -68,8 +68,13 @@ class Network(nn.Module):
 
     def arrays(self, quantiles: int) -> dict[str, np.ndarray[Any, Any]]:
         """Return the weights as a policy file holds them."""
-        layers: dict[str, Any] = {"W1": self.state[0], "W2": self.state[2], "C": self.embedding,
-                  "W3": self.head[0], "W4": self.head[2]}  # fmt: skip
+        layers: dict[str, Any] = {
+            "W1": self.state[0],
+            "W2": self.state[2],
+            "C": self.embedding,
+            "W3": self.head[0],
+            "W4": self.head[2],
+        }
         biases = {"W1": "b1", "W2": "b2", "C": "c", "W3": "b3", "W4": "b4"}
         found: dict[str, np.ndarray[Any, Any]] = {"quantiles": np.array(quantiles)}
         for name, layer in layers.items():

@@ -24,9 +24,14 @@ SELECTION_SEED: Final = 910_000_000
 SELECTION_EPISODES: Final = 100
 
 DEFAULT_STEPS: Final = {
-    "acrobot": 60_000, "cartpole": 60_000, "lunarlander": 400_000, "ant": 1_000_000,
-    "halfcheetah": 1_500_000, "hopper": 1_000_000, "walker2d": 1_000_000,
-}  # fmt: skip
+    "acrobot": 60_000,
+    "cartpole": 60_000,
+    "lunarlander": 400_000,
+    "ant": 1_000_000,
+    "halfcheetah": 1_500_000,
+    "hopper": 1_000_000,
+    "walker2d": 1_000_000,
+}
 
 OTHER_STEPS: Final = 200_000  # of an environment of one's own
 

@@ -78,9 +78,10 @@ class Forest:
         counts, depths = take(arrays, "counts", (None,), "i"), take(arrays, "depths", (None,), "i")
         total = int(counts.sum()) if (counts > 0).all() else -1
         left, right = (take(arrays, n, (total,), "i") for n in ("left", "right"))
-        feature, threshold = take(arrays, "feature", (total,), "i"), take(
-            arrays, "threshold", (total,)
-        )  # fmt: skip
+        feature, threshold = (
+            take(arrays, "feature", (total,), "i"),
+            take(arrays, "threshold", (total,)),
+        )
         leaf = left < 0
         leaves = take(arrays, "leaves", (int(leaf.sum()), features))
         values = np.zeros((total, features, 1))
@@ -90,8 +91,11 @@ class Forest:
         ends = np.cumsum(counts).tolist()
         parts = [slice(end - count, end) for end, count in zip(ends, counts.tolist(), strict=True)]
         nodes = {
-            "left_child": left, "right_child": right, "feature": feature, "threshold": threshold,
-        }  # fmt: skip
+            "left_child": left,
+            "right_child": right,
+            "feature": feature,
+            "threshold": threshold,
+        }
         trees = [
             _tree({n: a[p] for n, a in nodes.items()}, values[p], depth, window * features)
             for p, depth in zip(parts, depths.tolist(), strict=True)

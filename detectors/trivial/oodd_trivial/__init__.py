@@ -235,8 +235,13 @@ class Range(_Scaled):
         self.longest_ = np.where(counts == 1, np.iinfo(np.int64).max, longest)
 
     def _arrays(self) -> Arrays:
-        return {"low": self.low_, "high": self.high_, "values": self.values_,
-                "discrete": self.discrete_.astype("int64"), "longest": self.longest_}  # fmt: skip
+        return {
+            "low": self.low_,
+            "high": self.high_,
+            "values": self.values_,
+            "discrete": self.discrete_.astype("int64"),
+            "longest": self.longest_,
+        }
 
     def _restore(self, arrays: Arrays, sensors: int) -> None:
         from oodd_eval.plugins.state import take

@@ -22,9 +22,14 @@ class Draw(Fault):
     """One anomaly as drawn: corrupted `sensors`, new values of the simulator's `attributes`."""
 
     def __init__(
-        self, anomaly: str, parameters: dict[str, Any], rng: np.random.Generator, *,
-        sensors: NDArray[np.intp] | None = None, attributes: dict[str, float] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        anomaly: str,
+        parameters: dict[str, Any],
+        rng: np.random.Generator,
+        *,
+        sensors: NDArray[np.intp] | None = None,
+        attributes: dict[str, float] | None = None,
+    ) -> None:
         super().__init__(parameters)
         self.anomaly, self._rng = anomaly, rng
         self.sensors = np.zeros(0, dtype=np.intp) if sensors is None else sensors

@@ -97,10 +97,14 @@ class Chunk:
 
 
 def build_split(
-    definition: SplitDefinition, directory: Path, *, environments: Iterable[str] | None = None,
-    policies: Mapping[str, Path] | None = None, jobs: int | None = None,
+    definition: SplitDefinition,
+    directory: Path,
+    *,
+    environments: Iterable[str] | None = None,
+    policies: Mapping[str, Path] | None = None,
+    jobs: int | None = None,
     progress: Progress = lambda _done, _total, _what: None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Build a split into a directory and return the directory; resume an earlier build.
 
     Complete environments there are kept. By default there are all seven, the frozen policies act,
@@ -161,10 +165,13 @@ def _write(
             for part in (TRAIN, CALIBRATION, TWINS, *(f"test/{c}" for c in conditions))
         )
         return layout.write_environment(
-            directory / f"{environment}.h5", groups, policy, sensors=info.sensors,
+            directory / f"{environment}.h5",
+            groups,
+            policy,
+            sensors=info.sensors,
             actions=info.actions,
             own=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
-        ) | _strengths(definition, environment)  # fmt: skip
+        ) | _strengths(definition, environment)
 
 
 def _check_sizes(definition: SplitDefinition) -> None:

@@ -70,9 +70,14 @@ def twins_of(
 
 
 def measure(
-    environment: str, kind: str, strength: float, first: int = FIRST_SEED, count: int = 0,
-    *, whole: bool = False,
-) -> list[float]:  # fmt: skip
+    environment: str,
+    kind: str,
+    strength: float,
+    first: int = FIRST_SEED,
+    count: int = 0,
+    *,
+    whole: bool = False,
+) -> list[float]:
     """Return the returns of the seeds under an anomaly of a strength."""
     setup = setup_of(environment, whole=whole)
     episodes = (
@@ -192,11 +197,13 @@ def find_rungs(
         kept_low, kept_high = np.percentile(draws[i], [2.5, 97.5])
         return {
             "strength": float(strengths[i]),
-            "low": _rounded(min(low, strengths[i])), "high": _rounded(max(high, strengths[i])),
+            "low": _rounded(min(low, strengths[i])),
+            "high": _rounded(max(high, strengths[i])),
             "kept": _rounded(kept[i]),
-            "kept_low": _rounded(kept_low), "kept_high": _rounded(kept_high),
+            "kept_low": _rounded(kept_low),
+            "kept_high": _rounded(kept_high),
             "reached": bool(fitted[-1] <= level),
-        }  # fmt: skip
+        }
 
     levels = levels_of(environment, kind, whole=whole)
     if whole:
@@ -218,10 +225,15 @@ def _rounded(value: float) -> float:
 
 
 def calibrate(
-    output: Path, work: Path, *, environments: Iterable[str], kinds: Sequence[str],
-    whole: bool = False, jobs: int | None = None,
+    output: Path,
+    work: Path,
+    *,
+    environments: Iterable[str],
+    kinds: Sequence[str],
+    whole: bool = False,
+    jobs: int | None = None,
     progress: Callable[[str], None] = lambda _text: None,
-) -> dict[str, dict[str, Any]]:  # fmt: skip
+) -> dict[str, dict[str, Any]]:
     """Measure and find the rungs of some environments and kinds; return all that `output` has.
 
     `whole` finds the rung of robots for whole episodes, and of the paper's kinds alone. Returns
@@ -229,9 +241,10 @@ def calibrate(
     """
     places = [
         (e, kind)
-        for e in environments for kind in kinds
+        for e in environments
+        for kind in kinds
         if not whole or (kind in TABLE1 and not ENVIRONMENTS[e].discrete)
-    ]  # fmt: skip
+    ]
     measured, broken = _read_work(work)
     caps = [WHOLE] if whole else []
     key = {

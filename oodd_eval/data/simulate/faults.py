@@ -392,9 +392,23 @@ def _replaced(action: Row, j: int, value: float) -> Row:
 
 
 _MAKERS: Final[dict[str, _Maker]] = {
-    "iid": _noise, "calibration": _calibration, "drift": _drift, "shutdown": _shutdown,
-    "wind-l2r": _wind(1), "wind-r2l": _wind(-1), "gravity": _gravity, "components": _components,
-    "ar1": _ar1, "varma": _varma, "delay": _delay, "stuck": _stuck, "gain": _gain, "bias": _bias,
-    "stuck-joint": _stuck_joint, "latency": _latency, "action-noise": _action_noise,
-    "mass": _mass, "friction": _friction,
-}  # fmt: skip
+    "iid": _noise,
+    "calibration": _calibration,
+    "drift": _drift,
+    "shutdown": _shutdown,
+    "wind-l2r": _wind(1),
+    "wind-r2l": _wind(-1),
+    "gravity": _gravity,
+    "components": _components,
+    "ar1": _ar1,
+    "varma": _varma,
+    "delay": _delay,
+    "stuck": _stuck,
+    "gain": _gain,
+    "bias": _bias,
+    "stuck-joint": _stuck_joint,
+    "latency": _latency,
+    "action-noise": _action_noise,
+    "mass": _mass,
+    "friction": _friction,
+}

@@ -33,18 +33,24 @@ PICTURED: Final = "kept75"
 
 _WORDS: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _ATTRIBUTES: Final = {
-    "link_length_1": "length of the inner link", "link_length_2": "length of the outer link",
-    "link_mass_1": "mass of the inner link", "link_mass_2": "mass of the outer link",
-    "pole_length": "half the pole's length", "pole_mass": "mass of the pole",
-    "main_engine_power": "power of the main engine", "power": "motor power",
+    "link_length_1": "length of the inner link",
+    "link_length_2": "length of the outer link",
+    "link_mass_1": "mass of the inner link",
+    "link_mass_2": "mass of the outer link",
+    "pole_length": "half the pole's length",
+    "pole_mass": "mass of the pole",
+    "main_engine_power": "power of the main engine",
+    "power": "motor power",
     "side_engine_power": "power of the side engines",
-}  # fmt: skip
+}
 
 
 def write_pages(
-    directory: Path, *, environments: Iterable[str] = tuple(ENVIRONMENTS),
+    directory: Path,
+    *,
+    environments: Iterable[str] = tuple(ENVIRONMENTS),
     progress: Callable[[str], None] = lambda _text: None,
-) -> None:  # fmt: skip
+) -> None:
     """Write the overview, ``environments.md``, and the pages with their pictures below it.
 
     The same versions write the same bytes. The overview names all environments; `progress` is
@@ -77,11 +83,15 @@ def pictured(environment: str, kind: str) -> tuple[str, float]:
 def overview() -> str:
     """Return the text of ``environments.md``."""
     environments = [
-        (f"[{e}]({NAME}/{e}.md)",
-         f'<img src="{NAME}/{e}.png" alt="{i.title}: a frame" width="160">',
-         *_returns(e), i.observation_dim, f"{i.action_dim}{', one a step' * i.discrete}")
+        (
+            f"[{e}]({NAME}/{e}.md)",
+            f'<img src="{NAME}/{e}.png" alt="{i.title}: a frame" width="160">',
+            *_returns(e),
+            i.observation_dim,
+            f"{i.action_dim}{', one a step' * i.discrete}",
+        )
         for e, i in ENVIRONMENTS.items()
-    ]  # fmt: skip
+    ]
     kinds = [(f"`{k}`", a.title, a.group, a.summary) for k, a in ANOMALIES.items()]
     strengths = [(f"`{k}`", *(_overview_strength(e, k) for e in ENVIRONMENTS)) for k in ANOMALIES]
     columns = ("environment", "", "return", "the paper's", "sensors", "actions")
@@ -123,10 +133,12 @@ def environment_page(environment: str) -> str:
     ours, papers = _returns(environment)
     spread, breakable = spread_of(environment), VALUES["sensors"][environment]
     facts = [
-        ("simulator", f"`{info.simulator}`"), ("longest episode", f"{info.episode_cap} steps"),
-        ("policy", info.policy), ("its mean return over 100 episodes", ours),
+        ("simulator", f"`{info.simulator}`"),
+        ("longest episode", f"{info.episode_cap} steps"),
+        ("policy", info.policy),
+        ("its mean return over 100 episodes", ours),
         ("that of the paper's policy", papers),
-    ]  # fmt: skip
+    ]
     sensors = [
         (i, s.name, _unit(s.unit), f"{spread[i]:.3g}", "yes" if i in breakable else "")
         for i, s in enumerate(info.sensors)

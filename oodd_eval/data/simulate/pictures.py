@@ -140,8 +140,10 @@ def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
         points = " ".join(f"{x(first + i):.1f},{y(value):.1f}" for i, value in enumerate(line))
         shapes.append(f'<polyline points="{points}" stroke="{colour}" stroke-width="1.5"/>')
     if (end := len(episode.trajectory) - 1) < last:
-        shapes.append(f'<circle cx="{x(end):.1f}" cy="{y(lines[CORRUPTED][-1]):.1f}" r="3.5" '
-                      f'fill="{CORRUPTED}"/>')  # fmt: skip
+        shapes.append(
+            f'<circle cx="{x(end):.1f}" cy="{y(lines[CORRUPTED][-1]):.1f}" r="3.5" '
+            f'fill="{CORRUPTED}"/>'
+        )
     size = f'width="{WIDTH}" height="{HEIGHT}"'
     font = 'font-family="sans-serif" font-size="12"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" {size} {font}'

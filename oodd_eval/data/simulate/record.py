@@ -85,9 +85,14 @@ class Episode:
 
 
 def record_seed(
-    environment: str, seed: int, conditions: Iterable[str] | Mapping[str, float | None] = (), *,
-    policy: Policy, episode_cap: int | None = None, noise: float = 0.0,
-) -> dict[str | None, Episode]:  # fmt: skip
+    environment: str,
+    seed: int,
+    conditions: Iterable[str] | Mapping[str, float | None] = (),
+    *,
+    policy: Policy,
+    episode_cap: int | None = None,
+    noise: float = 0.0,
+) -> dict[str | None, Episode]:
     """Record the nominal twin of a seed (key None) and one episode per condition.
 
     Parameters
@@ -127,17 +132,25 @@ def record_seed(
 
 
 def record_nominal(
-    environment: str, seed: int, *, policy: Policy, episode_cap: int | None = None,
+    environment: str,
+    seed: int,
+    *,
+    policy: Policy,
+    episode_cap: int | None = None,
     noise: float = 0.0,
-) -> Episode:  # fmt: skip
+) -> Episode:
     """Record the nominal episode of a seed, a whole number from 0; see `record_seed`."""
     return Setup(environment, policy, episode_cap, noise).record(seed)
 
 
 def evaluate_policy(
-    environment: str, policy: Policy, *, episodes: int = 100, seed: int = EVALUATION_SEED,
+    environment: str,
+    policy: Policy,
+    *,
+    episodes: int = 100,
+    seed: int = EVALUATION_SEED,
     noise: float = 0.0,
-) -> NDArray[np.float64]:  # fmt: skip
+) -> NDArray[np.float64]:
     """Return the returns of nominal episodes, a fresh simulator each, seeds ``seed + i``."""
     if noise:
         measure(environment, policy)
@@ -178,9 +191,13 @@ def generator(environment: str, anomaly: str, seed: int, attempt: int) -> np.ran
 
 
 def record_anomalous(
-    setup: Setup, condition: str, strength: float | None, twin: Episode, *,
+    setup: Setup,
+    condition: str,
+    strength: float | None,
+    twin: Episode,
+    *,
     redraws: int = MAX_REDRAWS,
-) -> Episode:  # fmt: skip
+) -> Episode:
     """Record the episode of a twin's seed under one condition; see `record_seed`.
 
     After so many `redraws` the longest episode is taken.
@@ -228,9 +245,11 @@ def first_difference(rows: _Rows, twin: _Rows) -> int | None:
 
 
 def _run(
-    setup: Setup, seed: int, replayed: Sequence[Any] = (),
+    setup: Setup,
+    seed: int,
+    replayed: Sequence[Any] = (),
     anomaly: tuple[_Maker, np.random.Generator] | None = None,
-) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:  # fmt: skip
+) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
     environment, policy, fault = setup.environment, setup.policy, None
     simulator, info, noisy = make(environment), info_of(environment), _noise(setup, seed)

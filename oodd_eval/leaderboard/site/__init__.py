@@ -26,9 +26,19 @@ PAGE: Final = "index.html"
 PARTS: Final = "data"  # directory of the data files
 
 SCRIPTS: Final = (
-    "core.js", "model.js", "columns.js", "table.js", "filters.js", "plots.js", "player.js",
-    "power.js", "overviews.js", "detector.js", "pair.js", "main.js",
-)  # fmt: skip
+    "core.js",
+    "model.js",
+    "columns.js",
+    "table.js",
+    "filters.js",
+    "plots.js",
+    "player.js",
+    "power.js",
+    "overviews.js",
+    "detector.js",
+    "pair.js",
+    "main.js",
+)
 """Parts of the page's one script, in order."""
 
 LEVELS: Final = 250  # least steps from zero to the largest value of a drawing: one a pixel
@@ -59,9 +69,13 @@ def index(data: Json) -> str:
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     parts = {
-        "version": __version__, "style": style, "style-hash": _digest(style), "script": script,
-        "script-hash": _digest(script), "data": embedded(data),
-    }  # fmt: skip
+        "version": __version__,
+        "style": style,
+        "style-hash": _digest(style),
+        "script": script,
+        "script-hash": _digest(script),
+        "data": embedded(data),
+    }
     # One pass, so that nothing in the data is taken for a place to fill in.
     return re.sub(r"@([a-z-]+)@", lambda match: parts[match[1]], _static("page.html"))
 

@@ -27,22 +27,33 @@ from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.tables.board import Board, Standing, grouped
 
 _COMPARED: Final = (
-    "false_episodes", "early", "delay", "delay_censored", "missed", "found_within_20",
+    "false_episodes",
+    "early",
+    "delay",
+    "delay_censored",
+    "missed",
+    "found_within_20",
     "found_within_100",
-)  # fmt: skip
+)
 WITH_INTERVALS: Final = (
-    "auc_matched", "auc_smoothed", "auc_unpaired", "auc", "delay", "delay_null", "delay_censored",
-    "missed", "far", "far_twin",
+    "auc_matched",
+    "auc_smoothed",
+    "auc_unpaired",
+    "auc",
+    "delay",
+    "delay_null",
+    "delay_censored",
+    "missed",
+    "far",
+    "far_twin",
     *(f"{name}_{HEADLINE}" for name in _COMPARED),
-)  # fmt: skip
+)
 """Metrics that have intervals on the site: those that comparisons are made with."""
 
 SUMMARIES: Final = ("all|all", "all|sensor", "all|dynamics")
 """Selections of cells whose means stand in the index; other means are made from a part."""
 
-ENTRY_FIELDS: Final = (
-    "id", "title", "submitter", "created", "citation", "url", "caption",
-)  # fmt: skip
+ENTRY_FIELDS: Final = ("id", "title", "submitter", "created", "citation", "url", "caption")
 """Fields of an entry that the site shows."""
 
 RANKING_PLACE: Final = WITH_INTERVALS.index(RANKING)
@@ -70,12 +81,15 @@ def site_data(
     used = {*TABLE1, *(name for board in shown for name in board["anomalies"])}
     kinds = [a for a in ANOMALIES.values() if a.id in used]
     data = {
-        "threshold": THRESHOLD, "drift": DRIFT, "metrics": {name: _metric(name) for name in names},
+        "threshold": THRESHOLD,
+        "drift": DRIFT,
+        "metrics": {name: _metric(name) for name in names},
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
-        "paper": paper_tables()["table5_groups_delta1"], "boards": shown,
+        "paper": paper_tables()["table5_groups_delta1"],
+        "boards": shown,
         "power": [*power],
-    }  # fmt: skip
+    }
     return data, parts
 
 
@@ -110,11 +124,14 @@ def _power(section: SuiteSection) -> Json:
         "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],
         "metrics": [_metric(info.name) | {"chance": info.name == RANKING} for info in metrics],
         "rows": [
-            {"label": str(row), "trivial": board.is_trivial(row),
-             "points": [_points(records[row], info.name) for info in metrics]}
+            {
+                "label": str(row),
+                "trivial": board.is_trivial(row),
+                "points": [_points(records[row], info.name) for info in metrics],
+            }
             for row in rows
         ],
-    }  # fmt: skip
+    }
 
 
 def _points(records: Sequence[Record], metric: str) -> list[list[float | None]]:
@@ -153,8 +170,9 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
             part: [_mean(records, metric) for records in own] for part, own in by_cell.items()
         }
         parts[metric_part(section.name, metric)] = {
-            "values": values, "intervals": ends if metric == RANKING else {},
-        }  # fmt: skip
+            "values": values,
+            "intervals": ends if metric == RANKING else {},
+        }
     return {
         "id": section.name,
         "episodes": _episodes(section, parts, rows),
@@ -188,9 +206,12 @@ def _episodes(
 
 
 def _row(
-    section: LeaderboardSection, standing: Standing, names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]], units: Units,
-) -> tuple[Json, Json]:  # fmt: skip
+    section: LeaderboardSection,
+    standing: Standing,
+    names: Sequence[str],
+    chosen: Mapping[str, Sequence[SelectedCell]],
+    units: Units,
+) -> tuple[Json, Json]:
     """Return a row's line of the index, and its part."""
     row, records = standing.entry, standing.records
     source, label, ranks = section.sources[row], str(row), section.ranks
@@ -199,39 +220,56 @@ def _row(
     identity = f"{section.name}/{label}"
     have = {(r.environment, r.anomaly) for r in records}
     line = {
-        "id": identity, "part": part_name(identity), "label": label, "detector": row.detector,
-        "plugin": records[0].plugin, "horizon": row.horizon, "overrides": row.overrides,
+        "id": identity,
+        "part": part_name(identity),
+        "label": label,
+        "detector": row.detector,
+        "plugin": records[0].plugin,
+        "horizon": row.horizon,
+        "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        **_fields(standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank",
-                  "ties", "state"),
+        **_fields(
+            standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank", "ties", "state"
+        ),
         "wins": _short(standing.wins),
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
-        "trust": section.trust[row], **_fields(source.meta, "submitter", "caption"),
+        "trust": section.trust[row],
+        **_fields(source.meta, "submitter", "caption"),
         "missing": [i for i, cell in enumerate(chosen.get("all|all", [])) if cell not in have],
-        "failed": [[chosen["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
-                   for r in in_order if not r.ok],
+        "failed": [
+            [chosen["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
+            for r in in_order
+            if not r.ok
+        ],
         "means": _summaries(section, standing, names, chosen, intervals),
-    }  # fmt: skip
+    }
     compared = [c for c in ranks.ranking.comparisons if label in (c.first, c.second)]
     part = {
-        "version": records[0].detector_version, "parameters": records[0].parameters,
-        "command": " && ".join(commands_of(records)), "entry": _entry(source, records[0].plugin),
-        "cells": [_cell(r, names) for r in in_order], "intervals": intervals,
+        "version": records[0].detector_version,
+        "parameters": records[0].parameters,
+        "command": " && ".join(commands_of(records)),
+        "entry": _entry(source, records[0].plugin),
+        "cells": [_cell(r, names) for r in in_order],
+        "intervals": intervals,
         "comparisons": [
             [c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
-            for c in compared if c.first == label
+            for c in compared
+            if c.first == label
         ],
         "worse_than": [c.first for c in compared if c.second == label and c.better],
         "wins": {other: _short(rate) for (one, other), rate in ranks.rates.items() if one == label},
         "curves": _curves(units.get(source.meta.id, []), records),
-    }  # fmt: skip
+    }
     return line, part
 
 
 def _summaries(
-    section: LeaderboardSection, standing: Standing, names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]], intervals: Json,
-) -> dict[str, list[list[int | None]]]:  # fmt: skip
+    section: LeaderboardSection,
+    standing: Standing,
+    names: Sequence[str],
+    chosen: Mapping[str, Sequence[SelectedCell]],
+    intervals: Json,
+) -> dict[str, list[list[int | None]]]:
     """Return means over the selections of the index: values, then low and high ends.
 
     They are whole numbers of the last digit that is printed, None where there is none.
@@ -242,10 +280,12 @@ def _summaries(
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
         own = intervals.get(key, [None] * len(_with_intervals(names)))
         ends = [
-            [_digits(NAN if pair is None or pair[i] is None else pair[i], name)
-             for pair, name in zip(own, _with_intervals(names), strict=True)]
+            [
+                _digits(NAN if pair is None or pair[i] is None else pair[i], name)
+                for pair, name in zip(own, _with_intervals(names), strict=True)
+            ]
             for i in (0, 1)
-        ]  # fmt: skip
+        ]
         found[key.partition("|")[2]] = [values, *ends]
     return found
 
@@ -280,7 +320,7 @@ def _entry(entry: SubmittedEntry, plugin: str) -> Json:
     return _fields(meta, *ENTRY_FIELDS) | {
         "source_digest": digests.get(plugin, ""),
         "grant": grant and _fields(grant, "by", "day", "how"),
-    }  # fmt: skip
+    }
 
 
 def _cell(record: Record, names: Sequence[str]) -> Json:
@@ -298,9 +338,11 @@ def _cell(record: Record, names: Sequence[str]) -> Json:
 
 
 def _intervals(
-    board: Board, standing: Standing, names: Sequence[str],
+    board: Board,
+    standing: Standing,
+    names: Sequence[str],
     chosen: Mapping[str, Sequence[SelectedCell]],
-) -> Json:  # fmt: skip
+) -> Json:
     """Intervals of means by key of the selection, in the order of the board's ``intervals``.
 
     A single record has its own.

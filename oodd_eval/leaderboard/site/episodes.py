@@ -41,8 +41,10 @@ def _sensors(data: EnvironmentData, anomaly: str, index: int) -> list[Json]:
     both = min(len(own), len(twin))
     spread = np.maximum(twin.std(axis=0), 1e-6)
     apart = np.abs(own[:both] - twin[:both]).mean(axis=0) / spread
-    return [_sensor(_title(data.sensors[d]), own[:, d], twin[:, d])
-            for d in np.argsort(-apart, kind="stable")[:SHOWN]]  # fmt: skip
+    return [
+        _sensor(_title(data.sensors[d]), own[:, d], twin[:, d])
+        for d in np.argsort(-apart, kind="stable")[:SHOWN]
+    ]
 
 
 def _title(sensor: Quantity) -> str:

@@ -42,9 +42,13 @@ _Numbers = dict[object, tuple[str, str]]  # by place and numbers of a cell: its 
 
 @without_collector()
 def verify_entry(
-    directory: Path, *, name: str = "", split: str | Path | None = None,
-    rerun: Sequence[Record] = (), order: RerunOrder | None = None,
-) -> EntryVerdict:  # fmt: skip
+    directory: Path,
+    *,
+    name: str = "",
+    split: str | Path | None = None,
+    rerun: Sequence[Record] = (),
+    order: RerunOrder | None = None,
+) -> EntryVerdict:
     """Check one entry, which is going to have another name if one is given.
 
     `split` names its split where that is not at its usual place, `rerun` are a verifier's records,

@@ -267,8 +267,10 @@ def _check_trajectories(
         return
     before = findings.count
     for name, part in (
-        ("train", data.train), ("calibration", data.calibration), ("test", data.twins),
-    ):  # fmt: skip
+        ("train", data.train),
+        ("calibration", data.calibration),
+        ("test", data.twins),
+    ):
         findings.expect(where, f"counts.{name}", len(part), record.counts[name], "as the split has")
     if sums is None or findings.count > before:
         return

@@ -21,9 +21,10 @@ _RATES: Final = {"far", "far_twin"}
 _MEANS: Final = {*METRICS, *GUARANTEED, *catalogue.ATTRIBUTION} - _RATES
 _AUCS: Final = {name for name in METRICS if name.startswith("auc")}
 _SHARES: Final = {
-    name for name in _MEANS
+    name
+    for name in _MEANS
     if name.startswith(("missed", "early", "found", "false_episodes", "sensor_named"))
-}  # fmt: skip
+}
 _STEPS: Final = _MEANS - _AUCS - _SHARES
 
 _TERMS: Final[tuple[tuple[set[str], Callable[[Any, Any], Mask], str], ...]] = (

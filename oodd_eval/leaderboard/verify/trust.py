@@ -32,9 +32,14 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.tables.board import contribution, grouped
 
 COMPARED: Final = (
-    "auc_matched", "auc", "far_twin", "missed", "delay_censored", "false_episodes_at_5pct",
+    "auc_matched",
+    "auc",
+    "far_twin",
+    "missed",
+    "delay_censored",
+    "false_episodes_at_5pct",
     "delay_censored_at_5pct",
-)  # fmt: skip
+)
 """Metrics whose means over a row's cells have to agree with those of a re-run."""
 
 LEVEL: Final = 0.05
@@ -45,8 +50,15 @@ _NORMAL: Final = 1.96  # half widths of a 95 % interval in standard errors
 LEAST: Final = 3
 """Environments in which a row has to be run again, so that a difference has an interval."""
 
-_FIELDS: Final = ("detector_version", "plugin", "plugin_source", "status", "deterministic", "alarm",
-                  "inputs")  # fmt: skip
+_FIELDS: Final = (
+    "detector_version",
+    "plugin",
+    "plugin_source",
+    "status",
+    "deterministic",
+    "alarm",
+    "inputs",
+)
 """Fields of a record that are the same in a re-run."""
 
 
@@ -182,10 +194,13 @@ def _differences(
         pairs: dict[str, list[list[float]]] = {}
         for (environment, _), sides in cells.items():
             own = [
-                [drawn_cell(environment, r.seed, contribution(r, metric))
-                 for r in side if r.ok and metric in r.per_trajectory]
+                [
+                    drawn_cell(environment, r.seed, contribution(r, metric))
+                    for r in side
+                    if r.ok and metric in r.per_trajectory
+                ]
                 for side in sides
-            ]  # fmt: skip
+            ]
             both = [nan_mean(value for cell in side for value in cell.values) for side in own]
             if not any(map(math.isnan, both)):
                 pairs.setdefault(environment, []).append(both)

@@ -12,8 +12,13 @@ from oodd_eval.plugins.conformance import checks_consistency, checks_contract, c
 from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
 from oodd_eval.plugins.discovery import printable
 
-STATUSES: Final = {"passed": "passed", "failed": "failed", "skipped": "skipped",
-                   "xfailed": "failed as expected", "xpassed": "passed unexpectedly"}  # fmt: skip
+STATUSES: Final = {
+    "passed": "passed",
+    "failed": "failed",
+    "skipped": "skipped",
+    "xfailed": "failed as expected",
+    "xpassed": "passed unexpectedly",
+}
 """Statuses and what the summary calls them; failed and xpassed are not all right."""
 
 _COLUMNS: Final = 80

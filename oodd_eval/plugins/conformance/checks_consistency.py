@@ -23,7 +23,7 @@ from oodd_eval.plugins.conformance.trial import (
     must_equal,
     noisy_from,
     offered,
-)  # fmt: skip
+)
 from oodd_eval.plugins.contract import Detector, StorableDetector
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 

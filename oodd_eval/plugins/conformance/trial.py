@@ -52,9 +52,13 @@ class Trial:
     """
 
     def __init__(
-        self, factory: Factory, *, horizon: int = 1, seed: int = 0,
+        self,
+        factory: Factory,
+        *,
+        horizon: int = 1,
+        seed: int = 0,
         parameters: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.spec = (
             factory
             if isinstance(factory, DetectorSpec)

@@ -31,9 +31,14 @@ POLL_SECONDS: Final = 0.05  # between two looks at a child that is silent
 LOOK_SECONDS: Final = 0.5  # between two looks at all processes of a sandbox, which take longer
 
 _SINGLE_THREAD: Final = (
-    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS", "LOKY_MAX_CPU_COUNT",
-)  # fmt: skip
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "LOKY_MAX_CPU_COUNT",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +88,14 @@ class Child:
             command, more = box.command(command)
             descriptors = (*descriptors, more)
         self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            pass_fds=descriptors, env=environment, start_new_session=True,
-        )  # fmt: skip
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            pass_fds=descriptors,
+            env=environment,
+            start_new_session=True,
+        )
         for descriptor in descriptors:
             os.close(descriptor)
         self.channel = Channel(self._receiving, self.sending, self._wait)

@@ -21,14 +21,32 @@ SCRATCH: Final = Path("/tmp")  # noqa: S108  of the sandbox, not of the system
 PROCESSES: Final = 256  # at most, in a sandbox
 
 _READ_ONLY: Final = (
-    "/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/sys/devices/system/cpu",
-    "/etc/alternatives", "/etc/fonts", "/etc/group", "/etc/ld.so.cache", "/etc/localtime",
-    "/etc/nsswitch.conf", "/etc/passwd", "/etc/timezone",
-)  # fmt: skip
+    "/usr",
+    "/bin",
+    "/sbin",
+    "/lib",
+    "/lib32",
+    "/lib64",
+    "/libx32",
+    "/sys/devices/system/cpu",
+    "/etc/alternatives",
+    "/etc/fonts",
+    "/etc/group",
+    "/etc/ld.so.cache",
+    "/etc/localtime",
+    "/etc/nsswitch.conf",
+    "/etc/passwd",
+    "/etc/timezone",
+)
 _KEPT: Final = ("LANG", "LANGUAGE", "PATH", "TZ")  # of the user's environment
 _SUFFIXES: Final = (
-    *importlib.machinery.all_suffixes(), ".dist-info", ".egg-info", ".egg", ".zip", ".pth",
-)  # fmt: skip
+    *importlib.machinery.all_suffixes(),
+    ".dist-info",
+    ".egg-info",
+    ".egg",
+    ".zip",
+    ".pth",
+)
 
 
 class Sandbox:
@@ -104,9 +122,15 @@ def require_sandbox() -> None:
     try:
         command, descriptor = box.command([sys.executable, "-I", "-c", ""])
         done = subprocess.run(  # noqa: S603  bubblewrap and our own interpreter
-            command, pass_fds=[descriptor], env=box.environment(), stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, errors="replace", check=False,
-        )  # fmt: skip
+            command,
+            pass_fds=[descriptor],
+            env=box.environment(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
         os.close(descriptor)
     finally:
         box.close()

@@ -48,10 +48,14 @@ class Outcome:
 
 
 def run_isolated(
-    request: Mapping[str, Any], train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]] = (), *,
-    limits: Limits, stop: Stop,
-) -> Outcome:  # fmt: skip
+    request: Mapping[str, Any],
+    train: Iterable[Trajectory],
+    groups: Iterable[Iterable[Trajectory]],
+    explained: Iterable[Iterable[Trajectory]] = (),
+    *,
+    limits: Limits,
+    stop: Stop,
+) -> Outcome:
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
 
     A detector that explains is asked to explain the groups `explained` in the same way, last.
@@ -74,10 +78,14 @@ def run_isolated(
 
 
 def _isolated(
-    request: Mapping[str, Any], train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]],
-    limits: Limits, stop: Stop, box: Sandbox | None,
-) -> Outcome:  # fmt: skip
+    request: Mapping[str, Any],
+    train: Iterable[Trajectory],
+    groups: Iterable[Iterable[Trajectory]],
+    explained: Iterable[Iterable[Trajectory]],
+    limits: Limits,
+    stop: Stop,
+    box: Sandbox | None,
+) -> Outcome:
     child = Child("oodd_eval.plugins.isolation.worker", limits, stop, box)
     outcome, expected = Outcome(), _Expected()
     # From another thread, so that neither side can deadlock on a full pipe.
@@ -177,10 +185,13 @@ def _noted(
 
 
 def _send(
-    child: Child, request: Mapping[str, Any], train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]],
+    child: Child,
+    request: Mapping[str, Any],
+    train: Iterable[Trajectory],
+    groups: Iterable[Iterable[Trajectory]],
+    explained: Iterable[Iterable[Trajectory]],
     explains: "Future[bool]",
-) -> None:  # fmt: skip
+) -> None:
     channel = child.channel
     try:
         channel.send({**request})

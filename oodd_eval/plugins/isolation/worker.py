@@ -44,9 +44,11 @@ from oodd_eval.plugins.explanations import explain_chunk, explains
 from oodd_eval.plugins.isolation import MARK, ROW_BYTES, Channel, end_all
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
-    MemoryError: "oom", NotImplementedError: "incompatible", ContractError: "invalid",
+    MemoryError: "oom",
+    NotImplementedError: "incompatible",
+    ContractError: "invalid",
     ModuleNotFoundError: "unavailable",
-}  # fmt: skip
+}
 """Status of a cell by what its detector raised."""
 
 

@@ -79,15 +79,22 @@ class Project:
         """Return the contents of all files by their paths in the project."""
         address = repository()
         names = {
-            "@NAME@": self.name, "@DISTRIBUTION@": self.distribution, "@MODULE@": self.module,
-            "@CLASS@": self.class_name, "@PROJECT@": "oodd-eval", "@SOURCE@": _WHEEL,
-            "@CONDITION@": _CONDITION, "@ADVICE@": _ADVICE,
-        }  # fmt: skip
+            "@NAME@": self.name,
+            "@DISTRIBUTION@": self.distribution,
+            "@MODULE@": self.module,
+            "@CLASS@": self.class_name,
+            "@PROJECT@": "oodd-eval",
+            "@SOURCE@": _WHEEL,
+            "@CONDITION@": _CONDITION,
+            "@ADVICE@": _ADVICE,
+        }
         if address:
             names |= {
                 "@PROJECT@": f"[oodd-eval]({address})",
-                "@SOURCE@": f'"oodd-eval @ git+{address}"', "@CONDITION@": "", "@ADVICE@": "",
-            }  # fmt: skip
+                "@SOURCE@": f'"oodd-eval @ git+{address}"',
+                "@CONDITION@": "",
+                "@ADVICE@": "",
+            }
         templates = files(__name__) / "templates"
 
         def fill(text: str) -> str:

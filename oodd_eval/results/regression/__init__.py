@@ -206,9 +206,13 @@ class Comparison:
 
 
 def compare(
-    now: RecordSet, reference: RecordSet, tolerances: Sequence[Tolerance] = (), *, by: By = "cell",
+    now: RecordSet,
+    reference: RecordSet,
+    tolerances: Sequence[Tolerance] = (),
+    *,
+    by: By = "cell",
     two_sided: bool = False,
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Compare records with a reference, cells under equal conditions only.
 
     Means are over the reference's cells: of a group of anomalies in one environment, or all of a
@@ -254,8 +258,9 @@ def compare(
             whole = outside.issuperset(ids)
             differences += [replace(d, outside=whole) for d in found]
         for cell in own.keys() - cells.keys():
-            new += [Difference(*_parts(cell), t, NAN, own[cell].value(t.metric), "new")
-                    for t in used]  # fmt: skip
+            new += [
+                Difference(*_parts(cell), t, NAN, own[cell].value(t.metric), "new") for t in used
+            ]
     new.sort(key=lambda d: (d.split, d.detector, d.place))
     for one, other in ((reference, now), (now, reference)):
         alone = (c for c in one.boards if c not in other.boards)
@@ -296,9 +301,12 @@ def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Place, list[Cell]]:
 
 
 def _compare_unit(
-    place: _Place, pairs: Sequence[tuple[Record, Record | None]], tolerances: Sequence[Tolerance],
-    *, two_sided: bool,
-) -> list[Difference]:  # fmt: skip
+    place: _Place,
+    pairs: Sequence[tuple[Record, Record | None]],
+    tolerances: Sequence[Tolerance],
+    *,
+    two_sided: bool,
+) -> list[Difference]:
     """Compare one cell, or the mean over several, in every metric."""
     present = [(r, n) for r, n in pairs if n is not None]
     failed = [n for r, n in present if r.ok and not n.ok]
@@ -375,10 +383,16 @@ def write_reference(
         metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
         terms = {name: r.per_trajectory[name] for name in keep if r.ok}
         kept = replace(
-            r, metrics=metrics, per_trajectory=terms, scores="", seconds_fit=NAN,
-            seconds_score=NAN, steps_scored=None, peak_rss_mb=NAN,
+            r,
+            metrics=metrics,
+            per_trajectory=terms,
+            scores="",
+            seconds_fit=NAN,
+            seconds_score=NAN,
+            steps_scored=None,
+            peak_rss_mb=NAN,
             provenance={k: v for k, v in r.provenance.items() if k in known},
-        )  # fmt: skip
+        )
         lines.append(kept.to_json() + "\n")
     content = "".join(lines).encode()
     write_bytes(Path(path), packed(Path(path), content))

@@ -61,8 +61,9 @@ class _RowCells:
         for n in {len(terms[0]) for _, _, terms in stored}:
             names, seeds, own = zip(*(one for one in stored if len(one[2][0]) == n), strict=True)
             both = np.array(own)
-            drawn = drawn_cells(environment, seeds, both[:, 0], both[:, 1],
-                                median=_is_median(metric))  # fmt: skip
+            drawn = drawn_cells(
+                environment, seeds, both[:, 0], both[:, 1], median=_is_median(metric)
+            )
             self._drawn.append((drawn, names))
             self._values += zip(names, seeds, drawn.values, strict=True)
 
@@ -114,9 +115,14 @@ class Board:
         return self._plugins[entry].endswith(":trivial")
 
     def mean(
-        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str, *,
+        self,
+        entry: Setting,
+        environments: Sequence[str],
+        anomalies: Sequence[str],
+        metric: str,
+        *,
         intervals: bool = False,
-    ) -> Value:  # fmt: skip
+    ) -> Value:
         """Return an entry's mean of a metric over cells, seeds included.
 
         The interval resamples test trajectories, the same ones for all cells of an environment,
@@ -134,9 +140,13 @@ class Board:
         return made
 
     def _computed(
-        self, entry: Setting, environments: Sequence[str], anomalies: Sequence[str], metric: str,
+        self,
+        entry: Setting,
+        environments: Sequence[str],
+        anomalies: Sequence[str],
+        metric: str,
         intervals: bool,
-    ) -> Value:  # fmt: skip
+    ) -> Value:
         blank = self._once(self._without_value, entry, environments, anomalies)
         if blank.state:
             return blank
@@ -267,9 +277,7 @@ class RankedBoard(NamedTuple):
     rates: dict[tuple[str, str], float]
 
 
-def primary_settings(
-    records: Iterable[Record], rerun: Collection[Setting] = ()
-) -> set[Setting]:  # fmt: skip
+def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ()) -> set[Setting]:
     """Return one row of each detector: of those with most cells and seeds enough the simplest.
 
     That is the row with the fewest other than default parameters, and then the least horizon. Cells
@@ -289,9 +297,10 @@ def primary_settings(
 
 
 def ranked(
-    records: Sequence[Record], primary: Collection[Setting] | None = None,
+    records: Sequence[Record],
+    primary: Collection[Setting] | None = None,
     rerun: Collection[Setting] = (),
-) -> RankedBoard:  # fmt: skip
+) -> RankedBoard:
     """Rank the rows of one board that have a value in every cell, with all their detector seeds.
 
     Primary rows, one a detector, push others down; by default `primary_settings`. They need three
@@ -312,32 +321,42 @@ def ranked(
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
     ranking, rows = _ranking(by_row, states, first - below, RANKING)
-    by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first)
-                 for e, own in by_row.items()}  # fmt: skip
+    by_alarms = {e: _state(own, len(cells), ALARM_RANKING, e in first) for e, own in by_row.items()}
     alarms, _ = _ranking(by_row, by_alarms, first - below, ALARM_RANKING)
-    rates = win_rates({
-        label: {c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)}
-        for label in ranking.ranks
-    })  # fmt: skip
+    rates = win_rates(
+        {
+            label: {
+                c: nan_mean(own[c].value for own in rows[label].values()) for c in sorted(cells)
+            }
+            for label in ranking.ranks
+        }
+    )
     unranked = set(map(str, below))
     place = {label: i for i, label in enumerate(ranking.ranks)}
     order = sorted(by_row, key=lambda e: (e in below, place.get(str(e), len(place)), _name(e)))
     board = Board([record for entry in order for record in by_row[entry]])
     standings = [
         Standing(
-            entry=entry, records=by_row[entry], trivial=board.is_trivial(entry),
-            primary=entry in first, below=entry in below, rank=ranking.ranks.get(str(entry)),
-            alarm_rank=alarms.ranks.get(str(entry)), ties=ranking.letters(str(entry)),
-            state=states[entry], alarm_state=by_alarms[entry],
+            entry=entry,
+            records=by_row[entry],
+            trivial=board.is_trivial(entry),
+            primary=entry in first,
+            below=entry in below,
+            rank=ranking.ranks.get(str(entry)),
+            alarm_rank=alarms.ranks.get(str(entry)),
+            ties=ranking.letters(str(entry)),
+            state=states[entry],
+            alarm_state=by_alarms[entry],
             wins=nan_mean(
-                rate for (one, other), rate in rates.items()
+                rate
+                for (one, other), rate in rates.items()
                 if one == str(entry) and other not in unranked
             ),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
         )
         for entry in order
-    ]  # fmt: skip
+    ]
     return RankedBoard(board, standings, ranking, alarms, rates)
 
 
@@ -345,9 +364,11 @@ _Rows = dict[str, dict[int, dict[Place, Contribution]]]
 
 
 def _ranking(
-    by_row: Mapping[Setting, Sequence[Record]], states: Mapping[Setting, str],
-    primary: Collection[Setting], metric: str,
-) -> tuple[Ranking, _Rows]:  # fmt: skip
+    by_row: Mapping[Setting, Sequence[Record]],
+    states: Mapping[Setting, str],
+    primary: Collection[Setting],
+    metric: str,
+) -> tuple[Ranking, _Rows]:
     """Rank the rows without a state by a metric; where lower is better its sign is turned."""
     rows: _Rows = {}
     for entry in (e for e, state in states.items() if not state):

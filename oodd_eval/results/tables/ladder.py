@@ -44,9 +44,7 @@ def tables(board: Board, *, intervals: bool = False, places: bool = False) -> li
     return [overview(board, found), *made, by_kind, *own]
 
 
-def by_place(
-    board: Board, entry: Setting, found: Thresholds, *, intervals: bool = False
-) -> Table:  # fmt: skip
+def by_place(board: Board, entry: Setting, found: Thresholds, *, intervals: bool = False) -> Table:
     """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
     own = found[entry]
     kinds = [k for k in board.anomalies if any(k == kind for _, kind in own)]

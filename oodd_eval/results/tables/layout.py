@@ -21,9 +21,13 @@ _FEW: Final = 30  # test seeds per environment below which a board calls compari
 _BRIEF: Final = "\N{DAGGER}"  # marks the figures of brief cells
 
 _ALARMS: Final = (
-    "delay", "missed", *(f"found_within_{k}" for k in catalogue.FOUND_WITHIN),
-    f"found_within_{catalogue.FOUND_WITHIN[-1]}_null", "false_episodes", "early",
-)  # fmt: skip
+    "delay",
+    "missed",
+    *(f"found_within_{k}" for k in catalogue.FOUND_WITHIN),
+    f"found_within_{catalogue.FOUND_WITHIN[-1]}_null",
+    "false_episodes",
+    "early",
+)
 """Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
 
 _PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
@@ -121,9 +125,13 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
 
 
 def guaranteed(
-    board: Board, suffix: str = "", *, intervals: bool = False, nulls: bool = False,
+    board: Board,
+    suffix: str = "",
+    *,
+    intervals: bool = False,
+    nulls: bool = False,
     standings: Sequence[Standing] = (),
-) -> Table | None:  # fmt: skip
+) -> Table | None:
     """Return guaranteed alarms at a level, mean over cells; None when no record has them.
 
     The level is by default ``at_5pct``, or the strictest that the records have. False episodes
@@ -248,11 +256,30 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
         rank, detector, settings = _labels(one)
         inputs = one.inputs.replace("observations+actions", "+actions") or UNDEFINED
         alarms = _place(one.alarm_rank, one)
-        rows.append([rank, one.ties or UNDEFINED, alarms, detector, settings, inputs,
-                     trust.get(one.entry, UNDEFINED), *_texts(ranks.board, one.entry, columns),
-                     _percent(one.wins)])  # fmt: skip
-    header = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust",
-              *(c.title for c in columns), "win rate"]  # fmt: skip
+        rows.append(
+            [
+                rank,
+                one.ties or UNDEFINED,
+                alarms,
+                detector,
+                settings,
+                inputs,
+                trust.get(one.entry, UNDEFINED),
+                *_texts(ranks.board, one.entry, columns),
+                _percent(one.wins),
+            ]
+        )
+    header = [
+        "rank",
+        "ties",
+        "alarm rank",
+        "detector",
+        "settings",
+        "inputs",
+        "trust",
+        *(c.title for c in columns),
+        "win rate",
+    ]
     return Table("Ranking by matched AUC (%)", header, rows, labels=7)
 
 

@@ -74,15 +74,25 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
             column: board.mean(one.entry, board.environments, anomalies, metric, intervals=True)
             for column, (metric, anomalies) in wanted.items()
         }
-        lines.append({
-            "rank": one.rank, "ties": one.ties, "alarm_rank": one.alarm_rank, "state": one.state,
-            **_setting(one.entry), "trivial": str(one.trivial).lower(),
-            "primary": str(one.primary).lower(), "seeds": one.seeds, "inputs": one.inputs,
-            "trust": trust.get(one.entry, ""), "win_rate": number(one.wins),
-            "seconds_fit": number(one.cost.fit), "microseconds_per_step": number(one.cost.step),
-            "peak_rss_mb": number(one.cost.peak),
-            **dict(zip(_columns(means), _texts(means.values()), strict=True)),
-        })  # fmt: skip
+        lines.append(
+            {
+                "rank": one.rank,
+                "ties": one.ties,
+                "alarm_rank": one.alarm_rank,
+                "state": one.state,
+                **_setting(one.entry),
+                "trivial": str(one.trivial).lower(),
+                "primary": str(one.primary).lower(),
+                "seeds": one.seeds,
+                "inputs": one.inputs,
+                "trust": trust.get(one.entry, ""),
+                "win_rate": number(one.wins),
+                "seconds_fit": number(one.cost.fit),
+                "microseconds_per_step": number(one.cost.step),
+                "peak_rss_mb": number(one.cost.peak),
+                **dict(zip(_columns(means), _texts(means.values()), strict=True)),
+            }
+        )
     return csv_rows(lines)
 
 
@@ -94,16 +104,28 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
     """
     known: list[dict[str, object]] = [
         {
-            **about, "split": r.split, "digest": r.split_digest, "protocol": r.protocol,
-            "limit": "" if r.limit is None else r.limit, "detector": r.detector,
-            "version": r.detector_version, "horizon": r.horizon,
-            "overrides": r.setting.overrides_json, "seed": r.seed, "environment": r.environment,
-            "group": r.group, "anomaly": r.anomaly, "strength": r.strength, "status": r.status,
-            "brief": str(r.brief).lower(), "seconds_fit": number(r.seconds_fit),
+            **about,
+            "split": r.split,
+            "digest": r.split_digest,
+            "protocol": r.protocol,
+            "limit": "" if r.limit is None else r.limit,
+            "detector": r.detector,
+            "version": r.detector_version,
+            "horizon": r.horizon,
+            "overrides": r.setting.overrides_json,
+            "seed": r.seed,
+            "environment": r.environment,
+            "group": r.group,
+            "anomaly": r.anomaly,
+            "strength": r.strength,
+            "status": r.status,
+            "brief": str(r.brief).lower(),
+            "seconds_fit": number(r.seconds_fit),
             "microseconds_per_step": number(cost_of([r]).step),
             "peak_rss_mb": number(r.peak_rss_mb),
-        } for about, r in lines
-    ]  # fmt: skip
+        }
+        for about, r in lines
+    ]
     first = [[*known[0], *_columns(NAMES)]] if header else []
     metrics = (_texts(map(r.metrics.get, NAMES)) for _, r in lines)
     rows = ([*own.values(), *texts] for own, texts in zip(known, metrics, strict=True))
@@ -112,14 +134,28 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
 
 def comparisons_csv(ranks: RankedBoard) -> str:
     """Return one line per ordered pair of ranked rows: difference, p-values, win rate."""
-    header = ["first", "second", "difference", "difference_low", "difference_high", "p", "p_holm",
-              "better", "win_rate"]  # fmt: skip
+    header = [
+        "first",
+        "second",
+        "difference",
+        "difference_low",
+        "difference_high",
+        "p",
+        "p_holm",
+        "better",
+        "win_rate",
+    ]
     place = {label: i for i, label in enumerate(ranks.ranking.ranks)}
     lines = [
-        [c.first, c.second, *map(number, (c.difference, c.low, c.high, c.p, c.p_holm)),
-         str(c.better).lower(), number(ranks.rates[c.first, c.second])]
+        [
+            c.first,
+            c.second,
+            *map(number, (c.difference, c.low, c.high, c.p, c.p_holm)),
+            str(c.better).lower(),
+            number(ranks.rates[c.first, c.second]),
+        ]
         for c in sorted(ranks.ranking.comparisons, key=lambda c: (place[c.first], place[c.second]))
-    ]  # fmt: skip
+    ]
     return csv_text([header, *lines])
 
 
@@ -139,8 +175,11 @@ def _metrics(ranks: RankedBoard) -> list[str]:
 
 
 def _setting(setting: Setting) -> dict[str, object]:
-    return {"detector": setting.detector, "horizon": setting.horizon,
-            "overrides": setting.overrides_json}  # fmt: skip
+    return {
+        "detector": setting.detector,
+        "horizon": setting.horizon,
+        "overrides": setting.overrides_json,
+    }
 
 
 def _columns(names: Iterable[str]) -> list[str]:

@@ -140,11 +140,15 @@ def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
     return {
         "version": __version__,
         "split": {"path": str(split.path.absolute()), "name": str(split.manifest["name"])},
-        "plan": {"split": job.plan.split, "split_digest": job.plan.split_digest,
-                 "groups": dict(job.plan.groups), "limit": job.plan.limit},
+        "plan": {
+            "split": job.plan.split,
+            "split_digest": job.plan.split_digest,
+            "groups": dict(job.plan.groups),
+            "limit": job.plan.limit,
+        },
         "unit": asdict(job.unit),
         "limits": asdict(limits),
-    }  # fmt: skip
+    }
 
 
 def on_worker(order: Message) -> Message:
