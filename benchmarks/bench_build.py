@@ -19,11 +19,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from oodd_recording.build import Chunk, record_chunk
+from oodd_recording.environments import make, quiet_streams
+from oodd_recording.policies import load_policy
 
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.build import Chunk, record_chunk
-from oodd_eval.data.simulate.environments import make, quiet_streams
-from oodd_eval.data.simulate.policies import load_policy
 
 FIRST_SEED = 990 * 10**6
 SHARE = 0.75

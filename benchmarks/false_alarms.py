@@ -16,12 +16,12 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from oodd_recording.policies import load_policy
+from oodd_recording.record import record_nominal
 from scipy.stats import betabinom, binom
 
 from oodd_eval import load_split
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import record_nominal
 from oodd_eval.metrics.alarms import GuaranteedAlarm, offered_levels, quantile_rank
 from oodd_eval.names import select
 from oodd_eval.plugins.contract import make_detector, score_chunk

@@ -37,7 +37,7 @@ ELSEWHERE = (
     "leaderboard/reproduction/*/figures/*",
     "leaderboard/reproduction/*/*.csv",
     "leaderboard/reproduction/*/tables/*.csv",
-    "training/README.md",
+    "recording/README.md",
 )
 """Files outside docs/ that are part of the site, under the same paths."""
 

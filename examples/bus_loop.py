@@ -17,9 +17,9 @@ import time
 
 import gymnasium
 import numpy as np
+from oodd_recording.policies import load_policy
 
 from oodd_eval import load_split
-from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.live import TerminalMonitor, Watchdog
 
 RATE = 50

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from oodd_recording.policies import load_policy
 
 from oodd_eval import load_split
-from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.live import TerminalMonitor, Watchdog, WatchdogWrapper
 
 HEAVIER = {"masspole": 0.4, "length": 1.0}

@@ -14,7 +14,7 @@ from helpers_own import forget_own
 ROOT = Path(__file__).parents[1]
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
-         *sorted((ROOT / "detectors").rglob("*.md")), ROOT / "training" / "README.md",
+         *sorted((ROOT / "detectors").rglob("*.md")), ROOT / "recording" / "README.md",
          *sorted((ROOT / "examples").rglob("*.md"))]  # fmt: skip
 
 TINY_SPLIT = "--train 3 --calibration 2 --test 2 --cap 80"

@@ -64,7 +64,7 @@ def set_viscosity(env, value):
 
 
 def leak(strength, rng, simulator):
-    from oodd_eval.data.simulate.faults import Fault
+    from oodd_recording.faults import Fault
 
     class Leak(Fault):
         def command(self, action, simulator):

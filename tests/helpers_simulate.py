@@ -34,7 +34,7 @@ class Reflex:
 
 def record(environment, anomaly, seed, *, policy, episode_cap=None):
     """Record one episode: nominal, or with an anomaly from a random onset on."""
-    from oodd_eval.data.simulate.record import record_seed
+    from oodd_recording.record import record_seed
 
     names = [] if anomaly is None else [anomaly]
     options = {"policy": policy, "episode_cap": episode_cap}

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
-from oodd_training.freeze import freeze_policy
+from oodd_recording import build
+from oodd_recording.build import Chunk, build_split
+from oodd_recording.policies import FROZEN, load_policy
+from oodd_recording.record import TwinTooShortError, record_seed
+from oodd_recording.train.freeze import freeze_policy
 
 from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
-from oodd_eval.data.simulate import build
-from oodd_eval.data.simulate.build import Chunk, build_split
-from oodd_eval.data.simulate.policies import FROZEN, load_policy
-from oodd_eval.data.simulate.record import TwinTooShortError, record_seed
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 
@@ -112,7 +112,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from oodd_eval.data.facts import SplitDefinition
-from oodd_eval.data.simulate import build
+from oodd_recording import build
 
 if __name__ == "__main__":
     build.CHUNK.update(train=1, calibration=1, test=1)

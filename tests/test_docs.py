@@ -74,7 +74,7 @@ def pages(site):
 
 def test_every_document_is_a_page(site):
     sources = [p.relative_to(DOCS) for p in sorted(DOCS.rglob("*.md"))]
-    beside = [p for d in ("detectors", "training") for p in sorted((ROOT / d).rglob("*.md"))]
+    beside = [p for d in ("detectors", "recording") for p in sorted((ROOT / d).rglob("*.md"))]
     outside = [p.relative_to(ROOT) for p in beside]
     built = [p.with_name("index.md") if p.name == "README.md" else p for p in (*sources, *outside)]
     missing = [p for p in built if not (site / p.with_suffix(".html")).is_file()]

@@ -162,7 +162,7 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
     for folder in known["folders"]:
         shutil.copytree(ROOT / folder, tmp_path / Path(folder).name)
     # A policy is selected by one episode: that shows what a hundred do.
-    monkeypatch.setattr("oodd_training.train.SELECTION_EPISODES", 1)
+    monkeypatch.setattr("oodd_recording.train.train.SELECTION_EPISODES", 1)
     session = Session(tmp_path, monkeypatch)
     request.addfinalizer(session.forget)
     for command in (*known["before"], *commands(path.read_text())):

@@ -85,9 +85,9 @@ def swimmer(monkeypatch):
 
 
 def test_the_swimmer_swims_and_passes_its_checks(swimmer):
-    from oodd_eval.data.simulate.checks import check_own
-    from oodd_eval.data.simulate.policies import load_policy
-    from oodd_eval.data.simulate.record import evaluate_policy
+    from oodd_recording.checks import check_own
+    from oodd_recording.policies import load_policy
+    from oodd_recording.record import evaluate_policy
 
     assert evaluate_policy("swimmer", load_policy("swimmer"), episodes=3).min() > 60
     for spec in swimmer.registered():

@@ -10,14 +10,14 @@ import pytest
 from helpers_simulate import Reflex
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oodd_recording import faults
+from oodd_recording.environments import make
+from oodd_recording.faults import make_fault
+from oodd_recording.policies import load_policy
+from oodd_recording.record import Setup, record_anomalous, record_seed
+from oodd_recording.values import VALUES, bound_of, spread_of, unit_of
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.simulate import faults
-from oodd_eval.data.simulate.environments import make
-from oodd_eval.data.simulate.faults import make_fault
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import Setup, record_anomalous, record_seed
-from oodd_eval.data.simulate.values import VALUES, bound_of, spread_of, unit_of
 from oodd_eval.data.split import load_split
 
 pytestmark = pytest.mark.slow
@@ -138,7 +138,7 @@ def test_noise_is_correlated_as_stated(rows):
 DIGESTS_OF_NOISE = """
 import hashlib
 import numpy as np
-from oodd_eval.data.simulate.faults import make_fault
+from oodd_recording.faults import make_fault
 
 for environment in ("ant", "halfcheetah", "hopper", "acrobot"):
     for seed in range(4):
@@ -356,7 +356,7 @@ def test_noise_of_nominal_operation_is_that_of_the_twin_and_has_the_stated_devia
 
 
 def faults_of_noise(setup):
-    from oodd_eval.data.simulate.record import _noise
+    from oodd_recording.record import _noise
 
     add = _noise(setup, 7)
     return np.array([add(np.zeros(4, np.float32)) for _ in range(2000)]) / spread_of("cartpole")

@@ -11,6 +11,10 @@ from sklearn.isotonic import IsotonicRegression
 
 pytest.importorskip("gymnasium")
 
+from oodd_recording import build, calibrate
+from oodd_recording.build import build_split
+from oodd_recording.values import bound_of, unit_of
+
 from oodd_eval.cli.main import main
 from oodd_eval.data import ladder
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
@@ -24,9 +28,6 @@ from oodd_eval.data.ladder import (
     rungs_of,
     strength_of,
 )
-from oodd_eval.data.simulate import build, calibrate
-from oodd_eval.data.simulate.build import build_split
-from oodd_eval.data.simulate.values import bound_of, unit_of
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SplitError, UnknownNameError
 

@@ -7,13 +7,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 from helpers_docs import ROOT
+from oodd_recording import page, pictures
+from oodd_recording.environments import make
+from oodd_recording.record import Episode
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import read_ladder
-from oodd_eval.data.simulate import page, pictures
-from oodd_eval.data.simulate.environments import make
-from oodd_eval.data.simulate.record import Episode
 from oodd_eval.data.trajectory import Trajectory
 
 DOCS = ROOT / "docs"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
-from oodd_training.freeze import freeze_policy
+from oodd_recording.policies import load_policy, policy_digest
+from oodd_recording.train.freeze import freeze_policy
 
-from oodd_eval.data.simulate.policies import load_policy, policy_digest
 from oodd_eval.errors import PolicyError, UnknownNameError
 
 

@@ -6,9 +6,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from helpers_simulate import SEEDS, Reflex
+from oodd_recording.environments import make
 
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity
-from oodd_eval.data.simulate.environments import make
 
 BULLET = [e for e, info in ENVIRONMENTS.items() if info.family == "bullet"]
 UNITS = {"m", "m/s", "rad", "rad/s", "N m", "1"}

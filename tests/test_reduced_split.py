@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
+from oodd_recording.build import build_split
+
 from oodd_eval.data.facts import SPLITS, SplitDefinition
-from oodd_eval.data.simulate.build import build_split
 from oodd_eval.data.split import load_split
 
 pytestmark = pytest.mark.slow

@@ -10,22 +10,13 @@ from pathlib import Path
 
 import pytest
 from helpers_records import make_record
+from oodd_paper.claims import CLAIMS, RETURN, Claim, Region, claims_table, judge, rulings, summary
+from oodd_paper.estimates import Estimate, Estimator, Side, lost_return
+from oodd_paper.experiments import EXPERIMENTS, read_tables, settings_of
+from oodd_paper.inputs import KINDS
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.errors import ResultsError
-from oodd_eval.paper.claims import (
-    CLAIMS,
-    RETURN,
-    Claim,
-    Region,
-    claims_table,
-    judge,
-    rulings,
-    summary,
-)
-from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
-from oodd_eval.paper.experiments import EXPERIMENTS, read_tables, settings_of
-from oodd_eval.paper.inputs import KINDS
 
 ABOUT_DETECTORS = [c for c in CLAIMS if c.metric != RETURN and not c.settled]
 SETTLED = [c for c in CLAIMS if c.settled]

@@ -10,14 +10,9 @@ import re
 import numpy as np
 import pytest
 from helpers_records import make_record
-
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.bootstrap import bootstrap_weights
-from oodd_eval.metrics.catalogue import UNDEFINED
-from oodd_eval.paper.claims import changed, rulings
-from oodd_eval.paper.estimates import Estimate, Estimator, Side, compute
-from oodd_eval.paper.experiments import (
+from oodd_paper.claims import changed, rulings
+from oodd_paper.estimates import Estimate, Estimator, Side, compute
+from oodd_paper.experiments import (
     EXPERIMENTS,
     FILE,
     TIERS,
@@ -26,7 +21,7 @@ from oodd_eval.paper.experiments import (
     read_tables,
     scope,
 )
-from oodd_eval.paper.inputs import (
+from oodd_paper.inputs import (
     HEADER,
     KINDS,
     RETURNS,
@@ -35,7 +30,7 @@ from oodd_eval.paper.inputs import (
     dump_returns,
     load_returns,
 )
-from oodd_eval.paper.page import (
+from oodd_paper.page import (
     caption,
     front_page,
     layout,
@@ -45,8 +40,13 @@ from oodd_eval.paper.page import (
     returns_tables,
     show,
 )
-from oodd_eval.paper.pictures import pictures_of
-from oodd_eval.paper.run import COSTS
+from oodd_paper.pictures import pictures_of
+from oodd_paper.run import COSTS
+
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.bootstrap import bootstrap_weights
+from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results.identity import Setting
 
 ALL, SENSOR, DYNAMICS = map(scope, ("all", "sensor", "dynamics"))

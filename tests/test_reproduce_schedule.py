@@ -4,11 +4,8 @@ import dataclasses
 
 import pytest
 from helpers_records import make_record
-
-from oodd_eval import load_split
-from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.paper.experiments import EXPERIMENTS, TIERS
-from oodd_eval.paper.run import (
+from oodd_paper.experiments import EXPERIMENTS, TIERS
+from oodd_paper.run import (
     Progress,
     duration,
     estimated_cost,
@@ -18,6 +15,9 @@ from oodd_eval.paper.run import (
     stage_of,
     unfinished,
 )
+
+from oodd_eval import load_split
+from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.identity import Setting
 from oodd_eval.scoring.plan import Unit

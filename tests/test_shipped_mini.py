@@ -9,11 +9,11 @@ pytest.importorskip("gymnasium")
 from gymnasium.envs.box2d import lunar_lander
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+from oodd_recording.anomalies import VALUES
+from oodd_recording.policies import load_policy
 from pybullet_envs_gymnasium import gym_locomotion_envs
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1
-from oodd_eval.data.simulate.anomalies import VALUES
-from oodd_eval.data.simulate.policies import load_policy
 from oodd_eval.data.split import SHIPPED, load_split
 
 SENSOR = [a for a in TABLE1 if ANOMALIES[a].group == "sensor"]

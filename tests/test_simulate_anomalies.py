@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from oodd_recording.anomalies import VALUES, Draw, draw
+from oodd_recording.environments import make
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.simulate.anomalies import VALUES, Draw, draw
-from oodd_eval.data.simulate.environments import make
 from oodd_eval.errors import UnknownNameError
 
 # Table 1 of Danesh & Fern (2021), written out a second time: mean, s.d., factor, slope, wind.

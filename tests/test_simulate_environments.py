@@ -7,11 +7,11 @@ import pytest
 from gymnasium.envs.box2d import lunar_lander
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from helpers_simulate import SEEDS, Reflex
+from oodd_recording.anomalies import VALUES
+from oodd_recording.environments import _Acrobot, make
+from oodd_recording.record import record_nominal
 
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.anomalies import VALUES
-from oodd_eval.data.simulate.environments import _Acrobot, make
-from oodd_eval.data.simulate.record import record_nominal
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UnknownNameError
 

@@ -12,11 +12,11 @@ import pytest
 from helpers_simulate import SEEDS, Reflex, record
 from hypothesis import given
 from hypothesis import strategies as st
+from oodd_recording import record as recording
+from oodd_recording.anomalies import Draw
+from oodd_recording.record import TwinTooShortError, record_nominal, record_seed
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.simulate import record as recording
-from oodd_eval.data.simulate.anomalies import Draw
-from oodd_eval.data.simulate.record import TwinTooShortError, record_nominal, record_seed
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError, UnknownNameError
 

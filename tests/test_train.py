@@ -4,11 +4,11 @@ import json
 import sys
 
 import numpy as np
-import oodd_training
+import oodd_recording.train
 import pytest
+from oodd_recording.policies import FROZEN, load_policy
 
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
-from oodd_eval.data.simulate.policies import FROZEN, load_policy
 from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError
 
 torch = pytest.importorskip("torch")
@@ -16,8 +16,8 @@ pytest.importorskip("gymnasium")
 record, freeze, iqn, td3, train = (
     pytest.importorskip(name)
     for name in (
-        "oodd_eval.data.simulate.record",
-        *(f"oodd_training.{module}" for module in ("freeze", "iqn", "td3", "train")),
+        "oodd_recording.record",
+        *(f"oodd_recording.train.{module}" for module in ("freeze", "iqn", "td3", "train")),
     )
 )
 
@@ -141,8 +141,8 @@ def test_too_few_steps_for_an_evaluation_say_so(tmp_path):
 
 def test_training_without_torch_names_the_extra(tmp_path, monkeypatch):
     for name in ("iqn", "td3"):
-        monkeypatch.delattr(oodd_training, name)
-        monkeypatch.delitem(sys.modules, f"oodd_training.{name}")
+        monkeypatch.delattr(oodd_recording.train, name)
+        monkeypatch.delitem(sys.modules, f"oodd_recording.train.{name}")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingExtraError, match=r"oodd-eval\[train\]"):
         train.train_policy("cartpole", out=tmp_path, steps=40)

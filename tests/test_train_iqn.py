@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from oodd_training.replay import Replay
-
-from oodd_eval.data.simulate.policies import IQNPolicy
+from oodd_recording.policies import IQNPolicy
+from oodd_recording.train.replay import Replay
 
 pytestmark = pytest.mark.slow
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-iqn = pytest.importorskip("oodd_training.iqn")
+iqn = pytest.importorskip("oodd_recording.train.iqn")
 
 
 @pytest.fixture(autouse=True)

@@ -5,14 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from oodd_eval.data.simulate.policies import TD3Policy
+from oodd_recording.policies import TD3Policy
 
 pytestmark = pytest.mark.slow
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
-td3 = pytest.importorskip("oodd_training.td3")
+td3 = pytest.importorskip("oodd_recording.train.td3")
 
 
 @pytest.fixture(autouse=True)

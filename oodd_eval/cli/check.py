@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _own(options: argparse.Namespace, wanted: Predicate) -> int:
     """Check an environment or an anomaly of a plug-in; 1 when a check failed."""
-    from oodd_eval.data.simulate.checks import check_own
+    from oodd_recording.checks import check_own
 
     specs = {spec.name: spec for spec in know_own(options)}
     spec, environment = specs[options.detector], options.detector

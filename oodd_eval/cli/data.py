@@ -140,7 +140,7 @@ def record_split(
 ) -> None:
     """Record a split, by default of all environments and where splits are found."""
     # Other actions need no simulators.
-    from oodd_eval.data.simulate.build import build_split
+    from oodd_recording.build import build_split
 
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
@@ -262,7 +262,7 @@ def verify(options: argparse.Namespace) -> int:
 
 def calibrate(options: argparse.Namespace) -> int:
     """Carry out ``data calibrate``; returns that an earlier call has measured are kept."""
-    from oodd_eval.data.simulate.calibrate import calibrate as find_strengths
+    from oodd_recording.calibrate import calibrate as find_strengths
 
     notes = make_console(quiet=options.verbosity < 0)
     work = options.work or options.output.with_name(options.output.name + ".work")
@@ -315,7 +315,7 @@ def info(options: argparse.Namespace) -> int:
 
 def page(options: argparse.Namespace) -> int:
     """Carry out ``data page``; the overview names all environments."""
-    from oodd_eval.data.simulate.page import NAME, write_pages
+    from oodd_recording.page import NAME, write_pages
 
     notes = make_console(quiet=options.verbosity < 0)
     environments = select("environment", options.env, ENVIRONMENTS)

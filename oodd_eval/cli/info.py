@@ -4,6 +4,7 @@ import argparse
 import json
 from collections.abc import Iterator
 
+from oodd_recording.values import unit_of
 from tabulate import tabulate
 
 from oodd_eval.cli import Parser
@@ -11,7 +12,6 @@ from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.ladder import rungs_of
 from oodd_eval.data.own import AnomalySpec, OwnSpec
-from oodd_eval.data.simulate.values import unit_of
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of

@@ -3,13 +3,13 @@
 import argparse
 from pathlib import Path
 
-from oodd_training.train import train_policy
+from oodd_recording.policies import load_policy
+from oodd_recording.record import evaluate_policy
+from oodd_recording.train.train import train_policy
 
 from oodd_eval.cli import Parser, at_least
 from oodd_eval.cli.terminal import know_own, make_console
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import evaluate_policy
 
 
 def define(parser: Parser) -> None:

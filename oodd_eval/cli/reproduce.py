@@ -3,6 +3,11 @@
 import argparse
 from pathlib import Path
 
+from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
+from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
+from oodd_paper.page import publish
+from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
+
 from oodd_eval.cli import Parser, add_resources, say_notes, value
 from oodd_eval.cli.data import record_split
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
@@ -10,10 +15,6 @@ from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
 from oodd_eval.names import check_known, seconds, select
-from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, TIERS
-from oodd_eval.paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
-from oodd_eval.paper.page import publish
-from oodd_eval.paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record

@@ -93,7 +93,7 @@ class AnomalySpec:
         Largest sensible strength; 0 is nothing at all.
     make
         Called as ``make(strength, rng, simulator)`` at the onset; returns a `Fault` of
-        `oodd_eval.data.simulate.faults`. What it draws comes from the generator `rng` and does not
+        `oodd_recording.faults`. What it draws comes from the generator `rng` and does not
         depend on the strength. ``simulator.env`` is the environment.
     environments
         Names of the environments that it can be recorded in; empty for any.

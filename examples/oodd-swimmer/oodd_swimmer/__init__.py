@@ -28,7 +28,7 @@ def make():
 
 def make_thicker(strength, rng, simulator):
     """Return a fault that multiplies the viscosity of the fluid by 1 + strength."""
-    from oodd_eval.data.simulate.faults import Fault
+    from oodd_recording.faults import Fault
 
     class Thicker(Fault):
         def begin(self, simulator, rows):

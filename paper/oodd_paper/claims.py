@@ -16,11 +16,11 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import NAMES, metric_info
 from oodd_eval.names import check_known
-from oodd_eval.paper.estimates import Estimate, Estimator, Side, lost_return
-from oodd_eval.paper.experiments import read_tables
-from oodd_eval.paper.inputs import Other, Returns
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import csv_rows
+from oodd_paper.estimates import Estimate, Estimator, Side, lost_return
+from oodd_paper.experiments import read_tables
+from oodd_paper.inputs import Other, Returns
 
 NOT_RUN: Final = "not run"
 RETURN: Final = "return"  # the measure of claims about the policies, not about detectors

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
-from oodd_eval.data.simulate.environments import Row, Simulator
-from oodd_eval.data.simulate.faults import Command, Fault
-from oodd_eval.data.simulate.values import VALUES, choose_sensors
 from oodd_eval.names import check_known
+from oodd_recording.environments import Row, Simulator
+from oodd_recording.faults import Command, Fault
+from oodd_recording.values import VALUES, choose_sensors
 
 NOMINAL_MARGIN: Final = 0.02  # draws this near to the nominal value change next to nothing
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.data.own import info_of
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import evaluate_policy
 from oodd_eval.errors import MissingExtraError, PolicyError
-from oodd_training.freeze import freeze_policy
+from oodd_recording.policies import load_policy
+from oodd_recording.record import evaluate_policy
+from oodd_recording.train.freeze import freeze_policy
 
 SELECTION_SEED: Final = 910_000_000
 """First seed of the episodes by which a training picks its best actor."""
@@ -95,7 +95,7 @@ def _make_learner(environment: str, algorithm: str, seed: int) -> Learner:
     try:
         import torch  # noqa: PLC0415  slow to import
 
-        from oodd_training import iqn, td3  # noqa: PLC0415  need torch
+        from oodd_recording.train import iqn, td3  # noqa: PLC0415  need torch
     except ImportError as error:
         raise MissingExtraError(
             f"training needs torch ({error}): pip install 'oodd-eval[train]'"

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, info_of
-from oodd_eval.data.simulate.policies import Policy, load_policy
-from oodd_eval.data.simulate.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
-from oodd_eval.data.simulate.values import bound_of
 from oodd_eval.errors import OoddError, SimulationError
+from oodd_recording.policies import Policy, load_policy
+from oodd_recording.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
+from oodd_recording.values import bound_of
 
 SEEDS: Final = range(960_000_000, 960_000_008)  # outside every split and training
 PARTS: Final = (1 / 16, 1 / 4, 1.0)  # of the bound: strengths whose effects are compared

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import FIRST_ONSET, split_condition
 from oodd_eval.data.own import MEASURED, Measured, environment_spec, info_of, kinds_of
-from oodd_eval.data.simulate.anomalies import draw
-from oodd_eval.data.simulate.environments import Simulator, make
-from oodd_eval.data.simulate.faults import Fault, make_fault
-from oodd_eval.data.simulate.policies import Policy
-from oodd_eval.data.simulate.values import spread_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
+from oodd_recording.anomalies import draw
+from oodd_recording.environments import Simulator, make
+from oodd_recording.faults import Fault, make_fault
+from oodd_recording.policies import Policy
+from oodd_recording.values import spread_of
 
 _Rows = NDArray[np.float32]
 _Maker = Callable[[Simulator, np.random.Generator], Fault]

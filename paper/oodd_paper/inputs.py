@@ -17,10 +17,10 @@ from oodd_eval.data.facts import TABLE1, split_condition
 from oodd_eval.data.files import forms, write_bytes
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.paper.experiments import EXPERIMENTS, Tier, settings_of
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import Record
+from oodd_paper.experiments import EXPERIMENTS, Tier, settings_of
 
 HEADER: Final = "reproduction.json"
 RETURNS: Final = "returns.json"

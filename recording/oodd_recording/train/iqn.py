@@ -1,7 +1,7 @@
 """Implicit quantile networks (Dabney et al. 2018) for the environments with discrete actions.
 
 Double-Q target selection, n-step returns and eight simulators stepped side by side. The network is
-that of `oodd_eval.data.simulate.policies.IQNPolicy`: two state layers, a cosine embedding of the
+that of `oodd_recording.policies.IQNPolicy`: two state layers, a cosine embedding of the
 quantile level multiplied in, one hidden layer, a return per action.
 """
 
@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from oodd_eval.data.own import info_of
-from oodd_eval.data.simulate.environments import make
-from oodd_training.replay import Replay
+from oodd_recording.environments import make
+from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {
     "width": 64,

@@ -13,7 +13,6 @@ from typing import Final
 
 from oodd_eval.data.parts import TWINS
 from oodd_eval.data.split import Split
-from oodd_eval.paper.experiments import CONTROLS, Experiment, Tier, settings_of
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.parameters import parameters_of
@@ -21,6 +20,7 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.scoring.plan import Unit, make_unit
+from oodd_paper.experiments import CONTROLS, Experiment, Tier, settings_of
 
 # Units run stage after stage, and within a stage environment by environment.
 STAGES: Final = (

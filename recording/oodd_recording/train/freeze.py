@@ -13,15 +13,8 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.data.own import info_of
-from oodd_eval.data.simulate.policies import (
-    FROZEN,
-    LAYERS,
-    Arrays,
-    load_policy,
-    make_policy,
-    policy_digest,
-)
-from oodd_eval.data.simulate.record import EVALUATION_SEED, evaluate_policy
+from oodd_recording.policies import FROZEN, LAYERS, Arrays, load_policy, make_policy, policy_digest
+from oodd_recording.record import EVALUATION_SEED, evaluate_policy
 
 
 def freeze_policy(

@@ -48,18 +48,18 @@ from oodd_eval.data.own import (
     registered,
 )
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import (
+from oodd_eval.data.split import Split, load_split
+from oodd_eval.errors import SimulationError, SplitError, UsageError
+from oodd_eval.names import check_known
+from oodd_recording.policies import load_policy
+from oodd_recording.record import (
     GENERATOR_VERSION,
     Episode,
     TwinTooShortError,
     measure,
     record_seed,
 )
-from oodd_eval.data.simulate.values import bound_of, unit_of
-from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import SimulationError, SplitError, UsageError
-from oodd_eval.names import check_known
+from oodd_recording.values import bound_of, unit_of
 
 CHUNK: Final = {
     "train": 25,

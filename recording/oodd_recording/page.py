@@ -22,8 +22,8 @@ from oodd_eval.data.ladder import (
     read_ladder,
     rungs_of,
 )
-from oodd_eval.data.simulate.policies import FROZEN
-from oodd_eval.data.simulate.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
+from oodd_recording.policies import FROZEN
+from oodd_recording.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
 
 NAME: Final = "environments"
 COMMAND: Final = "oodd-eval data page docs"
@@ -57,7 +57,7 @@ def write_pages(
     called with the name of each when its files are written.
     """
     # Texts alone need no simulators.
-    from oodd_eval.data.simulate.pictures import draw_pictures  # noqa: PLC0415
+    from oodd_recording.pictures import draw_pictures  # noqa: PLC0415
 
     write_text(directory / f"{NAME}.md", overview())
     for environment in environments:

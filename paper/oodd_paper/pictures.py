@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.paper.estimates import Estimate, Numbers, mean_return
-from oodd_eval.paper.experiments import Experiment, Grid
-from oodd_eval.paper.inputs import KINDS, Returns
 from oodd_eval.results.record import NAN
+from oodd_paper.estimates import Estimate, Numbers, mean_return
+from oodd_paper.experiments import Experiment, Grid
+from oodd_paper.inputs import KINDS, Returns
 
 STYLE: Final = Path(__file__).with_name("pictures.mplstyle")
 

@@ -22,30 +22,15 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.paper.claims import (
-    NOT_RUN,
-    Ruling,
-    changed,
-    claims_csv,
-    claims_table,
-    rulings,
-    summary,
-)
-from oodd_eval.paper.estimates import (
-    Estimate,
-    Estimator,
-    Numbers,
-    TableNumber,
-    compute,
-    mean_return,
-)
-from oodd_eval.paper.experiments import EXPERIMENTS, TABLE_2, Experiment
-from oodd_eval.paper.inputs import KINDS, Other, Reproduction, Returns, write_changed
-from oodd_eval.paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import csv_text, number
 from oodd_eval.results.tables.rendering import markdown as padded_table
+from oodd_paper.claims import NOT_RUN, Ruling, changed, claims_csv, claims_table, rulings, summary
+from oodd_paper.estimates import Estimate, Estimator, Numbers, TableNumber, compute, mean_return
+from oodd_paper.experiments import EXPERIMENTS, TABLE_2, Experiment
+from oodd_paper.inputs import KINDS, Other, Reproduction, Returns, write_changed
+from oodd_paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 

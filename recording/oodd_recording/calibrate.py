@@ -24,17 +24,11 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
 from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
-from oodd_eval.data.monotone import isotonic
-from oodd_eval.data.simulate.build import workers
-from oodd_eval.data.simulate.policies import load_policy
-from oodd_eval.data.simulate.record import (
-    GENERATOR_VERSION,
-    Episode,
-    Setup,
-    record_anomalous,
-    return_of,
-)
-from oodd_eval.data.simulate.values import bound_of, unit_of
+from oodd_eval.metrics.threshold import isotonic
+from oodd_recording.build import workers
+from oodd_recording.policies import load_policy
+from oodd_recording.record import GENERATOR_VERSION, Episode, Setup, record_anomalous, return_of
+from oodd_recording.values import bound_of, unit_of
 
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
 STEP: Final = 4.0  # ratio of neighbouring strengths in the first pass

@@ -24,9 +24,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from oodd_eval.data.own import info_of
-from oodd_eval.data.simulate.environments import make
-from oodd_eval.data.simulate.policies import LAYERS
-from oodd_training.replay import Replay
+from oodd_recording.environments import make
+from oodd_recording.policies import LAYERS
+from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {
     "layers": [400, 300],

@@ -1,7 +1,7 @@
 """Anomalies with one scalar strength: the kinds of the suite ladder.
 
 A kind's strength is 0 for nothing at all. Its unit and its largest sensible strength depend on the
-environment, see `oodd_eval.data.simulate.values`. What a fault draws (sensors, actuator, noise)
+environment, see `oodd_recording.values`. What a fault draws (sensors, actuator, noise)
 depends on the generator and not on its strength: two strengths differ in nothing else.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.own import anomaly_spec, info_of
-from oodd_eval.data.simulate.environments import Row, Simulator
-from oodd_eval.data.simulate.values import VALUES, choose_sensors, spread_of
+from oodd_recording.environments import Row, Simulator
+from oodd_recording.values import VALUES, choose_sensors, spread_of
 
 ON, PERIOD = 10, 50  # an intermittent fault acts on 10 rows, then rests for 40
 AR: Final = 0.9  # coefficient of the correlated noise
