@@ -39,7 +39,7 @@ def add_environment(directory, name, kinds, *, discrete=True):
         directory / f"{name}.h5", groups.items(), "0" * 64,
         sensors=[Quantity(f"gauge {i}", "bar") for i in range(4)],
         actions=[Quantity("open", "1"), Quantity("close", "1")],
-        own=own_facts(name, discrete=discrete, groups=kinds),
+        custom=own_facts(name, discrete=discrete, groups=kinds),
     )  # fmt: skip
     write_manifest(directory, manifest["definition"], entries, generator=1, versions={})
     return directory

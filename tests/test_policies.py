@@ -118,7 +118,7 @@ def test_pickled_objects_are_not_opened(tmp_path):
 
     file = tmp_path / "hopper.npz"
     np.savez(file, W1=np.array([Trap()], dtype=object))
-    with pytest.raises(PolicyError, match="plain arrays"):
+    with pytest.raises(PolicyError, match="expected numbers"):
         load_policy("hopper", file)
 
 
@@ -144,8 +144,8 @@ def test_a_policy_of_another_algorithm_environment_or_with_nan_is_refused(tmp_pa
     ("arrays", "message"),
     [
         (td3() | {"W2": np.zeros((8, 5), "f4")}, "do not fit"),
-        (td3() | {"b1": np.array(["1"] * 7)}, "not numbers"),
-        (np.zeros(3), r"hopper\.npz is not a policy file"),
+        (td3() | {"b1": np.array(["1"] * 7)}, "expected numbers"),
+        (np.zeros(3), r"hopper\.npz cannot be read"),
     ],
     ids=["layers", "text", "single array"],
 )

@@ -204,7 +204,7 @@ def test_verify_lists_every_group_with_what_was_expected_and_found(copy):
     assert len(checks) == 2 * (11 + 1)
     bad = [c for c in checks if not c.ok]
     assert [(c.file, c.group) for c in bad] == [("hopper.h5", TWINS)]
-    assert bad[0].expected != bad[0].found
+    assert bad[0].expected != bad[0].actual
 
 
 def test_a_changed_name_is_noticed_in_file_and_manifest(copy):

@@ -254,7 +254,7 @@ def verify(options: argparse.Namespace) -> int:
     for check in checks:
         if options.verbosity > 0 or not check.ok:
             expected = "" if check.ok else f"expected {check.expected}, found "
-            console.print(f"{check.file}, {check.group}: {expected}{check.found}")
+            console.print(f"{check.file}, {check.group}: {expected}{check.actual}")
     good = f"{sum(check.ok for check in checks)} of {len(checks)} groups as they should be"
     console.print(f"split {split.name}, digest {split.digest}: {good}")
     return int(not all(check.ok for check in checks))

@@ -1,4 +1,4 @@
-"""Fetch a split: bring its files here, verify everything, then put it in its place in one step.
+"""Fetch a split: bring its files here, verify everything, then install it in one step.
 
 Files on their way are in ``<home>/.fetch/<source>/``, where a fetch that was stopped goes on. They
 are compared with the manifest, and the manifest with the digest that the caller expects, if any.
@@ -14,6 +14,7 @@ import lzma
 import shutil
 import stat
 import tarfile
+import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -26,13 +27,14 @@ from urllib.parse import quote, urlsplit
 from urllib.request import url2pathname
 
 from oodd_eval._version import __version__
+from oodd_eval.data.bounded import MANIFEST_BYTES
 from oodd_eval.data.files import lock
-from oodd_eval.data.layout import MANIFEST, MOST_MANIFEST, read_manifest
+from oodd_eval.data.layout import MANIFEST, read_manifest
 from oodd_eval.data.split import SHIPPED, Split, data_home
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
 
 ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
-MOST_ARCHIVE: Final = 10**12
+ARCHIVE_BYTES: Final = 10**12
 MOST_MEMBERS: Final = 10_000  # of an archive: a tar file of 10 MB may have millions
 PATIENCE: Final = 60.0
 SLOWEST: Final = 4096
@@ -56,38 +58,53 @@ Source = Callable[[str, Path, int], None]
 
 
 class Fetched(NamedTuple):
-    """A fetched split in its place; `already` is True if it was there before."""
+    """An installed split; `already` is True if it was there before."""
 
     split: Split
     already: bool = False
 
 
 def fetch(
-    place: str,
+    address: str,
     *,
     output: Path | None = None,
     digest: str | None = None,
     progress: Progress = lambda _file: None,
 ) -> Fetched:
-    """Fetch a split and install it in `output`, by default its name below `data_home`.
+    """Fetch a split and install it.
 
-    One with another digest than a given one is refused. `progress` is called with the name of each
-    file when it is verified. `SplitError` when something is missing or not as the manifest says,
-    `UsageError` when another split is in the way.
+    Parameters
+    ----------
+    address
+        A directory with the split's files, or a tar or zip archive of them: a path or a URL.
+    output
+        Directory of the split, by default its name below `data_home`.
+    digest
+        The split's digest; one with another digest is refused.
+    progress
+        Called with the name of each file when it is verified.
+
+    Raises
+    ------
+    SplitError
+        When something is missing or is not as the manifest says.
+    UsageError
+        When another split is in the way, or the address is none.
+    OutputError
+        When files cannot be written, or another process is fetching the same.
     """
     home = output.parent if output else data_home()
-    staging = home / ".fetch" / hashlib.sha256(place.encode()).hexdigest()[:16]
+    staging = home / ".fetch" / hashlib.sha256(address.encode()).hexdigest()[:16]
     try:
         staging.mkdir(parents=True, exist_ok=True)
         with lock(staging, wait=False) as held:
             if not held:
                 raise OutputError(f"another process is fetching the same into {str(home)!r}; wait")
             try:
-                with _open_source(place, staging / "archive") as source:
-                    found = _bring(source, staging, output, digest, progress)
+                with _open_source(address, staging / "archive") as source:
+                    fetched = _bring(source, staging, output, digest, progress)
                 shutil.rmtree(staging, ignore_errors=True)
             finally:
-                shutil.rmtree(staging / "doubtful", ignore_errors=True)
                 # Files beside the manifest are work that a later fetch goes on from.
                 if not any(p.is_file() and p.name != MANIFEST for p in staging.rglob("*")):
                     shutil.rmtree(staging, ignore_errors=True)
@@ -98,17 +115,15 @@ def fetch(
     finally:
         with contextlib.suppress(OSError):
             staging.parent.rmdir()  # unless there is more on its way
-    return found
+    return fetched
 
 
 def _bring(
     source: Source, staging: Path, output: Path | None, digest: str | None, progress: Progress
 ) -> Fetched:
-    fresh, incoming = staging / "split", staging / MANIFEST
-    fresh.mkdir(exist_ok=True)
-    source(MANIFEST, incoming, MOST_MANIFEST)
-    incoming.replace(fresh / MANIFEST)
-    split, manifest = Split(fresh), read_manifest(fresh)
+    (staging / MANIFEST).unlink(missing_ok=True)
+    source(MANIFEST, staging / MANIFEST, MANIFEST_BYTES)
+    manifest = read_manifest(staging)
     # Names in the manifest become names of files.
     name, environments = manifest["name"], manifest["environments"]
     if not name or not name.isprintable() or set(name) & set("/\\@: ") or name.startswith("."):
@@ -117,17 +132,19 @@ def _bring(
         file, expected = entry["file"], f"{environment}.h5"
         if file != expected:
             raise SplitError(f"it names the file {file!r} for {environment}, expected {expected!r}")
-    if digest and manifest["digest"] != digest:
-        raise DigestError(f"split {name!r} there has the digest {split.digest}, expected {digest}")
+    actual = manifest["digest"]
+    if digest and actual != digest:
+        raise DigestError(f"split {name!r} there has the digest {actual}, expected {digest}")
     target = output or data_home() / name
-    if there := _installed(name, target, split.digest, by_name=output is None):
-        return Fetched(there, already=True)
+    if present := _installed(name, target, actual, by_name=output is None):
+        return Fetched(present, already=True)
+    fresh = staging / actual
+    fresh.mkdir(exist_ok=True)
+    shutil.copy(staging / MANIFEST, fresh)
     for environment, entry in environments.items():
-        _bring_file(source, split, environment, entry, staging)
+        if not (fresh / entry["file"]).exists():  # an earlier attempt has verified what is there
+            _bring_file(source, fresh, environment, entry, staging)
         progress(entry["file"])
-    files = {MANIFEST, *(entry["file"] for entry in environments.values())}
-    for stray in (path for path in fresh.iterdir() if path.name not in files):
-        stray.unlink()
     if target.exists():  # a damaged copy
         shutil.rmtree(staging / "replaced", ignore_errors=True)
         target.rename(staging / "replaced")
@@ -136,7 +153,7 @@ def _bring(
 
 
 def _installed(name: str, target: Path, digest: str, *, by_name: bool) -> Split | None:
-    """Return the split if it is in its place already; raise `UsageError` if another one is."""
+    """Return the split if it is installed already; raise `UsageError` if another one is."""
     shipped = Split(SHIPPED / name)
     if by_name and (shipped.path / MANIFEST).exists():
         if shipped.digest == digest:
@@ -146,11 +163,11 @@ def _installed(name: str, target: Path, digest: str, *, by_name: bool) -> Split 
         )
     if not target.exists():
         return None
-    there = Split(target)
+    present = Split(target)
     with contextlib.suppress(SplitError):
-        if there.digest == digest:
+        if present.digest == digest:
             with contextlib.suppress(SplitError):
-                return there if all(check.ok for check in there.verify()) else None
+                return present if all(check.ok for check in present.verify()) else None
             return None  # a damaged copy is replaced
     raise UsageError(
         f"{str(target)!r} exists and is not this split: remove it, or name another with --output"
@@ -158,49 +175,46 @@ def _installed(name: str, target: Path, digest: str, *, by_name: bool) -> Split 
 
 
 def _bring_file(
-    source: Source, split: Split, environment: str, entry: dict[str, Any], staging: Path
+    source: Source, fresh: Path, environment: str, entry: dict[str, Any], staging: Path
 ) -> None:
-    """Fetch and verify one file; one that an earlier attempt has verified stays."""
-    file, part = split.path / entry["file"], staging / f"{entry['file']}.part"
-    if file.exists():
-        return
+    """Fetch one file and verify it."""
+    part = staging / f"{entry['file']}.part"
     # The most bytes that it may have, if nothing in it were compressed, with some to spare.
     sensors, actions = len(entry["sensors"]), len(entry["actions"])
     row = 4 * (sensors + actions + 1)
     trajectory = 4 * sensors + 6 * 8 + 4096
     sizes = [(g["transitions"], g["trajectories"]) for g in entry["groups"].values()]
     most = 2 * _MIB + sum(_MIB + row * steps + trajectory * n for steps, n in sizes)
-    source(file.name, part, most)
+    source(entry["file"], part, most)
     # What ends the check, or this process, leaves nothing that a later fetch would go on from.
-    doubtful = staging / "doubtful"
-    shutil.rmtree(doubtful, ignore_errors=True)
-    doubtful.mkdir()
-    shutil.copy(split.path / MANIFEST, doubtful)
-    part.replace(doubtful / file.name)
-    Split(doubtful).environment(environment).close()
-    (doubtful / file.name).replace(file)
+    with tempfile.TemporaryDirectory(prefix="doubtful", dir=staging) as directory:
+        doubtful = Path(directory)
+        shutil.copy(fresh / MANIFEST, doubtful)
+        part.replace(doubtful / entry["file"])
+        Split(doubtful).environment(environment).close()
+        (doubtful / entry["file"]).replace(fresh / entry["file"])
 
 
 @contextlib.contextmanager
-def _open_source(place: str, archive: Path) -> Iterator[Source]:
-    """Give the files at a place; an archive on the web is downloaded to `archive` first."""
+def _open_source(address: str, archive: Path) -> Iterator[Source]:
+    """Give the files at an address; an archive on the web is downloaded to `archive` first."""
     try:
-        parts = urlsplit(place)
+        parts = urlsplit(address)
     except ValueError as error:
         raise UsageError(
-            f"{_plain(place)} is no address ({error}): expected such as "
+            f"{_plain(address)} is no address ({error}): expected such as "
             "https://example.org/split.tar"
         ) from None
-    path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(place)
+    path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(address)
     if parts.scheme in {"http", "https"}:
-        address = place.rstrip("/")
         if not parts.path.endswith(ARCHIVES):
-            yield lambda name, target, most: _download(f"{address}/{quote(name)}", target, most)
+            folder = address.rstrip("/")
+            yield lambda name, target, most: _download(f"{folder}/{quote(name)}", target, most)
             return
-        _download(place, archive, MOST_ARCHIVE)
+        _download(address, archive, ARCHIVE_BYTES)
         path = archive
-    elif "://" in place and parts.scheme != "file":
-        raise UsageError(f"{place!r} cannot be fetched, expected http://, https:// or file://")
+    elif "://" in address and parts.scheme != "file":
+        raise UsageError(f"{address!r} cannot be fetched, expected http://, https:// or file://")
     if path.is_dir():
         yield functools.partial(_copy_from, path)
     elif path.is_file():
@@ -212,15 +226,17 @@ def _open_source(place: str, archive: Path) -> Iterator[Source]:
             archive.unlink(missing_ok=True)
             raise
     else:
-        raise SplitNotFoundError(f"there is nothing at {place}: expected a directory, file or URL")
+        raise SplitNotFoundError(
+            f"there is nothing at {address}: expected a directory, file or URL"
+        )
 
 
 def _copy_from(directory: Path, name: str, target: Path, most: int) -> None:
-    try:
-        with (directory / name).open("rb") as content:
-            _copy(content, target, most, str(directory / name))
-    except FileNotFoundError:
-        raise SplitNotFoundError(f"{directory} holds no {name}") from None
+    file = directory / name
+    if not file.is_file():
+        raise SplitNotFoundError(f"{directory} holds no {name}")
+    with file.open("rb") as content:
+        _copy(content, target, most, str(file))
 
 
 @contextlib.contextmanager
@@ -258,17 +274,16 @@ class _TarInfo(tarfile.TarInfo):
     """A member whose extended header, which is read into memory, is no longer than 1 MiB."""
 
     @classmethod
-    def frombuf(cls, *given: Any) -> Self:
-        found = super().frombuf(*given)
-        if not found.isreg() and found.size > _MIB:
-            raise tarfile.HeaderError(f"a header of {found.size} bytes, expected at most {_MIB}")
-        return found
+    def frombuf(cls, *arguments: Any) -> Self:
+        member = super().frombuf(*arguments)
+        if not member.isreg() and member.size > _MIB:
+            raise tarfile.HeaderError(f"a header of {member.size} bytes, limit {_MIB}")
+        return member
 
 
 def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
     """Return what opens the manifest and the files beside it; refuse an archive with tricks."""
-    found: list[tuple[PurePosixPath, Callable[[], Any]]] = []
-    opened: Callable[[], Any]
+    files: dict[PurePosixPath, Callable[[], Any]] = {}
     zipped = isinstance(archive, zipfile.ZipFile)
     for number, item in enumerate(archive.infolist() if zipped else archive):
         if number == MOST_MEMBERS:
@@ -279,21 +294,17 @@ def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or "\\" in name:
             raise SplitError(f"{file} holds a file with the path {name!r}: refused")
-        mode = stat.S_IFMT(item.external_attr >> 16) if zipped else 0
-        if mode not in (0, stat.S_IFREG) or not (zipped or item.isreg()):
+        kind = stat.S_IFMT(item.external_attr >> 16) if zipped else 0
+        if kind not in (0, stat.S_IFREG) or not (zipped or item.isreg()):
             raise SplitError(f"{file} holds {name!r}, which is no plain file: refused")
-        opened = functools.partial(archive.open if zipped else archive.extractfile, item)
-        found.append((path, opened))
-    folders = [path.parent for path, _ in found if path.name == MANIFEST]
+        if path in files:
+            raise SplitError(f"{file} holds {name!r} twice: refused")
+        opener = archive.open if zipped else archive.extractfile
+        files[path] = functools.partial(opener, item)
+    folders = [path.parent for path in files if path.name == MANIFEST]
     if len(folders) != 1:
         raise SplitError(f"{file} holds {len(folders)} files named {MANIFEST}, expected one")
-    members: dict[str, Callable[[], Any]] = {}
-    for path, opened in found:
-        if path.parent == folders[0]:
-            if path.name in members:
-                raise SplitError(f"{file} holds {str(path)!r} twice: refused")
-            members[path.name] = opened
-    return members
+    return {path.name: opener for path, opener in files.items() if path.parent == folders[0]}
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
@@ -337,12 +348,8 @@ class _Response(http.client.HTTPResponse):
 
 class _Watching(urllib.request.AbstractHTTPHandler):
     def do_open(self, http_class: Any, req: Any, **settings: Any) -> Any:
-        def connect(*given: Any, **named: Any) -> Any:
-            connection = http_class(*given, **named)
-            connection.response_class = _Response
-            return connection
-
-        return super().do_open(connect, req, **settings)
+        watched: Any = type("Watched", (http_class,), {"response_class": _Response})
+        return super().do_open(watched, req, **settings)
 
 
 class _Http(_Watching, urllib.request.HTTPHandler):

@@ -4,6 +4,7 @@ Test episodes come in pairs: an anomalous episode and its nominal twin have the 
 an episode of the same task from the same start. Matched metrics compare the two from the onset on.
 """
 
+import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from oodd_eval._version import __version__
 from oodd_eval.data import layout
+from oodd_eval.data.bounded import EPISODES
 from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
@@ -25,7 +27,7 @@ from oodd_eval.data.facts import (
     Quantity,
     in_order,
 )
-from oodd_eval.data.logs import Log, Logs, open_logs, test_places
+from oodd_eval.data.logs import Log, Logs, open_logs, test_parts
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.data.split import Split, data_home
 from oodd_eval.data.trajectory import Trajectory
@@ -34,8 +36,6 @@ from oodd_eval.names import check_known
 
 IMPORTED: Final = "imported"
 """Word that a manifest has in place of the recipe and of the policy's digest."""
-
-MOST_EPISODES: Final = 200_000
 
 _Arrays = dict[str, NDArray[Any]]
 
@@ -75,56 +75,81 @@ def import_data(
 ) -> Split:
     """Import logs as one environment of a split; one of that name gets it as a further one.
 
-    `name` and `environment` are one's own: no published split, no environment of the benchmark.
-    `form` is one of `oodd_eval.data.logs.FORMATS`. `train` and `calibration` are places of nominal
-    episodes: to fit on, and for the thresholds of alarms. `test` is a folder with the place
-    ``nominal`` of the twins and one place for each anomaly, with its name; None for a split to
-    watch with, which cannot be evaluated. `sensors` and `actions` are names and units of the
-    columns, by default the files' own, else numbers; `discrete` is the number of actions where each
-    is a whole number from 0 on, else 0. `groups` are those of anomalies that the benchmark does not
-    know, by default ``"dynamics"``. `output` is the directory of the split, by default where splits
-    are found. `progress` is called with the name of each part when it is read.
+    Parameters
+    ----------
+    name
+        Name of the split: no published one.
+    environment
+        Name of the environment: none of the benchmark.
+    form
+        Name of a format, one of `oodd_eval.data.logs.FORMATS`.
+    train, calibration
+        Parts with nominal episodes: to fit on, and for the thresholds of alarms.
+    test
+        Folder with the part ``nominal`` of the twins and one part for each anomaly, under its name;
+        None for a split to watch with, which cannot be evaluated.
+    sensors, actions
+        Names and units of the columns; by default the files' own, else numbers.
+    discrete
+        Number of actions where each is a whole number from 0 on, else 0.
+    groups
+        Groups of anomalies that the benchmark does not know, by default ``"dynamics"``.
+    output
+        Directory of the split, by default where splits are found.
+    progress
+        Called with the name of each part when it is read.
+
+    Returns
+    -------
+    Split
+        The split with the environment in it.
 
     Raises
     ------
     UsageError
-        When a name is taken or wrong, or a place has nothing to read.
+        When a name is taken or wrong, or a part has nothing to read.
     TrajectoryError
         When an episode is not as it must be; the message names its file.
     """
-    for kind, known, given in (("split", SPLITS, name), ("environment", ENVIRONMENTS, environment)):
-        if given in known:
-            raise UsageError(f"{given!r} is the benchmark's {kind}: choose a name of your own")
-        _check_name(kind, given)
+    for kind, reserved, chosen in (
+        ("split", SPLITS, name),
+        ("environment", ENVIRONMENTS, environment),
+    ):
+        if chosen in reserved:
+            raise UsageError(f"{chosen!r} is the benchmark's {kind}: choose a name of your own")
+        _check_name(kind, chosen)
     directory = output or data_home() / name
-    entries = _others(directory, name, environment)
-    places = {} if test is None else test_places(form, test)
-    kinds = _kinds(places, test, groups or {})
-    logs = open_logs(form, train)
-    columns = _columns(logs, sensors, actions, discrete)
+    entries = _earlier_entries(directory, name, environment)
+    tests = {} if test is None else test_parts(form, test)
+    kinds = _kinds(tests, test, groups or {})
+    columns = _columns(open_logs(form, train), sensors, actions, discrete)
 
-    def episodes(place: Path) -> list[_Episode]:
-        return [_episode(log, columns) for log in _read(open_logs(form, place), place)]
+    def episodes(source: Path) -> list[_Episode]:
+        logs = open_logs(form, source).read()
+        read = [_episode(log, columns) for log in itertools.islice(logs, EPISODES)]
+        if not read or next(logs, None):
+            raise UsageError(f"{source} has {len(read) or 'no'} episodes, expected 1 to {EPISODES}")
+        return read
 
     def parts() -> Iterator[tuple[str, _Arrays]]:
-        for part, place in ((TRAIN, train), (CALIBRATION, calibration)):
-            yield part, _stacked(episodes(place), columns)
+        for part, source in ((TRAIN, train), (CALIBRATION, calibration)):
+            yield part, _stacked(episodes(source), columns)
             progress(part)
-        twins = episodes(places["nominal"]) if places else []
+        twins = episodes(tests["nominal"]) if tests else []
         yield TWINS, _stacked(twins, columns)
         progress(TWINS)
         for kind in kinds:
-            yield f"test/{kind}", _anomalous(places[kind], episodes(places[kind]), twins, columns)
+            yield f"test/{kind}", _anomalous(tests[kind], episodes(tests[kind]), twins, columns)
             progress(f"test/{kind}")
 
-    own = layout.own_facts(environment, discrete=columns.discrete, groups=kinds)
+    facts = layout.own_facts(environment, discrete=columns.discrete, groups=kinds)
     entries[environment] = layout.write_environment(
         directory / f"{environment}.h5",
         parts(),
         IMPORTED,
         sensors=columns.sensors,
         actions=columns.actions,
-        own=own,
+        custom=facts,
     )
     ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
     versions = {"oodd-eval": __version__, "numpy": np.__version__}
@@ -144,7 +169,7 @@ def _recipe(name: str) -> dict[str, str]:
     return {"name": name, "source": IMPORTED}
 
 
-def _others(directory: Path, name: str, environment: str) -> dict[str, Any]:
+def _earlier_entries(directory: Path, name: str, environment: str) -> dict[str, Any]:
     """Return the entries of the environments that the split has already."""
     if not (directory / layout.MANIFEST).exists():
         return {}
@@ -163,13 +188,13 @@ def _others(directory: Path, name: str, environment: str) -> dict[str, Any]:
 
 
 def _kinds(
-    places: Mapping[str, Path], test: Path | None, groups: Mapping[str, str]
+    tests: Mapping[str, Path], test: Path | None, groups: Mapping[str, str]
 ) -> dict[str, Group]:
-    """Return the anomalies that there are, with their groups."""
-    anomalies = [name for name in places if name != "nominal"]
-    if test is not None and "nominal" not in places:
+    """Return the anomalies of the test parts, with their groups."""
+    anomalies = [name for name in tests if name != "nominal"]
+    if test is not None and "nominal" not in tests:
         raise UsageError(
-            f"{str(test)!r} has {', '.join(places) or 'nothing'}, expected a place 'nominal', too: "
+            f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too: "
             "each anomalous episode needs a nominal twin of the same name to be compared with"
         )
     for name in anomalies:
@@ -179,11 +204,12 @@ def _kinds(
     if wrong := [n for n, g in groups.items() if n in ANOMALIES and ANOMALIES[n].group != g]:
         shipped = ANOMALIES[wrong[0]].group
         raise UsageError(f"{wrong[0]!r} is a {shipped} anomaly of the benchmark: use another name")
-    found: dict[str, Group] = {}
-    for name in in_order(anomalies, ANOMALIES):
-        own: Group = "sensor" if groups.get(name) == "sensor" else "dynamics"
-        found[name] = ANOMALIES[name].group if name in ANOMALIES else own
-    return found
+    chosen = {name: ANOMALIES[name].group for name in anomalies if name in ANOMALIES}
+    sensor = {name for name in anomalies if groups.get(name) == "sensor"}
+    return {
+        name: chosen.get(name, "sensor" if name in sensor else "dynamics")
+        for name in in_order(anomalies, ANOMALIES)
+    }
 
 
 def _columns(
@@ -193,12 +219,17 @@ def _columns(
     log = next(logs.read(), None)
     if log is None:
         raise UsageError("there are no training episodes, expected at least one")
-    width = _matrix(log, "observations", log.observations).shape[1]
+    if log.observations.ndim != 2:
+        raise TrajectoryError(
+            f"{log.source}: observations have shape {log.observations.shape}, expected "
+            "(rows, columns)"
+        )
+    width = log.observations.shape[1]
     number = discrete or logs.discrete
     commands = np.empty((0, 0)) if log.actions is None else log.actions
     if not number and commands.ndim == 1 and commands.dtype.kind in "iub":
         raise UsageError(
-            f"{log.where}: actions are whole numbers, expected the number of actions beside them: "
+            f"{log.source}: actions are whole numbers, expected the number of actions beside them: "
             "--discrete N, or rows of shape (T, 1) where they are amounts"
         )
     count = number or (commands.shape[1] if commands.ndim == 2 else 1)
@@ -217,59 +248,39 @@ def _columns(
 
 
 def _named(kind: str, option: str, count: int, *named: Sequence[Quantity]) -> tuple[Quantity, ...]:
-    found = next((tuple(own) for own in named if own), None)
-    found = found or tuple(Quantity(f"{kind} {i}", "1") for i in range(count))
-    names = [quantity.name for quantity in found]
-    plain = all(f"{quantity.name}{quantity.unit}".isprintable() for quantity in found)
-    if len(found) != count or len({*names}) < len(names) or not plain:
+    numbered = tuple(Quantity(f"{kind} {i}", "1") for i in range(count))
+    columns = next((tuple(quantities) for quantities in named if quantities), numbered)
+    names = [quantity.name for quantity in columns]
+    plain = all(f"{quantity.name}{quantity.unit}".isprintable() for quantity in columns)
+    if len(columns) != count or len({*names}) < len(names) or not plain:
         raise UsageError(
             f"there are {count} {kind}s, named {', '.join(names)}: expected as many different "
             f"names ({option})"
         )
-    return found
-
-
-def _read(logs: Logs, place: Path) -> Iterator[Log]:
-    """Yield the episodes of a place, which are neither none nor too many."""
-    count = 0
-    for count, log in enumerate(logs.read(), start=1):
-        if count > MOST_EPISODES:
-            raise UsageError(f"{place} has more than {MOST_EPISODES} episodes: import fewer")
-        yield log
-    if not count:
-        raise UsageError(f"{place} has no episodes, expected at least one")
-
-
-def _matrix(log: Log, what: str, array: NDArray[Any]) -> NDArray[Any]:
-    if array.ndim != 2:
-        raise TrajectoryError(
-            f"{log.where}: {what} have shape {array.shape}, expected (rows, columns)"
-        )
-    return array
+    return columns
 
 
 def _episode(log: Log, columns: Columns) -> _Episode:
     """Check one episode."""
-    rows = _matrix(log, "observations", log.observations)
     actions = None if log.actions is None else _commands(log, log.actions, columns)
     try:
-        trajectory = Trajectory(rows, actions)
+        trajectory = Trajectory(log.observations, actions)
     except TrajectoryError as error:
-        raise TrajectoryError(f"{log.where}: {error}") from None
-    found = trajectory.observation_dim, trajectory.action_dim
+        raise TrajectoryError(f"{log.source}: {error}") from None
+    widths = trajectory.observation_dim, trajectory.action_dim
     expected = len(columns.sensors), len(columns.actions)
-    if found != expected:
+    if widths != expected:
         raise TrajectoryError(
-            f"{log.where} has {found[0]} sensors and {found[1]} columns of actions, expected "
+            f"{log.source} has {widths[0]} sensors and {widths[1]} columns of actions, expected "
             f"{expected[0]} and {expected[1]} as in the first training episode"
         )
     steps = trajectory.transitions
     if not steps:
-        raise TrajectoryError(f"{log.where} has 1 observation, expected at least 2")
+        raise TrajectoryError(f"{log.source} has 1 observation, expected at least 2")
     rewards = np.zeros(steps) if log.rewards is None else log.rewards
     if rewards.shape != (steps,) or not np.isfinite(rewards).all():
         raise TrajectoryError(
-            f"{log.where}: rewards have shape {rewards.shape}, expected {steps} finite numbers, "
+            f"{log.source}: rewards have shape {rewards.shape}, expected {steps} finite numbers, "
             "one a transition"
         )
     return _Episode(log, trajectory, rewards)
@@ -278,17 +289,17 @@ def _episode(log: Log, columns: Columns) -> _Episode:
 def _commands(log: Log, actions: NDArray[Any], columns: Columns) -> NDArray[Any]:
     """Return actions as rows; a discrete one as a one-hot row."""
     if not columns.discrete:
-        return _matrix(log, "actions", actions[:, None] if actions.ndim == 1 else actions)
+        return actions[:, None] if actions.ndim == 1 else actions
     count, codes = len(columns.actions), actions.ravel() - columns.start
     if codes.size != len(actions):
         raise TrajectoryError(
-            f"{log.where}: actions have shape {actions.shape}, expected (T,) as they are discrete"
+            f"{log.source}: actions have shape {actions.shape}, expected (T,) as they are discrete"
         )
     wrong = ~np.isin(codes, np.arange(count))
     if wrong.any():
         i, first = int(wrong.argmax()), columns.start
         raise TrajectoryError(
-            f"{log.where}: action {i} is {actions.ravel()[i]}, expected a whole number from "
+            f"{log.source}: action {i} is {actions.ravel()[i]}, expected a whole number from "
             f"{first} to {first + count - 1}"
         )
     return np.eye(count, dtype=np.float32)[codes.astype(np.intp)]
@@ -310,16 +321,16 @@ def _stacked(episodes: Sequence[_Episode], columns: Columns) -> _Arrays:
 
 
 def _anomalous(
-    place: Path, episodes: Sequence[_Episode], twins: Sequence[_Episode], columns: Columns
+    source: Path, episodes: Sequence[_Episode], twins: Sequence[_Episode], columns: Columns
 ) -> _Arrays:
     """Return the datasets of an anomaly, in the order of the twins."""
     by_name = {e.log.name: e for e in episodes}
     names = {twin.log.name for twin in twins}
-    if odd := sorted(by_name.keys() ^ names):
-        where = "has no nominal twin" if odd[0] in by_name else "is missing"
+    if unpaired := sorted(by_name.keys() ^ names):
+        problem = "has no nominal twin" if unpaired[0] in by_name else "is missing"
         raise TrajectoryError(
-            f"{place}: episode {odd[0]!r} {where}, expected the episodes of 'nominal' and no "
-            "others, each under the name of its twin"
+            f"{source}: episode {unpaired[0]!r} {problem}, expected the episodes of 'nominal' and "
+            "no others, each under the name of its twin"
         )
     ordered = [by_name[twin.log.name] for twin in twins]
     effects = [_effect(e, twin) for e, twin in zip(ordered, twins, strict=True)]
@@ -333,20 +344,20 @@ def _anomalous(
 
 def _effect(episode: _Episode, twin: _Episode) -> int:
     """Return the first row from the onset on that differs from the twin's."""
-    where, onset = episode.log.where, episode.log.onset
-    rows, others = episode.trajectory.observations, twin.trajectory.observations
-    common = min(len(rows), len(others))
+    source, onset = episode.log.source, episode.log.onset
+    rows, nominal = episode.trajectory.observations, twin.trajectory.observations
+    common = min(len(rows), len(nominal))
     if onset is None:
         raise TrajectoryError(
-            f"{where} has no onset, the first row that may differ, expected 'onset' in the file "
+            f"{source} has no onset, the first row that may differ, expected 'onset' in the file "
             "or a line of onsets.csv beside it"
         )
     if not 0 <= onset < common:
         raise TrajectoryError(
-            f"{where}: the onset is row {onset}, expected 0 to {common - 1}, the last row that "
+            f"{source}: the onset is row {onset}, expected 0 to {common - 1}, the last row that "
             "the episode and its twin both have"
         )
-    differs = (rows[onset:common] != others[onset:common]).any(axis=1)
+    differs = (rows[onset:common] != nominal[onset:common]).any(axis=1)
     if not differs.any():
-        raise TrajectoryError(f"{where} equals its twin from its onset, row {onset}, on")
+        raise TrajectoryError(f"{source} equals its twin from its onset, row {onset}, on")
     return onset + int(differs.argmax())

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.bounded import MANIFEST_BYTES, read_bytes
 from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
@@ -36,7 +37,6 @@ from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
-MOST_MANIFEST: Final = 10**7  # bytes
 
 NOMINAL_DTYPES: Final = {
     **dict.fromkeys(("observations", "actions", "rewards"), "<f4"),
@@ -83,12 +83,12 @@ class GroupCheck:
     file: str
     group: str
     expected: str
-    found: str
+    actual: str
 
     @property
     def ok(self) -> bool:
         """True when the content is what the manifest names."""
-        return self.expected == self.found
+        return self.expected == self.actual
 
 
 def dtypes_of(group: str) -> dict[str, str]:
@@ -98,39 +98,38 @@ def dtypes_of(group: str) -> dict[str, str]:
 
 def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
     """Raise `SplitError` unless a group has the datasets, dtypes and lengths it must have."""
-    where, dtypes = f"{file}, group {name}", dtypes_of(name)
-    if more := sorted({*group} - {*dtypes}):
-        raise SplitError(f"{where} holds {more[0]!r}, expected {', '.join(dtypes)} alone")
+    source, dtypes = f"{file}, group {name}", dtypes_of(name)
+    if unknown := sorted({*group} - {*dtypes}):
+        raise SplitError(f"{source} holds {unknown[0]!r}, expected {', '.join(dtypes)} alone")
     for dataset, dtype in dtypes.items():
         if dataset not in group:
-            raise SplitError(f"{where} lacks the dataset {dataset!r}: build or fetch it again")
-        found, shape = group[dataset].dtype, group[dataset].shape
-        if found.hasobject or not found.str.startswith(dtype):
-            raise SplitError(f"{where}, {dataset} has dtype {found.str}, expected {dtype}")
+            raise SplitError(f"{source} lacks the dataset {dataset!r}: build or fetch it again")
+        actual, shape = group[dataset].dtype, group[dataset].shape
+        if actual.hasobject or not actual.str.startswith(dtype):
+            raise SplitError(f"{source}, {dataset} has dtype {actual.str}, expected {dtype}")
         dimensions = 2 if dataset in {"observations", "actions"} else 1
         if len(shape) != dimensions:
-            raise SplitError(f"{where}, {dataset} has shape {shape}, expected {dimensions} of them")
+            raise SplitError(f"{source}, {dataset} has shape {shape}, expected {dimensions} axes")
     offsets = group["offsets"][:]
     n = len(offsets) - 1
     # Differences of numbers from 0 on do not overflow.
     if n < 0 or offsets[0] != 0 or (offsets < 0).any() or (np.diff(offsets) < 1).any():
-        raise SplitError(f"{where}: offsets must start at 0 and rise by at least 1 per trajectory")
+        raise SplitError(f"{source}: offsets must start at 0 and rise by at least 1 per trajectory")
     total = int(offsets[-1])
     lengths = dict.fromkeys(dtypes, n)
     lengths |= {"observations": total + n, "actions": total, "rewards": total, "offsets": n + 1}
     for dataset, expected in lengths.items():
         if len(group[dataset]) != expected:
             raise SplitError(
-                f"{where}, {dataset} has {len(group[dataset])} rows, expected {expected} "
+                f"{source}, {dataset} has {len(group[dataset])} rows, expected {expected} "
                 f"for {n} trajectories with {total} transitions"
             )
     if "effects" in lengths:
         onsets, effects = group["onsets"][:], group["effects"][:]
         wrong = (onsets < 0) | (effects < onsets) | (effects > np.diff(offsets))
-        if wrong.any():
-            i = int(wrong.argmax())
+        for i in np.flatnonzero(wrong):
             raise SplitError(
-                f"{where}: trajectory {i} has its onset at row {onsets[i]} and its effect at row "
+                f"{source}: trajectory {i} has its onset at row {onsets[i]} and its effect at row "
                 f"{effects[i]}, expected 0 <= onset <= effect <= {offsets[i + 1] - offsets[i]}, "
                 "the last row"
             )
@@ -142,8 +141,11 @@ def check_names(file: str, parts: Mapping[str, Mapping[str, Any]]) -> None:
         if kind not in parts[NAMES]:
             raise SplitError(f"{file} lacks the names of its {kind}: build or fetch it again")
         names = parts[NAMES][kind]
-        if names.dtype.kind != "S":
-            raise SplitError(f"{file}, {NAMES}/{kind} has dtype {names.dtype.str}, expected |S")
+        if names.dtype.kind != "S" or len(names.shape) != 1:
+            raise SplitError(
+                f"{file}, {NAMES}/{kind} has dtype {names.dtype.str} and shape {names.shape}, "
+                "expected a column of |S"
+            )
         for part in (part for part in parts if part != NAMES):
             shape = parts[part][columns].shape
             if shape[1:] != names.shape:
@@ -183,8 +185,8 @@ def environment_digest(entry: Mapping[str, Any]) -> str:
     What is said of an environment or of anomalies of one's own counts, too.
     """
     digests = {name: group["sha256"] for name, group in entry["groups"].items()}
-    own = {"own": entry["own"]} if "own" in entry else {}
-    return _canonical_digest(digests | {NAMES: names_digest(entry)} | own)
+    custom = {"own": entry["own"]} if "own" in entry else {}
+    return _canonical_digest(digests | {NAMES: names_digest(entry)} | custom)
 
 
 def own_facts(environment: str, *, discrete: bool, groups: Mapping[str, Group]) -> dict[str, Any]:
@@ -206,9 +208,9 @@ def discrete_actions(environment: str, entry: Mapping[str, Any]) -> bool:
 
 def groups_of(entry: Mapping[str, Any]) -> dict[str, Group]:
     """Return the groups of the anomalies of a manifest entry, by kind."""
-    own = entry["own"]["anomalies"] if "own" in entry else {}
+    custom = entry["own"]["anomalies"] if "own" in entry else {}
     kinds = (split_condition(condition)[0] for condition in anomalies_in(entry["groups"]))
-    return {kind: ANOMALIES[kind].group if kind in ANOMALIES else own[kind] for kind in kinds}
+    return {kind: ANOMALIES[kind].group if kind in ANOMALIES else custom[kind] for kind in kinds}
 
 
 def names_digest(entry: Mapping[str, Any]) -> str:
@@ -240,11 +242,11 @@ def write_environment(
     *,
     sensors: Sequence[Quantity],
     actions: Sequence[Quantity],
-    own: Mapping[str, Any] | None = None,
+    custom: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write an environment's groups, one at a time, in one step; return its manifest entry.
 
-    `own` is what `own_facts` returns.
+    `custom` is what `own_facts` returns.
     """
     names = {
         "sensors": [dataclasses.asdict(q) for q in sensors],
@@ -266,7 +268,7 @@ def write_environment(
             digest = content_digest(group)
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
         check_names(path.name, written)
-    entry = {"groups": entries, **names, **(own or {})}
+    entry = {"groups": entries, **names, **(custom or {})}
     return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
 
 
@@ -307,7 +309,7 @@ def _manifest_schema() -> Any:
     group = record(sha256=text, trajectories=count, transitions=count)
     names = core_schema.list_schema(record(name=text, unit=text))
     kinds = by_name(name, core_schema.literal_schema([*GROUPS]))
-    own = record(discrete=core_schema.bool_schema(), anomalies=kinds)
+    custom = record(discrete=core_schema.bool_schema(), anomalies=kinds)
     environment = record(
         file=text,
         policy=text,
@@ -316,7 +318,7 @@ def _manifest_schema() -> Any:
         sensors=names,
         actions=names,
     )
-    environment["fields"]["own"] = core_schema.typed_dict_field(own, required=False)
+    environment["fields"]["own"] = core_schema.typed_dict_field(custom, required=False)
     environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
     named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
@@ -325,12 +327,12 @@ def _manifest_schema() -> Any:
 
 def part_sizes(manifest: Mapping[str, Any]) -> dict[str, str]:
     """Return numbers of trajectories, such as ``"40"`` or ``"12..40"`` of several environments."""
-    found = {}
+    counts = {}
     for name, group in (("train", TRAIN), ("calibration", CALIBRATION), ("test", TWINS)):
         parts = (entry["groups"].get(group) for entry in manifest["environments"].values())
         sizes = {part["trajectories"] if part else 0 for part in parts} or {0}
-        found[name] = "..".join(map(str, sorted({min(sizes), max(sizes)})))
-    return found
+        counts[name] = "..".join(map(str, sorted({min(sizes), max(sizes)})))
+    return counts
 
 
 def write_manifest(
@@ -363,45 +365,26 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 
     file = directory / MANIFEST
     try:
-        with file.open("rb") as content:
-            read = content.read(MOST_MANIFEST + 1)
-        if len(read) > MOST_MANIFEST:
-            raise SplitError(f"{file} has more than the {MOST_MANIFEST} bytes that it may have")
-        manifest: dict[str, Any] = _manifest_schema().validate_json(read)
+        content = read_bytes(file, MANIFEST_BYTES, SplitError)
+        manifest: dict[str, Any] = _manifest_schema().validate_json(content)
     except ValidationError as error:
         problems = error.errors(include_url=False)
-        other = next((p["input"] for p in problems if p["loc"] == ("schema",)), None)
-        if isinstance(other, int):
+        schema = next((p["input"] for p in problems if p["loc"] == ("schema",)), None)
+        if isinstance(schema, int):
             raise SplitError(
-                f"{file} is of a split with layout schema {other}, expected {SCHEMA}: it was "
+                f"{file} is of a split with layout schema {schema}, expected {SCHEMA}: it was "
                 "written by another version of oodd-eval; remove it, then build or fetch it again"
             ) from None
-        found = "; ".join(
+        problem = "; ".join(
             f"{'.'.join(map(str, p['loc'])) or 'content'}: {p['msg']}"
             + (f", got {p['input']!r}"[:100] if p["type"] != "missing" else "")
             for p in problems
         )
-        raise SplitError(f"{file} is not a split's manifest: {found}") from None
+        raise SplitError(f"{file} is not a split's manifest: {problem}") from None
     except OSError as error:
         raise SplitError(f"{file} cannot be read as a split's manifest: {error}") from error
-    for environment, entry in manifest["environments"].items():
-        said = entry["own"]["anomalies"] if "own" in entry else {}
-        kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
-        if environment not in ENVIRONMENTS and "own" not in entry:
-            raise SplitError(
-                f"{file} has an unknown environment {environment!r}, of which it says "
-                "nothing: build or import it again"
-            )
-        if lacking := [part for part in NOMINAL if part not in entry["groups"]]:
-            raise SplitError(
-                f"{file} has no group {lacking[0]!r} of {environment}, expected "
-                f"{', '.join(NOMINAL)}: build or fetch it again"
-            )
-        if unknown := sorted(kinds - {*ANOMALIES, *said}):
-            raise SplitError(
-                f"{file} has an unknown anomaly {unknown[0]!r} in {environment}, of "
-                "which it says nothing: build or import it again"
-            )
+    for problem in _problems(manifest["environments"]):
+        raise SplitError(f"{file} has {problem}: build, fetch or import it again")
     try:
         expected = split_digest(manifest["environments"], manifest["definition"])
     except (ValueError, RecursionError) as error:
@@ -415,3 +398,16 @@ def read_manifest(directory: Path) -> dict[str, Any]:
             "it was edited; build or fetch the split again"
         )
     return manifest
+
+
+def _problems(environments: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is missing in the entries of environments."""
+    for environment, entry in environments.items():
+        if environment not in ENVIRONMENTS and "own" not in entry:
+            yield f"an unknown environment {environment!r} without a description"
+        for part in (part for part in NOMINAL if part not in entry["groups"]):
+            yield f"no group {part!r} of {environment}"
+        described = entry["own"]["anomalies"] if "own" in entry else {}
+        kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
+        for kind in sorted(kinds - {*ANOMALIES, *described}):
+            yield f"an unknown anomaly {kind!r} in {environment} without a description"

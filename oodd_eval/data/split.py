@@ -211,8 +211,8 @@ class Split:
             if bad is not None:
                 raise DigestError(
                     f"{bad.file}, group {bad.group}: content does not match the manifest: expected "
-                    f"{bad.expected}, found {bad.found}; the file was changed or damaged, build or "
-                    "fetch it again"
+                    f"{bad.expected}, found {bad.actual}; the file was changed or damaged, build "
+                    "or fetch it again"
                 )
             stack.pop_all()
         entry = self.manifest["environments"][name]
@@ -241,6 +241,10 @@ class Split:
         # Installers may link the files of a package.
         if path.is_symlink() and self.path.parent != SHIPPED:
             raise SplitError(f"{path} is a link to another file, expected the file: copy it there")
+        if not path.is_file():
+            raise SplitNotFoundError(
+                f"{path} is missing, or is no plain file: build or fetch the split again"
+            )
         return StoredFile(path)
 
     def _parts(self, name: str, file: StoredFile) -> dict[str, dict[str, Any]]:

@@ -1,15 +1,15 @@
 """Read HDF5 files of strangers: sizes are bounded, and a change while a file is open is noticed.
 
 HDF5 allows links, content in other files, types of any size, and filters that make gigabytes of a
-few bytes. Here a file may hold only groups and plain datasets, and their sizes are checked before
-anything is read.
+few bytes. Here a file may hold only groups and plain datasets, and their sizes are compared with
+`oodd_eval.data.bounded` before anything is read.
 """
 
 import contextlib
 import math
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,12 +17,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError
+from oodd_eval.data.bounded import CHUNK_BYTES, SPLIT, Bounds
+from oodd_eval.errors import DigestError, OoddError, SplitError
 
 ROWS: Final = frozenset({"observations", "actions", "rewards"})
-"""Datasets with a row for each step. All others are small, and are in memory once they are read."""
+"""Datasets of a split with a row for each step: they are read in ranges, all others at once."""
 
-BROKEN: Final = (
+_BROKEN: Final = (
     OSError,
     ValueError,
     KeyError,
@@ -31,14 +32,9 @@ BROKEN: Final = (
     AttributeError,
     OverflowError,
     MemoryError,
-)
-"""Errors that h5py raises for a damaged file."""
-
-_MOST_LABELS: Final = 2**27  # bytes of all small datasets of a file
-_MOST_CHUNK: Final = 2**26  # bytes that a chunk may have, packed or not
+)  # what h5py raises for damage
 _DEFLATE: Final = 1032  # bytes that the format can make of one
 _FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
-_AGAIN: Final = "build or fetch it again"
 
 
 class StoredRows:
@@ -57,28 +53,32 @@ class StoredRows:
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         """Return a range of rows; `DigestError` when the file has changed since it was opened."""
         with self._file.reading(self._dataset.name):
-            found: NDArray[Any] = self._dataset[rows]
+            block: NDArray[Any] = self._dataset[rows]
         self._file.check_unchanged()
-        return found
+        return block
 
 
 class StoredFile:
-    """An open file of a split; `name` is the file's, without its directory.
+    """An open HDF5 file, by default of a split.
 
-    Raises `SplitNotFoundError` where there is no file, and `SplitError` where it is no HDF5 file.
+    Parameters
+    ----------
+    path
+        The file.
+    bounds
+        What its arrays may be; its error is raised where the file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name, self._labels = path.name, 0
+    def __init__(self, path: Path, bounds: Bounds = SPLIT) -> None:
+        self.name, self.bounds = path.name, bounds
+        self._taken = 0  # bytes of what was read at once
         if not path.is_file():
-            raise SplitNotFoundError(
-                f"{path} is missing, or is no plain file: build or fetch the split again"
-            )
+            raise bounds.failure(f"{path} is no plain file")
         try:
             self._file = h5py.File(path, "r", rdcc_nbytes=2**20)
-        except BROKEN as error:
-            raise SplitError(
-                f"{path.name} cannot be read, it is truncated or no HDF5 file ({error}): {_AGAIN}"
+        except _BROKEN as error:
+            raise bounds.failure(
+                f"{self.name} cannot be read, it is truncated or no HDF5 file ({error})"
             ) from error
         self._stamp = self._state()
 
@@ -88,15 +88,15 @@ class StoredFile:
 
     @contextlib.contextmanager
     def reading(self, what: str) -> Iterator[None]:
-        """Turn what h5py raises for damaged content into a `SplitError`."""
+        """Raise the error of the bounds for whatever h5py raises for damaged content."""
         try:
             yield
-        except SplitError:
+        except OoddError:
             raise
-        except BROKEN as error:
+        except _BROKEN as error:
             self.check_unchanged()
-            raise SplitError(
-                f"{self.name}, group {what} cannot be read ({error}): {_AGAIN}"
+            raise self.bounds.failure(
+                f"{self.name}, group {what} cannot be read ({error})"
             ) from error
 
     def groups(self, parent: str = "/") -> list[str]:
@@ -104,35 +104,59 @@ class StoredFile:
         with self.reading(parent):
             if parent not in self._file:
                 return []
-            group = self._file if parent == "/" else child(self._file, parent)
+            group = self._file if parent == "/" else child(self._file, parent, self.bounds.error)
             for name in group:
-                if not isinstance(child(group, name), h5py.Group):
-                    raise SplitError(f"{self.name} holds {name!r}, expected groups in {parent}")
+                if not isinstance(child(group, name, self.bounds.error), h5py.Group):
+                    message = f"{self.name} holds {name!r}, expected groups in {parent}"
+                    raise self.bounds.error(message)
             return [*group]
 
-    def part(self, name: str) -> dict[str, Any]:
-        """Return the datasets of a group by name: arrays, and `StoredRows` of those in `ROWS`."""
-        with self.reading(name):
-            group: Any = self._file
-            for step in name.split("/"):
-                if step not in group:
-                    raise SplitError(f"{self.name} lacks the group {name}: {_AGAIN}")
-                group = child(group, step)
-            return {dataset: self._content(group, dataset) for dataset in group}
+    def part(self, name: str, datasets: Collection[str] | None = None) -> dict[str, Any]:
+        """Return datasets of a group by name.
 
-    def _content(self, group: h5py.Group, name: str) -> Any:
-        found = child(group, name)
-        if not isinstance(found, h5py.Dataset) or not found.shape:
-            raise SplitError(f"{self.name}, {group.name} holds {name!r}, expected an array")
-        if name in ROWS or found.dtype.hasobject:
-            return StoredRows(self, found)
-        self._labels += found.nbytes
-        if self._labels > _MOST_LABELS:
-            raise SplitError(
-                f"{self.name}: with {found.name} all that is no row of an episode has "
-                f"{self._labels} bytes, expected at most {_MOST_LABELS}: {_AGAIN}"
-            )
-        array: NDArray[Any] = found[:]
+        Parameters
+        ----------
+        name
+            Path of the group.
+        datasets
+            Those to read at once, as far as the group has them; it stands for a file of its own
+            then, which the bounds are for. By default all, those in `ROWS` as `StoredRows`.
+        """
+        with self.reading(name):
+            group = self._group(name)
+            if datasets is None:
+                return {dataset: self._content(group, dataset, ROWS) for dataset in group}
+            self._taken = 0
+            return {d: self._content(group, d) for d in datasets if d in group}
+
+    def attributes(self, name: str, keys: Collection[str]) -> dict[str, Any]:
+        """Return attributes of a group with one value each, as far as it has them."""
+        with self.reading(name):
+            attributes = self._group(name).attrs
+            present = [key for key in keys if key in attributes]
+            for key in present:
+                if math.prod(attributes.get_id(key).shape) != 1:
+                    raise self.bounds.error(f"{self.name}, group {name}: {key} is no single value")
+            return {key: attributes[key] for key in present}
+
+    def _group(self, path: str) -> h5py.Group:
+        group: Any = self._file
+        for name in path.split("/"):
+            if name not in group:
+                raise self.bounds.failure(f"{self.name} lacks the group {path}")
+            group = child(group, name, self.bounds.error)
+        return group
+
+    def _content(self, group: h5py.Group, name: str, lazy: Collection[str] = ()) -> Any:
+        dataset = child(group, name, self.bounds.error)
+        if not isinstance(dataset, h5py.Dataset):
+            message = f"{self.name}, {group.name} holds {name!r}, expected an array"
+            raise self.bounds.error(message)
+        if name in lazy or (lazy and dataset.dtype.hasobject):
+            return StoredRows(self, dataset)
+        what = f"{self.name}, {dataset.name}"
+        self._taken = self.bounds.check(what, dataset.dtype, dataset.nbytes, self._taken)
+        array: NDArray[Any] = np.asarray(dataset[()])
         array.flags.writeable = False
         return array
 
@@ -147,70 +171,73 @@ class StoredFile:
             )
 
     def _state(self) -> tuple[int, int, int, int]:
-        found = os.fstat(self._file.id.get_vfd_handle())
-        return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_nlink
+        status = os.fstat(self._file.id.get_vfd_handle())
+        return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_nlink
 
 
-def child(group: h5py.Group, name: str) -> Any:
+def child(group: h5py.Group, name: str, error: type[OoddError] = SplitError) -> Any:
     """Return what a group holds under a name: a group, or a dataset that is plain.
 
-    `SplitError` for a link that leads elsewhere, for content in another file, and for more content
+    Raise `error` for a link that leads elsewhere, for content in another file, and for more content
     than the file can hold.
     """
     if not isinstance(group, h5py.Group):
-        raise SplitError(f"{_place(group)} is no group, expected one with {name!r}")
+        raise error(f"{_label(group)} is no group, expected one with {name!r}")
     if group.id.links.get_info(name.encode(errors="surrogateescape")).type != h5py.h5l.TYPE_HARD:
-        raise SplitError(f"{_place(group)} holds {name!r}, which points elsewhere: refused")
-    if isinstance(found := group[name], h5py.Dataset) and found.shape:
-        check_plain(found)
-    return found
+        raise error(f"{_label(group)} holds {name!r}, which points elsewhere: refused")
+    item = group[name]
+    if isinstance(item, h5py.Dataset):
+        check_plain(item, error)
+    return item
 
 
-def _place(found: Any) -> str:
+def _label(item: Any) -> str:
     """Return a group or dataset as messages name it."""
-    return f"{Path(found.file.filename).name}, {found.name}"
+    return f"{Path(item.file.filename).name}, {item.name}"
 
 
-def check_plain(dataset: h5py.Dataset) -> None:
-    """Raise `SplitError` unless a dataset's content is in its file, and no more than fits there."""
+def check_plain(dataset: h5py.Dataset, error: type[OoddError] = SplitError) -> None:
+    """Raise `error` unless a dataset's content is in its file, and no more than fits there."""
+    if dataset.shape is None:
+        raise error(f"{_label(dataset)} is empty, expected an array")
     # Opening a split comes here for some hundred datasets: what h5py makes anew is asked for once.
-    layout, item, held = dataset.id.get_create_plist(), dataset.dtype.itemsize, dataset.nbytes
+    layout, item, size = dataset.id.get_create_plist(), dataset.dtype.itemsize, dataset.nbytes
     if layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count():
-        raise SplitError(f"{_place(dataset)} keeps its content in another file: refused")
+        raise error(f"{_label(dataset)} keeps its content in another file: refused")
     filters = [layout.get_filter(i)[0] for i in range(layout.get_nfilters())]
     if {*filters} - _FILTERS or len(filters) > len({*filters}):
-        raise SplitError(
-            f"{_place(dataset)} is packed by the filters {filters}, expected gzip and "
+        raise error(
+            f"{_label(dataset)} is packed by the filters {filters}, expected gzip and "
             "shuffle: repack it, as with h5repack -f SHUF -f GZIP=4"
         )
-    size = os.fstat(h5py.h5i.get_file_id(dataset.id).get_vfd_handle()).st_size
-    pieces, longest, found, large = 1, held, [dataset.id.get_storage_size()], []
+    file_size = os.fstat(h5py.h5i.get_file_id(dataset.id).get_vfd_handle()).st_size
+    pieces, longest, stored, large = 1, size, [dataset.id.get_storage_size()], []
     if chunks := dataset.chunks:
         pairs = zip(dataset.shape, chunks, strict=True)
         pieces, longest = math.prod(-(-n // c) for n, c in pairs), math.prod(chunks) * item
-        if longest > _MOST_CHUNK:
-            raise SplitError(
-                f"{_place(dataset)} has chunks of {longest} bytes, expected at most "
-                f"{_MOST_CHUNK}: repack it, as with h5repack"
+        if longest > CHUNK_BYTES:
+            raise error(
+                f"{_label(dataset)} has chunks of {longest} bytes, limit {CHUNK_BYTES}: repack it, "
+                "as with h5repack"
             )
-        found = []
+        stored = []
 
         def note(chunk: Any) -> None:
-            found.append(chunk.size)
-            if chunk.size * _DEFLATE > _MOST_CHUNK and filters:
+            stored.append(chunk.size)
+            if chunk.size * _DEFLATE > CHUNK_BYTES and filters:
                 large.append(chunk)
 
-        if pieces <= size:
+        if pieces <= file_size:
             dataset.id.chunk_iter(note)
-    most = sum(found) * (_DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1)
-    if held > most or len(found) < pieces or sum(found) > size:
-        raise SplitError(
-            f"{_place(dataset)} has {held} bytes in {pieces} pieces, of which the file holds "
-            f"{len(found)} in {sum(found)} bytes: it is damaged, or made to fill the memory"
+    most = sum(stored) * (_DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1)
+    if size > most or len(stored) < pieces or sum(stored) > file_size:
+        raise error(
+            f"{_label(dataset)} has {size} bytes in {pieces} pieces, of which the file holds "
+            f"{len(stored)} in {sum(stored)} bytes: it is damaged, or made to fill the memory"
         )
     for chunk in large:
         _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
         with contextlib.suppress(zlib.error):  # HDF5 says so, too, when the chunk is read
             if len(zlib.decompressobj().decompress(content, longest + 1)) > longest:
-                where = _place(dataset)
-                raise SplitError(f"{where} has a chunk that unpacks to more than {longest} bytes")
+                message = f"{_label(dataset)} has a chunk that unpacks to more than {longest} bytes"
+                raise error(message)

@@ -29,14 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import files
+from oodd_eval.data.bounded import SCORES
+from oodd_eval.data.stored import child
 from oodd_eval.errors import OutputError, ResultsError
 from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Record
 
 RECORDS: Final = "records.jsonl"
 REPORT: Final = "report.md"
-
-MOST_ROWS: Final = 2 * 10**7  # of one part; a file may announce more than it holds
 
 WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next one may take
 
@@ -251,10 +251,11 @@ class ResultsDirectory:
 
 
 def _rows(part: h5py.Group) -> NDArray[np.float64]:
-    """Return all scores of a part; `ValueError` when there can be no such number of them."""
-    stored = part["scores"]
-    if stored.ndim != 1 or stored.size > MOST_ROWS or stored.dtype.kind != "f":
-        raise ValueError(f"scores of shape {stored.shape} and type {stored.dtype}")
+    """Return all scores of a part; `ResultsError` when there can be no such number of them."""
+    stored = child(part, "scores", SCORES.error)
+    SCORES.check("scores", stored.dtype, stored.nbytes)
+    if stored.ndim != 1:
+        raise SCORES.error(f"scores have shape {stored.shape}, expected one column")
     return np.asarray(stored[:], np.float64)
 
 

@@ -170,7 +170,7 @@ def _write(
             policy,
             sensors=info.sensors,
             actions=info.actions,
-            own=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
+            custom=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
         ) | _strengths(definition, environment)
 
 

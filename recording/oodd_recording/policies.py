@@ -4,15 +4,14 @@ A policy is deterministic: its forward pass runs in float64, and is rounded to a
 that the last bits of a matrix product cannot reach the simulator.
 """
 
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.bounded import POLICY, read_npz
 from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
 from oodd_eval.data.own import code_digest, environment_spec, info_of
@@ -105,16 +104,11 @@ def load_policy(environment: str, path: str | Path | None = None) -> Policy:
             return OwnPolicy(environment, spec.policy())
         path = spec.policy
     file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
-    try:
-        with file.open("rb") as source, np.load(source, allow_pickle=False) as stored:
-            arrays = {n: stored[n] for n in LAYERS[info.policy] if n in stored.files}
-    except FileNotFoundError:
+    if not file.exists():
         raise PolicyError(
             f"{file.name} does not exist: train it, `oodd-eval policies train {environment}`"
-        ) from None
-    # TypeError: a single array instead of an npz, which cannot be entered.
-    except (BadZipFile, ValueError, TypeError, OSError, EOFError, zlib.error) as error:
-        raise PolicyError(f"{file.name} is not a policy file of plain arrays: {error}") from error
+        )
+    arrays = read_npz(file, POLICY, LAYERS[info.policy])
     return make_policy(file.name, info, arrays)
 
 
@@ -129,8 +123,6 @@ def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
             f"{file} maps {found[0]} sensors to {found[1]} actions, expected "
             f"{info.observation_dim} and {info.action_dim} for {info.id}"
         )
-    if any(a.dtype.kind not in "fiu" for a in arrays.values()):
-        raise PolicyError(f"{file} holds arrays that are not numbers, expected float32 weights")
     if bad := [name for name, a in arrays.items() if not np.isfinite(a).all()]:
         raise PolicyError(f"{file} holds values that are not finite in {', '.join(bad)}")
     try:
