@@ -33,20 +33,38 @@ def export(
     environments: Sequence[str],
     progress: Callable[[str], None] = lambda _identity: None,
 ) -> list[str]:
-    """Write all parts of some environments below Minari's root; return the ids of the datasets.
+    """Write all parts of some environments as datasets below Minari's root.
 
-    Ids are such as ``oodd/mini/hopper/test-iid-v0``; `progress` is called with each when written.
-    `OutputError` when one exists, before any work, or cannot be written.
+    Parameters
+    ----------
+    split
+        The split.
+    directory
+        Minari's root.
+    environments
+        Those to export.
+    progress
+        Called with the id of each dataset when it is written.
+
+    Returns
+    -------
+    list of str
+        Ids of the datasets, such as ``oodd/mini/hopper/test-iid-v0``.
+
+    Raises
+    ------
+    OutputError
+        When a dataset exists, before any work, or cannot be written.
     """
     name = re.sub(r"[^-\w]", "-", str(split.manifest["name"]))
     entries = split.manifest["environments"]
-    found = [
+    targets = [
         directory / NAMESPACE / name / e / _dataset(part)
         for e in environments
         for part in entries[e]["groups"]
     ]
-    if there := next((str(place) for place in found if place.exists()), None):
-        raise OutputError(f"{there!r} exists: remove it, or export to another directory")
+    for target in (target for target in targets if target.exists()):
+        raise OutputError(f"{str(target)!r} exists: remove it, or export to another directory")
     written = []
     try:
         for environment in environments:
@@ -70,12 +88,12 @@ def _write(
     directory: Path, identity: str, data: EnvironmentData, trajectories: TrajectorySet, split: Split
 ) -> None:
     """Write one dataset, all or nothing."""
-    place = directory / identity
+    target = directory / identity
     policy = ENVIRONMENTS[data.id].policy if data.id in ENVIRONMENTS else "own"
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".", dir=place.parent) as temporary:
-        made = Path(temporary)
-        file = made / "data" / "main_data.hdf5"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".", dir=target.parent) as temporary:
+        partial = Path(temporary)
+        file = partial / "data" / "main_data.hdf5"
         file.parent.mkdir()
         with h5py.File(file, "w", track_order=True) as stored:
             ended = trajectories.terminated.tolist()
@@ -111,8 +129,8 @@ def _write(
             "actions": [dataclasses.asdict(quantity) for quantity in data.actions],
         }
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
-        made.chmod(0o755)  # temporary directories are their maker's alone
-        made.rename(place)
+        partial.chmod(0o755)  # temporary directories are their maker's alone
+        partial.rename(target)
 
 
 def _box(n: int, low: float, high: float) -> dict[str, Any]:
@@ -120,12 +138,12 @@ def _box(n: int, low: float, high: float) -> dict[str, Any]:
 
 
 def _episode(
-    group: h5py.Group, i: int, data: TrajectorySet, found: Trajectory, discrete: bool, ended: bool
+    group: h5py.Group, i: int, data: TrajectorySet, episode: Trajectory, discrete: bool, ended: bool
 ) -> None:
-    steps = found.transitions
+    steps = episode.transitions
     last = np.arange(steps) == steps - 1
-    actions = found.actions.argmax(axis=1) if discrete else found.actions
-    arrays = {"observations": found.observations, "actions": actions, "rewards": data.rewards(i)}
+    actions = episode.actions.argmax(axis=1) if discrete else episode.actions
+    arrays = {"observations": episode.observations, "actions": actions, "rewards": data.rewards(i)}
     arrays |= {"terminations": last & ended, "truncations": last & (not ended)}
     for name, array in arrays.items():
         group.create_dataset(name, data=array, chunks=True, compression="gzip", shuffle=True)

@@ -20,7 +20,7 @@ from oodd_eval.errors import OutputError, ResultsError
 GZIP: Final = ".gz"
 XZ: Final = ".xz"
 PACKED: Final = (XZ, GZIP)
-"""Endings of compressed files. New ones are by xz, which takes half of the place; both are read."""
+"""Endings of compressed files. New ones are by xz, which takes half of the room; both are read."""
 
 COMPRESSED_FROM: Final = 10**6  # bytes; smaller files stay readable in a pull request
 MAX_BYTES: Final = 64 * 10**6  # most bytes that a compressed file may decompress to
@@ -58,13 +58,13 @@ def remove_abandoned(directory: Path, name: str = "*") -> None:
 
     Where others may keep files, too, `name` says which of them this program writes.
     """
-    for place in directory.glob(f".{name}.*"):
-        found = re.fullmatch(r"\..+\.(\d{1,9})", place.name)
-        if found and not psutil.pid_exists(int(found[1])):
-            if place.is_dir():
-                shutil.rmtree(place, ignore_errors=True)
+    for path in directory.glob(f".{name}.*"):
+        process = re.fullmatch(r"\..+\.(\d{1,9})", path.name)
+        if process and not psutil.pid_exists(int(process[1])):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
             else:
-                place.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
 
 
 def digests(directory: Path, *, without: str = "") -> dict[str, str]:
