@@ -22,8 +22,13 @@ Group = Literal["sensor", "dynamics"]
 class Quantity:
     """A sensor or an action: its name, and the unit of its numbers.
 
-    `unit` is what the number 1 means: ``"rad"``, or ``"10 rad/s"`` where the simulator divides
-    angular speeds by ten, or ``"1"`` for a plain number.
+    Parameters
+    ----------
+    name
+        Of the sensor or action.
+    unit
+        What the number 1 means: ``"rad"``, or ``"10 rad/s"`` where the simulator divides angular
+        speeds by ten, or ``"1"`` for a plain number.
     """
 
     name: str
@@ -32,13 +37,32 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentInfo:
-    """One environment; actions are discrete in the family ``"classic"``, or with `numbers`.
+    """One environment.
 
-    `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A discrete action is a
-    one-hot row, so `action_dim` is then their number. `policy` is the algorithm of the nominal
-    policy, `paper_return` its mean return in the paper's Table 2, `episode_cap` the longest
-    episode in transitions. `sensors` and `actions` are names and units of the columns of
-    observations and of action rows.
+    Parameters
+    ----------
+    id
+        Its name here.
+    title
+        Its title in the paper.
+    simulator
+        Its name in Gymnasium.
+    family
+        Kind of simulator; actions are discrete in ``"classic"``.
+    observation_dim
+        Number of sensors.
+    action_dim
+        Width of an action row; of discrete actions, whose rows are one-hot, their number.
+    policy
+        Algorithm of the nominal policy.
+    paper_return
+        Mean return of that policy in the paper's Table 2.
+    episode_cap
+        Transitions of the longest episode.
+    sensors, actions
+        Names and units of the columns of observations and of action rows.
+    numbers
+        True when actions are discrete in another family.
     """
 
     id: str
@@ -62,7 +86,19 @@ class EnvironmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class AnomalyInfo:
-    """One anomaly type: its name, the paper's name, its group and what it changes."""
+    """One kind of anomaly.
+
+    Parameters
+    ----------
+    id
+        Its name here.
+    title
+        Its name in the paper.
+    group
+        Whether it changes sensors or dynamics.
+    summary
+        What it changes, in one sentence.
+    """
 
     id: str
     title: str
@@ -81,6 +117,11 @@ def split_condition(condition: str) -> tuple[str, str]:
     condition
         Such as ``"iid@kept99"``.
 
+    Returns
+    -------
+    tuple of str
+        Anomaly and strength.
+
     Examples
     --------
     >>> split_condition("iid@kept99"), split_condition("iid")
@@ -97,6 +138,11 @@ def join_condition(anomaly: str, strength: str) -> str:
     ----------
     anomaly, strength
         Names; an empty strength is none.
+
+    Returns
+    -------
+    str
+        Such as ``"iid@kept99"``, or the anomaly alone.
     """
     return f"{anomaly}@{strength}" if strength else anomaly
 
@@ -105,13 +151,26 @@ def join_condition(anomaly: str, strength: str) -> str:
 class SplitDefinition:
     """The recipe of a split: trajectories of each part, longest episode, seeds.
 
-    `episode_cap` None means the simulator's own limit. Trajectory seeds are
-    ``seed_base * 10**6 + offset of the part + index``. `suite` says which anomalies there are:
-    those of the paper's Table 1; all kinds at several strengths; or the kinds of the paper at the
-    strength at which its policies lost what its Table 2 says. `base` is the split whose training
-    and calibration parts, and test seeds, are taken, if any. `noise` is that of every sensor in
-    nominal operation, in shares of its spread. `strengths` are those of all conditions, in place of
-    a suite.
+    Parameters
+    ----------
+    name
+        Name of the split.
+    train, calibration, test
+        Numbers of trajectories, per anomaly for the last.
+    episode_cap
+        Transitions of the longest episode; None for the simulator's own limit.
+    seed_base
+        Trajectory seeds are ``seed_base * 10**6 + offset of the part + index``.
+    suite
+        The anomalies: ``"table1"`` are those of the paper's Table 1, ``"ladder"`` all kinds at
+        several strengths, ``"paper"`` the paper's at the strength at which its policies lost what
+        its Table 2 says.
+    base
+        Split whose training and calibration parts, and test seeds, are taken, if any.
+    noise
+        Noise of every sensor in nominal operation, in shares of its spread.
+    strengths
+        Strengths of all conditions, in place of a suite.
     """
 
     name: str
@@ -206,6 +265,11 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
         Environments, anomalies or conditions. A condition that is not known, such as
         ``"iid@0.5"``, has the place of its anomaly.
 
+    Returns
+    -------
+    list of str
+        The names.
+
     Examples
     --------
     >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
@@ -225,13 +289,24 @@ def title_of(environment: str) -> str:
     ----------
     environment
         Its name.
+
+    Returns
+    -------
+    str
+        The title.
     """
     return ENVIRONMENTS[environment].title if environment in ENVIRONMENTS else environment
 
 
 @functools.cache
 def paper_tables() -> Mapping[str, Any]:
-    """Return the numbers of the paper's tables, with the names of this module."""
+    """Return the numbers of the paper's tables, with the names of this module.
+
+    Returns
+    -------
+    mapping
+        Numbers by table, read-only.
+    """
     file = Path(__file__).with_name("paper_tables.json")
     tables: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return tables

@@ -52,8 +52,21 @@ def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
 class TrajectorySet(TrajectorySequence):
     """The trajectories of one part, decompressed once, or a few at a time beyond 16 MiB.
 
-    `group` is the name of the part, such as ``"test/iid"``; `lengths` and `seeds` (int64, of shape
-    (n,)) are the transitions of each trajectory and the environment's seeds.
+    Parameters
+    ----------
+    parts
+        Datasets by name of each part.
+    group
+        Name of the part.
+
+    Attributes
+    ----------
+    group
+        Name of the part, such as ``"test/iid"``.
+    lengths
+        Transitions of each trajectory, int64 of shape (n,).
+    seeds
+        Seeds of the environment, int64 of shape (n,).
     """
 
     def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
@@ -116,9 +129,19 @@ class TrajectorySet(TrajectorySequence):
 class AnomalousSet(TrajectorySet):
     """Anomalous trajectories and what is known of them; number i is the twin of test seed i.
 
-    `onsets` (int64, of shape (n,)) are the first observations that may differ from the twins',
-    `effects` those that do differ first, never before the onsets, and `redraws` the numbers of
-    draws that were rejected.
+    Parameters
+    ----------
+    parts, group
+        As those of `TrajectorySet`.
+
+    Attributes
+    ----------
+    onsets
+        First observations that may differ from the twins', int64 of shape (n,).
+    effects
+        First observations that do differ, never before the onsets, int64 of shape (n,).
+    redraws
+        Numbers of draws that were rejected, int64 of shape (n,).
     """
 
     def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
@@ -236,13 +259,32 @@ class TwinCheck:
 
 
 class EnvironmentData:
-    """The verified content of one environment: `id` is its name, `digest` that of all its parts.
+    """The verified content of one environment.
 
-    `train` are nominal trajectories to fit on, `calibration` those that standardize scores and
-    calibrate alarms, `twins` those of the test seeds. `anomalies` are the conditions of this split:
-    names of anomalies, with ``@`` and the strength where there are several, as in ``iid@kept99``.
-    `sensors` and `actions` are names and units of the columns of observations and actions; an
-    action that is `discrete` is a one-hot row.
+    Parameters
+    ----------
+    environment, file, parts, digest, discrete
+        What `Split.environment` has read and verified.
+
+    Attributes
+    ----------
+    id
+        Name of the environment.
+    digest
+        SHA-256 of all its parts.
+    train
+        Nominal trajectories to fit on.
+    calibration
+        Nominal trajectories that standardize scores and calibrate alarms.
+    twins
+        Nominal trajectories of the test seeds.
+    anomalies
+        Anomalies of this split, with ``@`` and the strength where there are several, as in
+        ``iid@kept99``.
+    sensors, actions
+        Names and units of the columns of observations and actions.
+    discrete
+        True when an action is a one-hot row.
     """
 
     def __init__(
@@ -272,6 +314,11 @@ class EnvironmentData:
         anomaly
             One of `anomalies`.
 
+        Returns
+        -------
+        AnomalousSet
+            Trajectory number i is the counterpart of twin number i.
+
         Raises
         ------
         UnknownNameError
@@ -287,6 +334,11 @@ class EnvironmentData:
         ----------
         part
             Such as ``"train"``.
+
+        Returns
+        -------
+        dict
+            Arrays by the names of the datasets.
         """
         return {name: dataset[:] for name, dataset in self._parts[part].items()}
 

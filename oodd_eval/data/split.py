@@ -42,7 +42,13 @@ def split_places(split: "Split") -> tuple[str, ...]:
 
 
 def data_home() -> Path:
-    """Return ``$OODD_EVAL_DATA``, or ``oodd-eval/splits`` in the user's data directory."""
+    """Return ``$OODD_EVAL_DATA``, or ``oodd-eval/splits`` in the user's data directory.
+
+    Returns
+    -------
+    Path
+        The directory, which need not exist.
+    """
     if os.environ.get("OODD_EVAL_DATA"):
         return Path(os.environ["OODD_EVAL_DATA"])
     base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
@@ -67,6 +73,11 @@ def load_split(name: str | Path) -> "Split":
         Such as ``"mini"`` or ``"path/to/mine"``: a directory with a manifest is taken first, then
         shipped splits, then built or fetched ones.
 
+    Returns
+    -------
+    Split
+        Its files are opened when an environment is.
+
     Raises
     ------
     UnknownNameError, SplitNotFoundError
@@ -90,7 +101,13 @@ def load_split(name: str | Path) -> "Split":
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """A frozen split: a directory with a manifest and one file per environment."""
+    """A frozen split: a directory with a manifest and one file per environment.
+
+    Parameters
+    ----------
+    path
+        The directory.
+    """
 
     path: Path
 
@@ -126,6 +143,11 @@ class Split:
         ----------
         environment
             One of `environments`.
+
+        Returns
+        -------
+        tuple of str
+            Such as ``"iid"`` or ``"iid@kept99"``, in the benchmark's order.
         """
         return anomalies_in(self.manifest["environments"][environment]["groups"])
 
@@ -180,6 +202,11 @@ class Split:
         ----------
         environment
             One of `environments`.
+
+        Returns
+        -------
+        str
+            SHA-256, in hexadecimal digits.
         """
         return str(self.manifest["environments"][environment]["groups"][TRAIN]["sha256"])
 
@@ -222,14 +249,31 @@ class Split:
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
-        """Give what opens environments, each once; all are closed when the block is left."""
+        """Give what opens environments, each once; all are closed when the block is left.
+
+        Yields
+        ------
+        function
+            Returns the `EnvironmentData` of a name.
+        """
         with contextlib.ExitStack() as stack:
             yield functools.cache(
                 lambda name: stack.enter_context(contextlib.closing(self.environment(name)))
             )
 
     def verify(self) -> Iterator[GroupCheck]:
-        """Compare every group with the manifest; `SplitError` when a file cannot be read."""
+        """Compare every group with the manifest; `SplitError` when a file cannot be read.
+
+        Yields
+        ------
+        GroupCheck
+            Of each group of each file, the expected and the actual digest.
+
+        Raises
+        ------
+        SplitError
+            When a file cannot be read.
+        """
         for name in self.environments:
             with contextlib.closing(self._open(name)) as file:
                 yield from self._checks(name, file, self._parts(name, file))

@@ -76,7 +76,13 @@ class Trajectory:
         return Trajectory(self.observations[:n], self.actions[: n - 1])
 
     def without_actions(self) -> "Trajectory":
-        """Return the same observations with actions of width 0."""
+        """Return the same observations with actions of width 0.
+
+        Returns
+        -------
+        Trajectory
+            This one where its actions are of width 0 already.
+        """
         return Trajectory(self.observations) if self.action_dim else self
 
     @property
