@@ -2,8 +2,10 @@
 
 import csv
 import json
+import os
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -11,10 +13,11 @@ import pytest
 
 from oodd_eval import evaluate, live, load_split
 from oodd_eval.cli.main import main
+from oodd_eval.data import logs
 from oodd_eval.data.export import export
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.importing import import_data
-from oodd_eval.data.logs import quantity
+from oodd_eval.data.logs import FORMATS, quantity
 from oodd_eval.errors import TrajectoryError, UsageError
 
 ROWS, SENSORS = 60, 3
@@ -94,30 +97,17 @@ def imported(root, form, name="plant", environment="pump", **more):
     return import_data(name, environment, **(arguments(root, form) | given))
 
 
-@pytest.fixture(scope="module", params=MAKE)
-def form(request):
-    return request.param
-
-
 @pytest.fixture(scope="module")
-def root(form, tmp_path_factory):
-    root = tmp_path_factory.mktemp(form)
-    MAKE[form](root)
-    return root
-
-
-@pytest.fixture(scope="module")
-def split(root, form):
-    return imported(root, form)
+def split(tmp_path_factory):
+    root = tmp_path_factory.mktemp("logs")
+    as_csv(root)
+    return imported(root, "csv")
 
 
 def test_an_import_holds_what_was_logged(split):
     data = split.environment("pump")
     assert split.groups == {"clog": "dynamics", "fog": "sensor"}
-    assert data.sensors == NAMED
-    assert [q.name for q in data.actions] == ["valve"]
-    sizes = [len(part) for part in (data.train, data.calibration, data.twins)]
-    assert sizes == [4, 5, 3]
+    assert (data.sensors, [q.name for q in data.actions]) == (NAMED, ["valve"])
     for part, episodes in parts():
         own = {"train": data.train, "calibration": data.calibration, "test/nominal": data.twins}
         found = own[part] if part in own else data.anomalous(part.removeprefix("test/"))
@@ -139,20 +129,16 @@ def test_every_command_takes_the_split(split, tmp_path, capsys):
     assert main(["show", output, "--split", place]) == 0
     shown = capsys.readouterr().out
     assert "pump" in shown
-    assert "Means over" not in shown.replace("Means over cells", "")
-
-
-def test_a_detector_sees_the_anomaly_that_was_logged(split):
     # The sensor leaves its range at the onset by many times its spread.
     assert evaluate("mahalanobis", split).mean("auc_matched") > 0.95
 
 
 def test_formats_give_the_same_bytes(tmp_path):
-    found = set()
+    digests = set()
     for form, make in MAKE.items():
         make(tmp_path / form)
-        found.add(imported(tmp_path / form, form).digest)
-    assert len(found) == 1
+        digests.add(imported(tmp_path / form, form).digest)
+    assert len(digests) == 1
 
 
 def test_a_further_environment_joins_a_split_and_none_is_replaced(tmp_path):
@@ -294,25 +280,22 @@ def changed(place, **arrays):
 
 
 BROKEN = [
-    (broken_row, r"run-1.npz: observations hold 1 values .* row 7, column 1"),
+    (broken_row, r"run-1.npz: .* row 7, column 1"),
     (huge, r"run-1.npz, observations: arrays take 12000000000 bytes"),
     (odd_method, r"run-1.npz cannot be read: .* neither stored nor deflated"),
-    (objects, r"run-1.npz, observations has dtype \|O, expected numbers"),
-    (lambda r: (r / "train" / "run-1.npz").write_bytes(b"no zip"), r"run-1.npz cannot be read"),
+    (objects, r"run-1.npz, observations has dtype \|O"),
     (changed("train", observations=None), r"lacks the array obs"),
-    (changed("train", observations=np.ones((61, 2))),
-     r"run-1.npz has 2 sensors and 1 columns of actions, expected 3 and 1"),
-    (changed("train", actions=np.ones((61, 1))),
-     r"run-1.npz: a trajectory has one observation more than actions"),
+    (changed("train", observations=np.ones((61, 2))), r"run-1.npz has 2 sensors"),
+    (changed("train", actions=np.ones((61, 1))), r"run-1.npz: .*one observation more"),
     (changed("train", observations=np.ones((1, 3)), actions=np.ones((0, 1)), rewards=None),
      r"has 1 observation, expected at least 2"),
     (changed("train", rewards=np.ones(3)), r"rewards have shape \(3,\)"),
-    (lambda r: (r / "test" / "fog" / "run-1.npz").unlink(), r"episode 'run-1' is missing"),
+    (lambda r: (r / "test" / "fog" / "run-1.npz").unlink(), r"'run-1' is missing"),
     (lambda r: (r / "test" / "nominal" / "run-1.npz").unlink(), r"'run-1' has no nominal twin"),
     (changed("test/fog", onset=None), r"run-1.npz has no onset"),
     (changed("test/fog", onset=61), r"onset is row 61, expected 0 to 60"),
     (changed("test/fog", onset=np.arange(3)), r"run-1.npz: onset is .*one whole number"),
-    (changed("test/fog", observations=episode(1)[0]), r"equals its twin from its onset, row 23"),
+    (changed("test/fog", observations=episode(1)[0]), r"equals its twin"),
 ]  # fmt: skip
 
 
@@ -329,13 +312,11 @@ def test_what_is_wrong_with_an_episode_is_said_with_its_file(tmp_path, spoil, me
 @pytest.mark.parametrize(
     ("line", "text", "message"),
     [
-        (5, "0.4,1,x,3,0,1", r"run-1.csv, line 5, column 'obs:flow': 'x', expected a number"),
-        (5, "0.4,1", r"run-1.csv, line 5, column 'obs:flow': nothing, expected a number"),
-        (5, "0.4,1,2,3,,1", r"run-1.csv, line 5, column 'action:valve': '', expected a number"),
-        (5, "0.4," * 2**18, r"run-1.csv cannot be read: .* more than 1048576 characters"),
-        (5, "", r"run-1.csv, line 5, column 'obs:pressure.*': nothing, expected a number"),
-        (1, "", r"run-1.csv has the columns \[\], expected those of"),
-        (1, "time,obs:a", r"run-1.csv has the columns \['time', 'obs:a'\], expected those of"),
+        (5, "0.4,1,x,3,0,1", r"line 5, column 'obs:flow': 'x'"),
+        (5, "0.4,1,2,3,,1", r"line 5, column 'action:valve': ''"),
+        (5, "", r"line 5, column 'obs:pressure.*': nothing"),
+        (5, "0.4," * 2**18, r"more than 1048576 characters"),
+        (1, "time,obs:a", r"expected those of"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_said_with_its_line(tmp_path, line, text, message):
@@ -360,59 +341,78 @@ def test_a_long_table_takes_little_memory(tmp_path):
     assert peak < 10 * path.stat().st_size
 
 
-def test_a_table_without_any_line_is_refused(tmp_path):
-    as_csv(tmp_path)
-    (tmp_path / "train" / "run-0.csv").write_bytes(b"")
-    with pytest.raises(TrajectoryError, match=r"run-0.csv has the columns \[\], expected obs:NAME"):
-        imported(tmp_path, "csv")
-
-
-def test_onsets_of_a_table_are_whole_numbers(tmp_path):
-    as_csv(tmp_path)
-    (tmp_path / "test" / "fog" / "onsets.csv").write_text("file,onset\nrun-0.csv,soon\n")
-    with pytest.raises(TrajectoryError, match=r"onsets.csv, line 2: .*expected the columns file"):
-        imported(tmp_path, "csv")
-
-
-def test_a_file_that_points_into_another_is_refused(tmp_path):
-    as_hdf5(tmp_path)
-    with h5py.File(tmp_path / "train.h5", "a") as file:
+def leak(root):
+    with h5py.File(root / "train.h5", "a") as file:
         file["leak"] = h5py.ExternalLink("calibration.h5", "run-0")
-    with pytest.raises(TrajectoryError, match="holds 'leak', which points elsewhere: refused"):
-        imported(tmp_path, "hdf5")
+
+
+def array_of_onsets(root):
+    with h5py.File(root / "test" / "fog.h5", "a") as file:
+        file["run-1"].attrs["onset"] = [1, 2]
+
+
+def pipe(root):
+    (root / "train.h5").unlink()
+    os.mkfifo(root / "train.h5")
+
+
+@pytest.mark.parametrize(
+    ("form", "spoil", "message"),
+    [
+        ("csv", lambda r: (r / "train" / "run-0.csv").write_bytes(b""), "expected obs:NAME"),
+        ("csv", lambda r: (r / "test" / "fog" / "onsets.csv").write_text("file,onset\na.csv,soon"),
+         "onsets.csv, line 2"),
+        ("hdf5", leak, "holds 'leak', which points elsewhere: refused"),
+        ("hdf5", array_of_onsets, "onset is no single value"),
+        ("hdf5", pipe, "train.h5 is no plain file"),
+    ],
+    ids=["empty", "onsets", "link", "array", "pipe"],
+)  # fmt: skip
+def test_what_is_wrong_with_a_file_is_said(tmp_path, form, spoil, message):
+    MAKE[form](tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(TrajectoryError, match=message):
+        imported(tmp_path, form)
 
 
 def test_a_dataset_of_dictionaries_is_refused(tiny_split, tmp_path):
     export(load_split(tiny_split), tmp_path, environments=["hopper"])
-    place = tmp_path / "oodd" / "tiny" / "hopper"
-    file = place / "train-v0" / "data" / "metadata.json"
-    said = json.loads(file.read_text()) | {"observation_space": '{"type": "Dict"}'}
-    file.write_text(json.dumps(said))
+    root = tmp_path / "oodd" / "tiny" / "hopper"
+    file = root / "train-v0" / "data" / "metadata.json"
+    facts = json.loads(file.read_text()) | {"observation_space": '{"type": "Dict"}'}
+    file.write_text(json.dumps(facts))
     with pytest.raises(TrajectoryError, match="observations are Dict and actions Box"):
-        import_data("back", "other", form="minari", train=place / "train-v0",
-                    calibration=place / "calibration-v0", output=tmp_path / "x")  # fmt: skip
+        import_data("back", "other", form="minari", train=root / "train-v0",
+                    calibration=root / "calibration-v0", output=tmp_path / "x")  # fmt: skip
+
+
+def test_a_reader_in_a_further_module_is_found(tmp_path, monkeypatch):
+    (tmp_path / "toy.py").write_text(
+        "from oodd_eval.data.logs import Logs, Reader\n"
+        "READER = Reader('toy', 'a folder', lambda folder: Logs(lambda: iter(())))\n"
+    )
+    monkeypatch.setattr(logs, "__path__", [*logs.__path__, str(tmp_path)])
+    assert {reader.name for reader in logs._formats()} == {*FORMATS, "toy"}
 
 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"environment": "hopper"}, "'hopper' is the benchmark's environment"),
-        ({"name": "mini"}, "'mini' is the benchmark's split"),
-        ({"environment": "../x"}, "cannot be the name of a environment"),
+        ({"environment": "hopper"}, "the benchmark's environment"),
+        ({"name": "mini"}, "the benchmark's split"),
+        ({"environment": "../x"}, "cannot be the name"),
         ({"groups": {"smog": "sensor"}}, "did you mean 'fog'"),
         ({"groups": {"fog": "weather"}}, "unknown group 'weather'"),
-        ({"sensors": NAMED[:2]}, r"there are 3 sensors, named pressure, flow: .* \(--sensors\)"),
+        ({"sensors": NAMED[:2]}, "there are 3 sensors"),
         ({"sensors": NAMED[:1] * 3}, "as many different names"),
         ({"form": "npz"}, "unknown format 'npz'"),
-        ({"calibration": "nowhere"}, "'nowhere' does not exist, expected a folder with a file"),
+        ({"calibration": "nowhere"}, "'nowhere' does not exist"),
         ({"test": "train"}, "expected a part 'nominal'"),
     ],
 )
 def test_a_wrong_request_is_refused_with_what_to_do(tmp_path, more, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     as_numpy(tmp_path)
-    from pathlib import Path
-
     paths = {k: Path(v) if k in {"calibration", "test"} else v for k, v in more.items()}
     with pytest.raises(UsageError, match=message):
         imported(tmp_path, **({"form": "numpy"} | paths))

@@ -12,12 +12,11 @@ from helpers_split import make_group, make_split
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.cli.main import main
 from oodd_eval.data import layout as splits_format
 from oodd_eval.data import parts
 from oodd_eval.data import split as splits
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.layout import check_layout, content_digest, write_environment
+from oodd_eval.data.layout import content_digest, write_environment
 from oodd_eval.data.parts import TWINS, TrajectorySet
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import DigestError, SplitError, SplitNotFoundError, UnknownNameError
@@ -67,14 +66,6 @@ def test_lengths_returns_and_sizes_of_the_parts(tiny_split):
     assert data.anomalies == TABLE1
 
 
-def test_twins_are_identical_before_the_onset_only(tiny_split):
-    data = load_split(tiny_split).environment("hopper")
-    drifted = data.anomalous("drift")
-    for twin, x, onset in zip(data.twins, drifted, drifted.onsets, strict=True):
-        np.testing.assert_array_equal(x.observations[:onset], twin.observations[:onset])
-        assert (x.observations[onset] != twin.observations[onset]).any()
-
-
 def brute_force_effect(x, twin):
     """The first row that both have and that differs."""
     for t in range(min(len(x), len(twin))):
@@ -118,14 +109,6 @@ def test_names_and_units_are_in_file_and_manifest_alike(tiny_split):
             assert stored["names/sensors"].dtype.kind == "S"
             first = json.loads(stored["names/sensors"][0])
         assert first == {"name": data.sensors[0].name, "unit": data.sensors[0].unit}
-
-
-def test_a_trajectory_set_is_a_sequence(tiny_split):
-    train = load_split(tiny_split).environment("cartpole").train
-    assert len(train[1:3]) == 2
-    np.testing.assert_array_equal(train[-1].observations, train[5].observations)
-    with pytest.raises(IndexError):
-        train[6]
 
 
 def test_iteration_holds_one_block_of_trajectories_in_memory(tmp_path, monkeypatch):
@@ -223,20 +206,6 @@ def test_a_changed_name_is_noticed_in_file_and_manifest(copy):
         _ = load_split(copy).digest
 
 
-@pytest.mark.parametrize("kind", ["sensors", "actions"])
-def test_a_file_without_names_or_with_too_few_is_refused(copy, kind):
-    with h5py.File(copy / "hopper.h5", "r+") as file:
-        names = file[f"names/{kind}"][:]
-        del file[f"names/{kind}"]
-    with pytest.raises(SplitError, match=rf"hopper\.h5 lacks the names of its {kind}"):
-        load_split(copy).environment("hopper")
-    with h5py.File(copy / "hopper.h5", "r+") as file:
-        file[f"names/{kind}"] = names[1:]
-    few = len(names) - 1
-    with pytest.raises(SplitError, match=rf"group train: .* expected {few} columns, since names"):
-        load_split(copy).environment("hopper")
-
-
 def test_writing_refuses_names_that_do_not_fit_the_columns(tmp_path):
     info = ENVIRONMENTS["cartpole"]
     groups = {"train": make_group("cartpole", range(2), 60)}
@@ -249,11 +218,6 @@ def test_writing_refuses_names_that_do_not_fit_the_columns(tmp_path):
 # Names
 
 
-def test_a_built_split_is_found_by_name(data_home):
-    make_split(data_home / "tiny")
-    assert load_split("tiny").environments == ("cartpole", "hopper")
-
-
 def test_a_directory_here_is_found_by_its_bare_name(data_home, tmp_path, monkeypatch):
     make_split(tmp_path / "work" / "mine", name="mine")
     monkeypatch.chdir(tmp_path / "work")
@@ -262,32 +226,16 @@ def test_a_directory_here_is_found_by_its_bare_name(data_home, tmp_path, monkeyp
     assert load_split("mine").path.absolute() == tmp_path / "work" / "mine"
 
 
-@pytest.mark.parametrize(
-    "command", ["data info", "data verify", "run --detector clock --env cartpole -k iid --split"]
-)
-def test_every_command_finds_a_directory_by_its_bare_name(tmp_path, monkeypatch, capsys, command):
-    make_split(tmp_path / "mine", name="mine")
-    monkeypatch.chdir(tmp_path)
-    assert main([*command.split(), "mine"]) == 0
-    assert load_split("mine").digest[:12] in capsys.readouterr().out
-
-
-def test_an_unknown_split_names_its_neighbour(data_home):
+def test_a_name_without_a_split_says_what_to_do(data_home, tmp_path):
     make_split(data_home / "tiny")
-    with pytest.raises(UnknownNameError, match=r"unknown split 'tinny': did you mean 'tiny'\?"):
-        load_split("tinny")
-    with pytest.raises(UnknownNameError, match=r"did you mean 'standard'\?"):
-        load_split("standart")
-
-
-def test_a_published_split_that_is_not_here_names_the_command(data_home):
-    with pytest.raises(SplitNotFoundError, match=r"`oodd-eval data build standard`"):
-        load_split("standard")
-
-
-def test_a_directory_without_manifest_is_no_split(tmp_path):
-    with pytest.raises(SplitNotFoundError, match=r"is no split: it has no manifest\.json"):
-        load_split(tmp_path)
+    for name, error, message in [
+        ("tinny", UnknownNameError, "did you mean 'tiny'"),
+        ("standart", UnknownNameError, "did you mean 'standard'"),
+        ("standard", SplitNotFoundError, "`oodd-eval data build standard`"),
+        (tmp_path, SplitNotFoundError, "has no manifest"),
+    ]:
+        with pytest.raises(error, match=message):
+            load_split(name)
 
 
 def test_a_rebuilt_published_split_is_labelled_as_another(data_home, tmp_path, monkeypatch):
@@ -328,125 +276,35 @@ def test_a_truncated_file_says_so(copy, share):
         load_split(copy).environment("hopper")
 
 
-def test_a_missing_file_is_named(copy):
+@pytest.mark.parametrize(
+    "gone", ["train", "train/seeds", "test/iid", "names/sensors", "names/actions"]
+)
+def test_what_a_file_lacks_is_named(copy, gone):
+    with h5py.File(copy / "hopper.h5", "r+") as file:
+        del file[gone]
+    with pytest.raises(SplitError, match=r"hopper\.h5.* lacks "):
+        load_split(copy).environment("hopper")
     (copy / "hopper.h5").unlink()
     with pytest.raises(SplitNotFoundError, match=r"hopper\.h5 is missing"):
         load_split(copy).environment("hopper")
 
 
-def test_a_part_that_the_manifest_does_not_name_is_refused(copy):
-    """Its content has no digest to be compared with."""
-
-    def forget(manifest):
-        del manifest["environments"]["hopper"]["groups"]["test/iid"]
-        digest = splits_format.split_digest(manifest["environments"], manifest["definition"])
-        manifest["digest"] = digest
-
-    edit_manifest(copy, forget)
-    for read in (lambda s: s.environment("hopper"), lambda s: list(s.verify())):
-        with pytest.raises(SplitError, match=r"hopper.h5 holds the groups .*test/iid.*, expected"):
-            read(load_split(copy))
-
-
-def test_a_missing_group_and_a_missing_dataset_are_named(copy):
-    with h5py.File(copy / "hopper.h5", "r+") as file:
-        del file["train"]["seeds"]
-        del file["test/iid"]
-    with pytest.raises(SplitError, match=r"group train lacks the dataset 'seeds'"):
-        load_split(copy).environment("hopper")
-    with h5py.File(copy / "hopper.h5", "r+") as file:
-        del file["train"]
-    with pytest.raises(SplitError, match=r"hopper\.h5 lacks the group train"):
-        load_split(copy).environment("hopper")
-
-
-def replaced(dataset, change):
-    def in_group(group):
-        array = change(group[dataset][:])
-        del group[dataset]
-        group[dataset] = array
-
-    return in_group
-
-
-@pytest.mark.parametrize(
-    ("part", "change", "message"),
-    [
-        ("test/iid", replaced("parameters", lambda _: np.array(["{}"] * 2, dtype=object)),
-         r"parameters has dtype \|O, expected \|S"),
-        ("train", replaced("rewards", lambda a: a.astype("<f8")),
-         "rewards has dtype <f8, expected <f4"),
-        ("train", replaced("actions", lambda a: a[:-1]),
-         "actions has 120 rows, expected 121 for 2 trajectories"),
-        ("train", replaced("offsets", lambda a: a * [1, 0, 1]),
-         "rise by at least 1 per trajectory"),
-        ("test/iid", replaced("effects", lambda a: a - 1),
-         r"trajectory 0 has its onset at row (\d+) and its effect at row \d+, expected"),
-        ("test/iid", replaced("effects", lambda a: a + np.array([0, 40])),
-         r"trajectory 1 has its onset .* expected 0 <= onset <= effect <= 61, the last row"),
-    ],
-    ids=["objects", "dtype", "rows", "offsets", "effect-before-onset", "effect-behind-the-end"],
-)  # fmt: skip
-def test_another_layout_is_refused(tmp_path, part, change, message):
-    anomaly = part.removeprefix("test/") if part != "train" else None
-    with h5py.File(tmp_path / "x.h5", "w") as file:
-        group = file.create_group(part)
-        for dataset, array in make_group("cartpole", [1, 2], 60, anomaly).items():
-            group[dataset] = array.astype("<f4") if array.dtype == np.float64 else array
-        check_layout("x.h5", part, group)
-        change(group)
-        with pytest.raises(SplitError, match=message):
-            check_layout("x.h5", part, group)
-
-
-def test_an_edited_manifest_is_noticed(copy):
-    def change(manifest):
-        manifest["environments"]["hopper"]["groups"]["train"]["sha256"] = "0" * 64
-
-    edit_manifest(copy, change)
-    with pytest.raises(SplitError, match=r"names the digest .* it was edited"):
-        _ = load_split(copy).digest
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(schema="2"), "schema: .*, got '2'"),
-        (lambda m: m["environments"]["hopper"].pop("sensors"), "hopper.sensors: Field required"),
-        (
-            lambda m: m["environments"]["hopper"]["actions"][0].update(unit=1),
-            "hopper.actions.0.unit: .*, got 1",
-        ),
-        (lambda m: m.pop("definition"), "definition: Field required"),
-        (lambda m: m["environments"]["hopper"].pop("groups"), "hopper.groups: Field required"),
-        (lambda m: m.update(environments=[]), r"environments: .*, got \[\]"),
-        (lambda m: m.update(definition=None), "definition: .*, got None"),
-        (lambda m: m.update(name=3), "name: .*, got 3"),
-        (
-            lambda m: m["environments"]["hopper"]["groups"]["train"].update(transitions=10**12),
-            "hopper.groups.train.transitions: .*10000000000, got 1000000000000",
-        ),
+        (lambda m: m.update(schema="2"), "schema"),
+        (lambda m: m.update(schema=1), "schema 1, expected 2"),
+        (lambda m: m["environments"]["hopper"].pop("sensors"), "hopper.sensors"),
+        (lambda m: m["environments"]["hopper"]["actions"][0].update(unit=1), "actions.0.unit"),
+        (lambda m: m["environments"]["hopper"].pop("groups"), "hopper.groups"),
+        (lambda m: m.update(environments=[]), "environments"),
+        (lambda m: m.update(definition=None), "definition"),
+        (lambda m: m["environments"]["hopper"].update(digest="0"), "it was edited"),
     ],
-)
+)  # fmt: skip
 def test_a_damaged_manifest_says_what_is_wrong(copy, change, message):
     edit_manifest(copy, change)
+    if message == "it was edited":
+        edit_manifest(copy, lambda m: m["definition"].update(train=7))
     with pytest.raises(SplitError, match=message):
         _ = load_split(copy).digest
-
-
-def test_a_split_of_another_layout_says_what_to_do(copy):
-    edit_manifest(copy, lambda m: m.update(schema=1))
-    with pytest.raises(SplitError, match=r"schema 1, expected 2: .*; remove it, then build or"):
-        _ = load_split(copy).digest
-
-
-def test_a_manifest_that_is_no_json_is_refused(copy):
-    (copy / "manifest.json").write_text("{")
-    with pytest.raises(SplitError, match="is not a split's manifest"):
-        _ = load_split(copy).name
-
-
-def test_a_manifest_cannot_point_outside_of_its_directory(copy):
-    edit_manifest(copy, lambda m: m["environments"]["hopper"].update(file="../hopper.h5"))
-    with pytest.raises(SplitError, match="file outside of the split"):
-        load_split(copy).environment("hopper")

@@ -2,6 +2,7 @@
 
 import fcntl
 import functools
+import hashlib
 import http.server
 import importlib.util
 import io
@@ -71,18 +72,16 @@ def is_installed(home, tiny_split):
 # Where from
 
 
-@pytest.mark.parametrize("archive", ["", "x.tar", "x.tar.gz", "x.tgz", "x.zip", "no-suffix"])
-@pytest.mark.parametrize("scheme", ["", "file://"])
+@pytest.mark.parametrize(
+    ("archive", "scheme", "folder"),
+    [("", "", ""), ("", "file://", ""), ("x.tar", "", "tiny/"), ("x.tar", "", ""),
+     ("x.tgz", "file://", "tiny/"), ("x.zip", "", "tiny/"), ("no-suffix", "", "tiny/")],
+)  # fmt: skip
 def test_a_split_is_fetched_from_a_directory_or_an_archive(
-    tiny_split, home, tmp_path, archive, scheme
+    tiny_split, home, tmp_path, archive, scheme, folder
 ):
-    place = pack(tiny_split, tmp_path / archive) if archive else tiny_split
-    assert not fetch(f"{scheme}{place}").already
-    assert is_installed(home, tiny_split)
-
-
-def test_an_archive_may_have_no_folder(tiny_split, home, tmp_path):
-    fetch(str(pack(tiny_split, tmp_path / "x.tar", folder="")))
+    source = pack(tiny_split, tmp_path / archive, folder) if archive else tiny_split
+    assert not fetch(f"{scheme}{source}").already
     assert is_installed(home, tiny_split)
 
 
@@ -141,12 +140,6 @@ def test_a_split_is_fetched_from_a_web_directory(tiny_split, home, web):
     ]  # fmt: skip
 
 
-def test_an_archive_is_fetched_from_the_web(tiny_split, home, web):
-    pack(tiny_split, web.root / "tiny.tar.gz")
-    fetch(f"{web.address}/tiny.tar.gz")
-    assert is_installed(home, tiny_split)
-
-
 @pytest.mark.parametrize("ranges", [True, False])
 @pytest.mark.parametrize("kind", ["directory", "archive"])
 def test_a_download_that_broke_off_goes_on(tiny_split, home, web, ranges, kind):
@@ -177,26 +170,16 @@ def test_files_that_are_there_and_whole_are_not_fetched_again(tiny_split, home, 
     assert is_installed(home, tiny_split)
 
 
-def test_what_is_not_on_the_server_is_named(home, web):
-    with pytest.raises(SplitNotFoundError, match=r"/none/manifest\.json answers 404"):
-        fetch(f"{web.address}/none")
+@pytest.mark.parametrize(
+    ("address", "error"),
+    [("{web}/none", SplitNotFoundError), ("http://127.0.0.1:9/x.tar", SplitError),
+     ("ftp://h/x.tar", UsageError), ("s3://b/x", UsageError), ("/no/such", SplitNotFoundError)],
+)  # fmt: skip
+def test_where_nothing_can_be_fetched_the_address_is_named(home, web, address, error):
+    address = address.format(web=web.address)
+    with pytest.raises(error, match=address):
+        fetch(address)
     assert not list(home.iterdir())
-
-
-def test_a_server_that_does_not_answer_is_named(home, web):
-    with pytest.raises(SplitError, match=r"http://127\.0\.0\.1:9/x\.tar cannot be reached"):
-        fetch("http://127.0.0.1:9/x.tar")
-
-
-@pytest.mark.parametrize("place", ["ftp://h/x.tar", "s3://bucket/x"])
-def test_other_schemes_are_refused(home, place):
-    with pytest.raises(UsageError, match=r"expected http://, https:// or file://"):
-        fetch(place)
-
-
-def test_nothing_at_the_place_is_said(home):
-    with pytest.raises(SplitNotFoundError, match="there is nothing at /no/such"):
-        fetch("/no/such")
 
 
 # What is refused; after each of these nothing is installed.
@@ -211,59 +194,29 @@ def edit(directory, change):
     file.write_text(json.dumps(manifest))
 
 
-def rename_file(manifest):
-    manifest["environments"]["hopper"]["file"] = "../../hopper.h5"
-
-
-def rename_split(manifest):
-    manifest["name"] = "../elsewhere"
-
-
-def hide_split(manifest):
-    manifest["name"] = ".fetch"
-
-
-def unknown_environment(manifest):
-    manifest["environments"]["pong"] = manifest["environments"].pop("hopper")
-
-
-def more_transitions(manifest):
-    manifest["environments"]["hopper"]["groups"]["train"]["transitions"] += 1
-
-
-def huge(manifest):
-    manifest["environments"]["hopper"]["groups"]["train"]["transitions"] = 10**12
-
-
-def fewer_groups(manifest):
-    del manifest["environments"]["hopper"]["groups"]["test/iid"]
+HOPPER = ("environments", "hopper")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("keys", "value", "message"),
     [
-        (rename_file, r"names the file '../../hopper.h5' for hopper, expected 'hopper.h5'"),
-        (rename_split, "names the split '../elsewhere', which is no name"),
-        (hide_split, "names the split '.fetch', which is no name"),
-        (unknown_environment, "unknown environment 'pong'"),
-        (more_transitions, r"hopper.h5, train has 6 trajectories with \d+ transitions, expected"),
-        (huge, "hopper.groups.train.*got 1000000000000"),
-        (fewer_groups, "hopper.h5 holds the groups .*test/iid.*, expected"),
+        ((*HOPPER, "file"), "../../hopper.h5", r"expected 'hopper.h5'"),
+        (("name",), "../elsewhere", "which is no name"),
+        (("name",), ".fetch", "which is no name"),
+        ((*HOPPER, "groups", "train", "transitions"), 7, "hopper.h5, train has"),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_refused(copy, home, change, message):
+def test_a_manifest_that_does_not_fit_is_refused(copy, home, keys, value, message):
+    def change(manifest):
+        for key in keys[:-1]:
+            manifest = manifest[key]
+        manifest[keys[-1]] = value
+
     edit(copy, change)
     with pytest.raises(SplitError, match=message):
         fetch(str(copy))
     assert not list(home.glob("*/manifest.json"))
     assert not (home.parent / "elsewhere").exists()
-
-
-def test_an_edited_manifest_is_refused(copy, home):
-    file = copy / "manifest.json"
-    file.write_text(file.read_text().replace('"train": 6', '"train": 7'))
-    with pytest.raises(SplitError, match="it was edited"):
-        fetch(str(copy))
 
 
 @pytest.mark.parametrize("kind", ["directory", "tar"])
@@ -276,17 +229,16 @@ def test_changed_content_is_refused_with_both_digests(copy, home, tmp_path, kind
     assert split_directories().keys() == {"mini"}
 
 
-@pytest.mark.parametrize("keep", [0, 100, -50])
-def test_a_cut_off_file_is_refused(copy, home, keep):
-    file = copy / "hopper.h5"
-    file.write_bytes(file.read_bytes()[:keep])
-    with pytest.raises(SplitError, match=r"hopper\.h5"):
+def test_a_missing_file_is_named(copy, home):
+    (copy / "hopper.h5").unlink()
+    with pytest.raises(SplitNotFoundError, match=r"hopper\.h5"):
         fetch(str(copy))
 
 
-def test_a_missing_file_is_named(copy, home):
+def test_a_pipe_in_place_of_a_file_is_refused(copy, home):
     (copy / "hopper.h5").unlink()
-    with pytest.raises(SplitNotFoundError, match=r"copy holds no hopper\.h5"):
+    os.mkfifo(copy / "hopper.h5")
+    with pytest.raises(SplitNotFoundError, match=r"hopper\.h5"):
         fetch(str(copy))
 
 
@@ -306,33 +258,6 @@ def test_another_digest_than_the_expected_one_is_refused(tiny_split, home):
     assert is_installed(home, tiny_split)
 
 
-def external_link(file, outside):
-    file["extra"] = h5py.ExternalLink(str(outside), "/x")
-
-
-def soft_link(file, outside):
-    file["extra"] = h5py.SoftLink("/train")
-
-
-def external_storage(file, outside):
-    file.create_dataset("extra", (1,), "u1", external=[(str(outside), 0, 1)])
-
-
-def virtual(file, outside):
-    layout = h5py.VirtualLayout((1,), "u1")
-    layout[:] = h5py.VirtualSource(str(outside), "x", (1,))
-    file.create_virtual_dataset("extra", layout)
-
-
-@pytest.mark.parametrize("trick", [external_link, soft_link, external_storage, virtual])
-def test_a_file_that_leads_to_others_is_refused(copy, home, tmp_path, trick):
-    (tmp_path / "outside").write_bytes(b"secret")
-    with h5py.File(copy / "hopper.h5", "r+") as file:
-        trick(file, tmp_path / "outside")
-    with pytest.raises(SplitError, match=r"points elsewhere|in another file"):
-        fetch(str(copy))
-
-
 def member(name, *, kind=tarfile.REGTYPE, link=""):
     info = tarfile.TarInfo(name)
     info.type, info.linkname, info.size = kind, link, 0 if link else 1
@@ -340,23 +265,24 @@ def member(name, *, kind=tarfile.REGTYPE, link=""):
 
 
 @pytest.mark.parametrize(
-    ("info", "message"),
+    "info",
     [
-        (member("../../escaped"), r"the path '\.\./\.\./escaped': refused"),
-        (member("/etc/escaped"), "the path '/etc/escaped': refused"),
-        (member("tiny/..\\escaped"), "escaped': refused"),
-        (member("tiny/x", kind=tarfile.SYMTYPE, link="/etc/passwd"), "is no plain file: refused"),
-        (member("tiny/x", kind=tarfile.LNKTYPE, link="tiny/hopper.h5"), "is no plain file"),
-        (member("tiny/x", kind=tarfile.CHRTYPE, link="x"), "is no plain file"),
-        (member("tiny/hopper.h5"), "'tiny/hopper.h5' twice: refused"),
-        (member("other/manifest.json"), r"holds 2 files named manifest\.json, expected one"),
+        member("../../escaped"),
+        member("/etc/escaped"),
+        member("tiny/..\\escaped"),
+        member("tiny/x", kind=tarfile.SYMTYPE, link="/etc/passwd"),
+        member("tiny/x", kind=tarfile.LNKTYPE, link="tiny/hopper.h5"),
+        member("tiny/x", kind=tarfile.CHRTYPE, link="x"),
+        member("tiny/hopper.h5"),
+        member("other/manifest.json"),
     ],
+    ids=lambda info: f"{info.name}-{info.type}",
 )
-def test_an_archive_with_tricks_is_refused(tiny_split, home, tmp_path, info, message):
+def test_an_archive_with_tricks_is_refused(tiny_split, home, tmp_path, info):
     archive = pack(tiny_split, tmp_path / "x.tar")
     with tarfile.open(archive, "a") as packed:
         packed.addfile(info, io.BytesIO(b"x"))
-    with pytest.raises(SplitError, match=message):
+    with pytest.raises(SplitError, match=r"refused|expected one"):
         fetch(str(archive))
     assert not list(home.iterdir())
     assert not list(tmp_path.rglob("escaped"))
@@ -375,7 +301,7 @@ def test_a_zip_with_tricks_is_refused(tiny_split, home, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["x.tar", "x.tar.gz", "x.zip"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.0, 0.9])
 def test_a_cut_off_archive_is_refused(tiny_split, home, tmp_path, name, share):
     archive = pack(tiny_split, tmp_path / name)
     content = archive.read_bytes()
@@ -396,17 +322,16 @@ def test_a_second_fetch_finds_it_there(tiny_split, home):
     assert (home / "tiny" / "hopper.h5").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("file", ["hopper.h5", "manifest.json"])
-def test_a_damaged_copy_is_replaced(tiny_split, home, file):
+def test_a_damaged_copy_is_replaced_and_another_split_is_not(tiny_split, home):
     fetch(str(tiny_split))
-    damaged = home / "tiny" / file
-    damaged.write_bytes(damaged.read_bytes()[:200])
-    if file == "manifest.json":
-        with pytest.raises(UsageError, match="exists and is not this split: remove it"):
+    for name in ("hopper.h5", "manifest.json"):
+        damaged = home / "tiny" / name
+        damaged.write_bytes(damaged.read_bytes()[:200])
+        if name == "hopper.h5":
             fetch(str(tiny_split))
-    else:
+            assert is_installed(home, tiny_split)
+    with pytest.raises(UsageError, match="exists and is not this split"):
         fetch(str(tiny_split))
-        assert is_installed(home, tiny_split)
 
 
 def test_another_split_of_the_same_name_stays(tiny_split, home, tmp_path):
@@ -419,33 +344,18 @@ def test_another_split_of_the_same_name_stays(tiny_split, home, tmp_path):
     assert load_split(tmp_path / "beside" / "tiny").digest == load_split(tiny_split).digest
 
 
-def test_a_shipped_split_is_there_already(home):
+def test_a_shipped_split_is_there_already_and_its_name_taken(home, tmp_path):
     found = fetch(str(SHIPPED / "mini"))
-    assert found.already
-    assert found.split.path == SHIPPED / "mini"
-
-
-def test_a_shipped_name_cannot_be_taken(home, tmp_path):
-    fake = make_split(tmp_path / "mini", ["hopper"], name="mini")
-    with pytest.raises(UsageError, match="comes with the package, and this is another one"):
-        fetch(str(fake))
+    assert (found.already, found.split.path) == (True, SHIPPED / "mini")
+    other = make_split(tmp_path / "mini", ["hopper"], name="mini")
+    with pytest.raises(UsageError, match="comes with the package"):
+        fetch(str(other))
 
 
 def test_two_fetches_of_the_same_do_not_meet(tiny_split, home):
-    fetch(str(tiny_split))
-    staging = []
-    real = Path.mkdir
-
-    def noting(self, *arguments, **settings):
-        staging.append(self)
-        return real(self, *arguments, **settings)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Path, "mkdir", noting)
-        fetch(str(tiny_split))
-    (place,) = {p for p in staging if p.parent.name == ".fetch"}
-    place.mkdir(parents=True)
-    descriptor = os.open(place, os.O_RDONLY)
+    staging = home / ".fetch" / hashlib.sha256(str(tiny_split).encode()).hexdigest()[:16]
+    staging.mkdir(parents=True)
+    descriptor = os.open(staging, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     try:
         with pytest.raises(OutputError, match="another process is fetching the same"):
@@ -559,34 +469,31 @@ def opened(exported):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_minari_lists_a_dataset_for_every_part(opened):
-    parts = ["train", "calibration", "test-nominal", "test-iid", "test-drift", "test-shutdown",
-             "test-calibration", "test-wind-l2r", "test-wind-r2l", "test-gravity",
-             "test-components"]  # fmt: skip
-    expected = {f"oodd/tiny/{e}/{p}-v0" for e in ("cartpole", "hopper") for p in parts}
+def test_minari_lists_every_part_and_knows_spaces_names_and_units(opened, tiny_split):
+    split = load_split(tiny_split)
+    expected = {
+        f"oodd/tiny/{environment}/{part.replace('/', '-')}-v0"
+        for environment in split.environments
+        for part in split.manifest["environments"][environment]["groups"]
+    }
     assert set(opened) == expected
-
-
-def test_minari_knows_the_spaces(opened):
     assert opened["oodd/tiny/cartpole/train-v0"]["spaces"] == [
         "Box(-inf, inf, (4,), float32)", "Discrete(2)",
     ]  # fmt: skip
     assert opened["oodd/tiny/hopper/train-v0"]["spaces"] == [
         "Box(-inf, inf, (15,), float32)", "Box(-1.0, 1.0, (3,), float32)",
     ]  # fmt: skip
-
-
-def test_minari_knows_names_and_units(opened):
-    for environment in ("cartpole", "hopper"):
+    for environment in split.environments:
         info = ENVIRONMENTS[environment]
-        expected = [[{"name": q.name, "unit": q.unit} for q in columns]
-                    for columns in (info.sensors, info.actions)]  # fmt: skip
-        for part in ("train", "test-gravity"):
-            assert opened[f"oodd/tiny/{environment}/{part}-v0"]["named"] == expected
+        columns = [
+            [{"name": q.name, "unit": q.unit} for q in quantities]
+            for quantities in (info.sensors, info.actions)
+        ]
+        assert opened[f"oodd/tiny/{environment}/test-gravity-v0"]["named"] == columns
 
 
 @pytest.mark.parametrize("environment", ["cartpole", "hopper"])
-@pytest.mark.parametrize("part", ["train", "calibration", "nominal", "gravity"])
+@pytest.mark.parametrize("part", ["train", "nominal", "gravity"])
 def test_minari_reads_the_numbers_of_the_split(opened, tiny_split, environment, part):
     data = load_split(tiny_split).environment(environment)
     named = {"train": data.train, "calibration": data.calibration, "nominal": data.twins}

@@ -282,6 +282,9 @@ HDF5 = {
     "another filter": (raw(shape=(8, 4), chunks=(8, 4), compression="lzf"), "packed by the filter"),
     "texts without bound": (object_texts, "dtype \\|O, expected \\|S"),
     "a compound": (raw([("x", "<f4")], (3, 4)), "dtype|holds|bytes"),
+    "another dtype": (replaced("rewards", lambda a: a.astype("<f8"), "train"), "expected <f4"),
+    "too few rows": (replaced("actions", lambda a: a[:-1], "train"), "rows, expected 121"),
+    "too few names": (replaced("sensors", lambda a: a[1:], "names"), "expected 3 columns"),
     "offsets from below 0": (offsets_of(-3, 60, 121), "offsets must start at 0"),
     "offsets that overflow": (offsets_of(0, 2**62, -(2**63), -(2**62), 121), "offsets must start"),
     "offsets without a number": (offsets_of(), "holds|offsets|expected"),
@@ -417,10 +420,8 @@ def test_rows_that_were_changed_are_not_scored(verified, change, read):
 @pytest.mark.parametrize("change", [write_over, cut])
 def test_labels_are_those_that_were_verified(verified, change):
     data, file = verified
-    expected = {
-        name: getattr(data.anomalous("iid"), name).copy()
-        for name in ("onsets", "effects", "redraws", "seeds", "lengths", "terminated")
-    }
+    names = ("onsets", "effects", "redraws", "seeds", "lengths", "terminated")
+    expected = {name: getattr(data.anomalous("iid"), name).copy() for name in names}
     change(file)
     for name, values in expected.items():
         assert (getattr(data.anomalous("iid"), name) == values).all()
