@@ -164,14 +164,19 @@ def _installed(name: str, target: Path, digest: str, *, by_name: bool) -> Split 
     if not target.exists():
         return None
     present = Split(target)
+    try:
+        same = present.digest == digest
+    except SplitError:
+        same = False
+    if not same:
+        raise UsageError(
+            f"{str(target)!r} exists and is not this split: remove it, or name another "
+            "with --output"
+        )
     with contextlib.suppress(SplitError):
-        if present.digest == digest:
-            with contextlib.suppress(SplitError):
-                return present if all(check.ok for check in present.verify()) else None
-            return None  # a damaged copy is replaced
-    raise UsageError(
-        f"{str(target)!r} exists and is not this split: remove it, or name another with --output"
-    )
+        if all(check.ok for check in present.verify()):
+            return present
+    return None  # a damaged copy is replaced
 
 
 def _bring_file(

@@ -198,8 +198,10 @@ def read_onsets(folder: Path) -> dict[str, int]:
     return onsets
 
 
-def whole_number(source: str, name: str, value: Any) -> int:
-    """Return one whole number that a file gives as an array, an attribute or a scalar."""
+def whole_number(source: str, name: str, value: Any) -> int | None:
+    """Return a number that a file gives as an array or scalar, if it does; one value, no text."""
+    if value is None:
+        return None
     array = np.asarray(value)
     if array.size != 1 or array.dtype.kind not in "iuf":
         raise TrajectoryError(f"{source}: {name} is {value!r:.80}, expected one whole number")

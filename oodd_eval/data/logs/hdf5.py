@@ -22,28 +22,23 @@ def read_groups(path: Path) -> Iterator[Log]:
 
 
 def _episode(file: StoredFile, source: str, name: str) -> Log:
-    arrays = file.part(name, (*ARRAYS, "terminations"))
-    attributes = file.attributes(name, ("onset", "seed", "parameters"))
-    if "observations" not in arrays:
+    values = file.attributes(name, ("onset", "seed", "parameters"))
+    values |= file.part(name, (*ARRAYS, "terminations"))
+    if "observations" not in values:
         raise TrajectoryError(f"{source} lacks the dataset observations")
-    numbers = {
-        key: whole_number(source, key, value)
-        for key, value in (attributes | arrays).items()
-        if key in {"onset", "seed"}
-    }
     try:
-        parameters = json.loads(attributes.get("parameters", "{}"))
+        parameters = json.loads(values.get("parameters", "{}"))
     except (TypeError, ValueError, RecursionError) as error:
         raise unreadable(f"{source}, attribute parameters,", error) from error
     return Log(
         name,
         source,
-        arrays["observations"],
-        arrays.get("actions"),
-        arrays.get("rewards"),
-        numbers.get("onset"),
-        numbers.get("seed"),
-        bool(np.any(arrays.get("terminations", False))),
+        values["observations"],
+        values.get("actions"),
+        values.get("rewards"),
+        whole_number(source, "onset", values.get("onset")),
+        whole_number(source, "seed", values.get("seed")),
+        bool(np.any(values.get("terminations", False))),
         parameters if isinstance(parameters, dict) else {},
     )
 

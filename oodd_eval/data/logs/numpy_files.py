@@ -15,11 +15,9 @@ def _episodes(folder: Path) -> Iterator[Log]:
         arrays = read_npz(path, EPISODE, ARRAYS)
         if "observations" not in arrays:
             raise TrajectoryError(f"{path} lacks the array observations")
-        onset = onsets.get(path.stem)
-        if "onset" in arrays:
-            onset = whole_number(str(path), "onset", arrays["onset"])
-        known = arrays["observations"], arrays.get("actions"), arrays.get("rewards")
-        yield Log(path.stem, str(path), *known, onset)
+        onset = whole_number(str(path), "onset", arrays.get("onset", onsets.get(path.stem)))
+        rows = arrays["observations"], arrays.get("actions"), arrays.get("rewards")
+        yield Log(path.stem, str(path), *rows, onset)
 
 
 READER: Final = Reader(
