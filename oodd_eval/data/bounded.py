@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.lib import format as npy
@@ -130,9 +130,16 @@ def read_npz(
 
 
 def _announced(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> tuple[np.dtype[Any], int]:
-    """Return the dtype and the bytes of an array, as its header says."""
     if item.compress_type not in _METHODS:
         raise zipfile.BadZipFile(f"{item.filename} is neither stored nor deflated")
     with archive.open(item) as member:
-        shape, _, dtype = _HEADERS[npy.read_magic(member)](member)
+        return npy_header(member)
+
+
+def npy_header(file: IO[bytes]) -> tuple[np.dtype[Any], int]:
+    """Return the dtype and the bytes of content that the header of an ``.npy`` file announces."""
+    header = _HEADERS[npy.read_magic(file)]
+    shape, _, dtype = header(file)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape}")
     return dtype, math.prod(shape) * dtype.itemsize

@@ -239,7 +239,7 @@ def test_an_archive_of_a_split_among_many_files_is_refused(small, home, tmp_path
     assert not list(home.glob("*/manifest.json"))
 
 
-@pytest.mark.parametrize("name", ["\x1b[2J", "a/b", "..", "con\u202etrol", ""])
+@pytest.mark.parametrize("name", ["\x1b[2J", "a/b", "..", ".fetch", "con\u202etrol", ""])
 def test_a_name_that_is_none_is_refused(small, home, tmp_path, name):
     from test_transfer import edit
 

@@ -9,6 +9,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from oodd_eval.data.bounded import npy_header
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins import contract
@@ -342,6 +343,4 @@ def _pickled(path: Path) -> str:
 
 
 def _holds_objects(file: IO[bytes]) -> bool:
-    first = np.lib.format.read_magic(file) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-    return bool(read(file)[2].hasobject)
+    return npy_header(file)[0].hasobject

@@ -7,7 +7,6 @@ with pickling refused. The messages before say which of the two comes next.
 
 import io
 import json
-import math
 import os
 import signal
 import time
@@ -19,6 +18,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from oodd_eval.data.bounded import npy_header
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
 
@@ -116,11 +116,9 @@ class Channel:
 def _read_array(content: bytes) -> NDArray[Any]:
     """Read what `numpy.save` has written; anything else raises, before room is made for it."""
     file = io.BytesIO(content)
-    version, _ = np.lib.format.read_magic(file)
-    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version}_0")(file)
-    rest = len(content) - file.tell()
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
-        raise ValueError(f"{rest} bytes for {dtype} of shape {shape}")
+    dtype, size = npy_header(file)
+    if size != len(content) - file.tell():
+        raise ValueError(f"{len(content) - file.tell()} bytes for {size} of {dtype}")
     file.seek(0)
     array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     return array
