@@ -13,7 +13,7 @@ from collections import Counter
 from functools import wraps
 
 from oodd_eval.cli.main import main as oodd_eval
-from oodd_eval.data import layout, stored
+from oodd_eval.data import bounded, layout, stored
 from oodd_eval.plugins import contract, explanations, specs
 from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.results.directory import ResultsDirectory
@@ -23,6 +23,7 @@ MOST = 0.05
 CHECKS = {
     layout: ["content_digest", "check_layout", "check_names"],
     stored: ["check_plain"],
+    bounded: ["read_npz"],
     specs: ["check_detector_spec"],
     keys: ["source_digest"],
     supervisor: ["_typed", "_number"],

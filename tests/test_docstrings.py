@@ -20,6 +20,9 @@ SEARCH = [ROOT, ROOT / "recording", *(ROOT / "detectors").iterdir()]
 OPTIONAL = {"oodd_eval.scoring.executors.dask", "oodd_eval.__main__"}
 """Modules that need an extra, or that run the program."""
 
+OPENED = {"EnvironmentData", "TrajectorySet", "AnomalousSet", "Watchdog"}
+"""Classes whose objects users get from a function: they have attributes in place of parameters."""
+
 DIRECTIVE = re.compile(r"^::: (\S+)\n((?:(?: {4}.*)?\n)*)", re.MULTILINE)
 
 
@@ -95,7 +98,7 @@ def omissions(item):
     names = {p.name.strip("*") for p in item.parameters if not p.name.startswith("_")}
     left_out = sorted(names - {"self", "cls"} - described)
     if item.is_class:
-        return left_out
+        return left_out if item.name not in OPENED else [] if described else ["attributes"]
     if str(item.returns) not in {"None", "NoReturn"} and not sections.keys() & {
         "returns",
         "yields",

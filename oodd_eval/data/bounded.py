@@ -27,7 +27,7 @@ from oodd_eval.errors import (
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What the arrays of one kind of file may be.
+    """Bounds of the arrays in one kind of file.
 
     Parameters
     ----------

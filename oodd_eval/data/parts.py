@@ -52,13 +52,6 @@ def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
 class TrajectorySet(TrajectorySequence):
     """The trajectories of one part, decompressed once, or a few at a time beyond 16 MiB.
 
-    Parameters
-    ----------
-    parts
-        Datasets by name of each part.
-    group
-        Name of the part.
-
     Attributes
     ----------
     group
@@ -128,11 +121,6 @@ class TrajectorySet(TrajectorySequence):
 
 class AnomalousSet(TrajectorySet):
     """Anomalous trajectories and what is known of them; number i is the twin of test seed i.
-
-    Parameters
-    ----------
-    parts, group
-        As those of `TrajectorySet`.
 
     Attributes
     ----------
@@ -259,12 +247,7 @@ class TwinCheck:
 
 
 class EnvironmentData:
-    """The verified content of one environment.
-
-    Parameters
-    ----------
-    environment, file, parts, digest, discrete
-        What `Split.environment` has read and verified.
+    """The verified content of one environment, opened by `Split.environment`.
 
     Attributes
     ----------

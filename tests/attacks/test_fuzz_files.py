@@ -5,6 +5,7 @@ With ``--long``, thousands of each. Never a traceback, much memory, or many seco
 
 import io
 import json
+import os
 import shutil
 import tempfile
 import zipfile
@@ -18,6 +19,9 @@ from helpers_split import make_split
 from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_split
+from oodd_eval.data.bounded import STATE as STATE_BOUNDS
+from oodd_eval.data.bounded import Bounds, read_bytes, read_npz
+from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import FittedStateError, OoddError
 from oodd_eval.leaderboard.grants import GRANTS, read_grants
 from oodd_eval.leaderboard.rerun import ORDER, read_order
@@ -209,3 +213,27 @@ def test_a_saved_detector_that_is_none_is_refused(tmp_path, case):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FittedStateError, match=r"cannot be read as a saved detector|holds "):
         load_state(tmp_path, kind="mine/1", settings={"size": 3})
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda pipe: read_npz(pipe, STATE_BOUNDS),
+        lambda pipe: read_bytes(pipe, 10, FittedStateError),
+        lambda pipe: StoredFile(pipe, STATE_BOUNDS),
+    ],
+    ids=["npz", "text", "hdf5"],
+)
+def test_a_pipe_in_place_of_a_file_is_refused(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FittedStateError, match="no plain file"):
+        read(tmp_path / "pipe")
+
+
+def test_arrays_are_bounded_together(tmp_path):
+    """Each fits for itself; the second is one too many, and objects are never read."""
+    bounds = Bounds(1000, FittedStateError, "say less")
+    np.savez(tmp_path / "x.npz", a=np.zeros(80), b=np.zeros(80))
+    with pytest.raises(FittedStateError, match="b: arrays take 1280 bytes, limit 1000: say less"):
+        read_npz(tmp_path / "x.npz", bounds)
+    assert read_npz(tmp_path / "x.npz", bounds, ["b", "c"]).keys() == {"b"}
