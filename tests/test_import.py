@@ -295,6 +295,8 @@ BROKEN = [
     (changed("test/fog", onset=None), r"run-1.npz has no onset"),
     (changed("test/fog", onset=61), r"onset is row 61, expected 0 to 60"),
     (changed("test/fog", onset=np.arange(3)), r"run-1.npz: onset is .*one whole number"),
+    (changed("test/fog", onset=np.nan), r"run-1.npz: onset is .*one whole number"),
+    (changed("test/fog", onset=2.0**70), r"run-1.npz: onset is .*one whole number"),
     (changed("test/fog", observations=episode(1)[0]), r"equals its twin"),
 ]  # fmt: skip
 

@@ -24,7 +24,10 @@ from helpers_split import make_group, make_split
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data import layout
-from oodd_eval.errors import DigestError, SplitError
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.data.logs import ARRAYS
+from oodd_eval.data.stored import StoredFile
+from oodd_eval.errors import DigestError, SplitError, TrajectoryError
 
 PART = "test/iid"
 
@@ -298,7 +301,7 @@ def limited():
 OPEN_ALL = """
 import sys, pathlib
 from oodd_eval import load_split
-from oodd_eval.errors import DigestError, SplitError
+from oodd_eval.errors import DigestError, SplitError, TrajectoryError
 for place in sorted(pathlib.Path(sys.argv[1]).iterdir()):
     try:
         load_split(place).environment("cartpole").close()
@@ -336,6 +339,21 @@ def test_a_file_that_is_no_split_is_refused_in_little_memory(told, attack):
     assert found[number][0] == "refused"
     assert "cartpole.h5" in found[number][1]
     assert re.search(message, found[number][1]), found[number]
+
+
+IN_LOGS = (
+    "external content", "virtual content", "an external link", "no room for what it has",
+    "chunks of gigabytes", "a chunk that unpacks to 670 megabytes", "another filter", "a compound",
+    "a group for a dataset",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", IN_LOGS)
+def test_logs_are_read_within_the_same_bounds(copy, attack):
+    with h5py.File(copy / "cartpole.h5", "r+") as file:
+        HDF5[attack][0](file)
+    with closing(StoredFile(copy / "cartpole.h5", EPISODE)) as file, pytest.raises(TrajectoryError):
+        file.part("train", (*ARRAYS, "offsets"))
 
 
 def test_a_pipe_is_no_file(copy):

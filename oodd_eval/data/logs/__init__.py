@@ -203,9 +203,11 @@ def whole_number(source: str, name: str, value: Any) -> int | None:
     if value is None:
         return None
     array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "iuf":
-        raise TrajectoryError(f"{source}: {name} is {value!r:.80}, expected one whole number")
-    return int(array.item())
+    if array.size == 1 and array.dtype.kind in "iuf" and float(array.item()).is_integer():
+        number = int(array.item())
+        if abs(number) < 2**63:
+            return number
+    raise TrajectoryError(f"{source}: {name} is {value!r:.80}, expected one whole number")
 
 
 def _formats() -> Iterator[Reader]:
