@@ -22,7 +22,7 @@ from pathlib import Path
 from oodd_eval.leaderboard.build import build, started, suite_parts
 from oodd_eval.leaderboard.entry import ENTRY, read_entries
 from oodd_eval.results.directory import RECORDS
-from oodd_eval.results.tables.board import SEEDS
+from oodd_eval.results.standings import SEEDS
 
 COMMITTED = Path("leaderboard")
 

@@ -125,7 +125,7 @@ def test_committed_entries_have_their_committed_places_on_the_published_board(co
         for one in section.entries:
             placed = place(one.records, board_of(one.records, published), one.meta.primary)
             assert places(placed.ranks) == places(section.ranks), one.meta.id
-            assert placed.published == placed.own
+            assert placed.published == placed.rows
 
 
 # The comparison itself

@@ -171,7 +171,7 @@ def test_an_entrys_own_records_have_the_places_of_the_board(name, board, shipped
     (own,) = [e for e in entries() if e.meta.id == name]
     placed = place(own.records, shipped, own.meta.primary)
     assert places(placed.ranks) == places(board.ranks)
-    assert placed.published == placed.own == {r.setting for r in own.records}
+    assert placed.published == placed.rows == {r.setting for r in own.records}
     assert not placed.lacking
 
 
@@ -204,7 +204,7 @@ def test_an_entry_declares_its_primary_row_here_too(shipped):
     for primary in ((), ("mine[h=5]",)):
         placed = place(mine, shipped, primary)
         own = {
-            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.own
+            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.rows
         }
         assert own == ({5} if primary else {1})
 
@@ -292,7 +292,7 @@ def test_rankings_mark_own_rows_and_have_an_order_of_their_own(shipped):
         for r in row("slow", 0.9)
     ]  # fmt: skip
     placed = place(slow, shipped)
-    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.own)
+    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.rows)
     assert {line[1]: line[0] for line in first.rows}["> slow"] == "1 a"
     assert [line[3] for line in first.rows if line[1] == "> slow"] == ["yours"]
     assert second.rows[-2][:2] == ["4", "> slow"]

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from oodd_eval.metrics import bootstrap
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import RESAMPLES, Samples, mean_samples
+from oodd_eval.results.board import contribution
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import contribution
-from oodd_eval.results.tables.rendering import number
+from oodd_eval.results.render.data import number
 from oodd_paper.experiments import MEAN, Experiment, Scope, Series, paper_number, scope
 from oodd_paper.inputs import KINDS, Returns
 

@@ -18,7 +18,7 @@ from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.parameters import parameters_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables import Table
 from oodd_eval.scoring.plan import Unit, make_unit
 from oodd_paper.experiments import CONTROLS, Experiment, Tier, settings_of
 

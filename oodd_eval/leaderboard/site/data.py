@@ -21,10 +21,11 @@ from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
+from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import Board, Standing, grouped
+from oodd_eval.results.standings import Standing
 
 _COMPARED: Final = (
     "false_episodes",

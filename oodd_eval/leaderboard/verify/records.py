@@ -26,11 +26,11 @@ from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, METRICS, split_name
 from oodd_eval.plugins.contract import MAX_WARM_UP
+from oodd_eval.results.board import contribution
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.evaluate import metric_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
-from oodd_eval.results.tables.board import contribution
 
 Records = Mapping[str, Record]  # records by where they stand
 TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders
