@@ -14,7 +14,7 @@ import pytest
 from oodd_eval.data.files import compress, decompress, read_text
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.placing import place
+from oodd_eval.leaderboard.placing import placement
 from oodd_eval.leaderboard.published import PUBLISHED, board_of, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.verify import verify
@@ -123,7 +123,7 @@ def test_committed_entries_have_their_committed_places_on_the_published_board(co
 
     for section in committed:
         for one in section.entries:
-            placed = place(one.records, board_of(one.records, published), one.meta.primary)
+            placed = placement(one.records, board_of(one.records, published), one.meta.primary)
             assert places(placed.ranks) == places(section.ranks), one.meta.id
             assert placed.published == placed.rows
 

@@ -11,7 +11,7 @@ from oodd_eval.cli import NAMES, Add, Parser, say_notes
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, read_entry
-from oodd_eval.leaderboard.placing import Placement, neighbours, place, rankings
+from oodd_eval.leaderboard.placing import Placement, neighbours, placement, rankings
 from oodd_eval.leaderboard.published import PublishedBoard, board_of, read_published
 from oodd_eval.names import check_known, select
 from oodd_eval.results.board import boards, grouped
@@ -80,7 +80,7 @@ def place_run(options: argparse.Namespace) -> int:
     runs = boards(records)
     compared_with = [board_of(run.records, published.boards) for run in runs]
     for run, board in zip(runs, compared_with, strict=True):
-        placed = place(run.records, board, primary)
+        placed = placement(run.records, board, primary)
         new = placed.rows - placed.published
         trust = board.trust | dict.fromkeys(new, "yours")
         tables, notes = [], _sentences(placed, board.entries)

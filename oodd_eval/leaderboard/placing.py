@@ -44,7 +44,7 @@ class Placement(NamedTuple):
     lacking: dict[Setting, str]
 
 
-def place(
+def placement(
     records: Sequence[Record], board: PublishedBoard, primary: Collection[str] = ()
 ) -> Placement:
     """Place the rows of a run among those of a board, as if they had been run again.

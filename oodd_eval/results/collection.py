@@ -105,6 +105,16 @@ class Results(Sequence[Record]):
             See ``oodd-eval list metrics``.
         row
             Name of the row.
+
+        Returns
+        -------
+        float
+            In the metric's unit, shares between 0 and 1; NaN where it is undefined or a cell failed.
+
+        Raises
+        ------
+        UnknownNameError, UsageError
+            For an unknown metric or row, or without a name where there are several rows.
         """
         metric_info(metric)
         setting = self._row(row)
@@ -134,11 +144,27 @@ class Results(Sequence[Record]):
         return paired.compare(self.records, first, second, metric)
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Return a flat mapping for each cell: what it is, its metrics, and what it cost."""
+        """Return a flat mapping for each cell: its identity, its metrics, and its cost.
+
+        Returns
+        -------
+        list of dict
+            All with the same keys, NaN where a cell lacks a metric.
+        """
         return flat(self.records)
 
     def to_frame(self) -> Any:
-        """Return `to_rows` as a ``pandas.DataFrame``; `MissingExtraError` without pandas."""
+        """Return `to_rows` as a data frame.
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
+        """
         try:
             pandas = import_module("pandas")
         except ImportError:
@@ -195,9 +221,12 @@ class Results(Sequence[Record]):
     def thresholds(self) -> list[dict[str, Any]]:
         """Return a flat mapping for each row, environment and anomaly with several strengths.
 
-        Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's unit:
-        0 where it is below the ``weakest`` strength, infinity where it is above the ``strongest``.
-        ``kept99`` is the strength that costs 1 % of the return.
+        Returns
+        -------
+        list of dict
+            Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
+            unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return.
         """
         return threshold_rows(self.records)
 
@@ -210,6 +239,10 @@ class Results(Sequence[Record]):
         ----------
         environment, anomaly, i, row, seed
             As those of `scores`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
 
         Raises
         ------
@@ -225,6 +258,15 @@ class Results(Sequence[Record]):
         ----------
         rows
             Names of rows; by default all.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ResultsError
+            When no row has an alarm at 5 %; others as those of `plot_trajectory`.
         """
         chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})
         curves = {}
@@ -248,6 +290,10 @@ class Results(Sequence[Record]):
         environments, anomalies
             What is averaged over: comma lists and globs, as on the command line. Strengths are in
             units of the strength that costs 1 % of the return, as each anomaly has its own unit.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
 
         Raises
         ------

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
+from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import RANKING, metric_info
 from oodd_eval.metrics.ranking import ALPHA, rank
 from oodd_eval.results.board import Conditions
@@ -110,10 +111,7 @@ def compare(
     settings = [row_named(records, name) for name in (first, second)]
     if settings[0] == settings[1]:
         raise UsageError(f"{first!r} and {second!r} are the same row")
-    rows = {
-        str(setting): terms_of((r for r in records if r.setting == setting), metric)
-        for setting in settings
-    }
+    rows = {s: terms_of((r for r in records if r.setting == s), metric) for s in settings}
     defined = (
         {cell for cell, terms in cells.items() if not math.isnan(terms.value)}
         for row in rows.values()
@@ -123,26 +121,21 @@ def compare(
     if not common:
         raise ResultsError(f"{first} and {second} have no cell in common with a value of {metric}")
     shared = {
-        name: {seed: {cell: cells[cell] for cell in common} for seed, cells in row.items()}
-        for name, row in rows.items()
+        str(setting): {seed: {cell: cells[cell] for cell in common} for seed, cells in row.items()}
+        for setting, row in rows.items()
     }
+    one, other = shared
     tests = {(test.first, test.second): test for test in rank(shared).comparisons}
-    names = str(settings[0]), str(settings[1])
-    test = tests[names]
-    # Terms of metrics of which lower is better have their sign turned.
-    sign = -1.0 if info.better == "lower" else 1.0
+    test = tests[one, other]
     means = (
-        sum(sum(c.value for c in cells.values()) / len(common) for cells in row.values()) / len(row)
-        for row in shared.values()
+        nan_mean(nan_mean(c.value for c in row.values()) for row in shared[name].values())
+        for name in shared
     )
+    # Where lower is better, the terms have their sign turned.
+    sign = -1.0 if info.better == "lower" else 1.0
     low, high = sorted((sign * test.low, sign * test.high))
+    values = tuple(sign * mean for mean in means)
+    p = min(t.p_holm for t in tests.values())
     return PairedComparison(
-        *names,
-        metric,
-        values=tuple(sign * mean for mean in means),
-        difference=sign * test.difference,
-        low=low,
-        high=high,
-        p=min(t.p_holm for t in tests.values()),
-        cells=len(common),
+        one, other, metric, values, sign * test.difference, low, high, p, len(common)
     )
