@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
@@ -61,15 +61,24 @@ class Value(NamedTuple):
 
 
 class Board:
-    """Records of one split digest, protocol and limit, see `boards`."""
+    """Records of one split digest, protocol and limit, see `boards`.
 
-    def __init__(self, records: Sequence[Record]) -> None:
+    Parameters
+    ----------
+    records
+        At least one.
+    expected
+        Environments and conditions that every row should have; by default `expected_cells`.
+    """
+
+    def __init__(self, records: Sequence[Record], expected: Collection[Place] = ()) -> None:
         self.records = list(records)
         self.conditions = Conditions.of(self.records[0])
         self.split, self.digest = self.conditions.split, self.conditions.split_digest
         self.protocol, self.limit = self.conditions.protocol, self.conditions.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
-        self._expected = {(e, split_condition(c)[0]) for e, c in expected_cells(self.records)}
+        cells = expected or expected_cells(self.records)
+        self._expected = {(e, split_condition(condition)[0]) for e, condition in cells}
         self._plugins: dict[Setting, str] = {}
         for r in self.records:
             self._plugins.setdefault(r.setting, r.plugin)

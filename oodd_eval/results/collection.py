@@ -109,7 +109,7 @@ class Results(Sequence[Record]):
         Returns
         -------
         float
-            In the metric's unit, shares between 0 and 1; NaN where it is undefined or a cell failed.
+            In the metric's unit, shares from 0 to 1; NaN where it is undefined or a cell failed.
 
         Raises
         ------

@@ -145,7 +145,7 @@ def ranked(
             "tell rows apart: give one of the detectors another name"
         )
     first = primary_settings(records) if primary is None else set(primary)
-    cells = sorted(expected or expected_cells(records))
+    cells = set(expected or expected_cells(records))
     counted = {e: [r for r in rows if r.place in cells] for e, rows in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
 
@@ -158,7 +158,9 @@ def ranked(
     alarms, _, alarm_states = ranking_by(ALARM_RANKING)
     rates = win_rates(
         {
-            label: {c: nan_mean(seed[c].value for seed in rows[label].values()) for c in cells}
+            label: {
+                c: nan_mean(seed[c].value for seed in rows[label].values()) for c in sorted(cells)
+            }
             for label in ranking.ranks
         }
     )
@@ -167,7 +169,7 @@ def ranked(
     order = sorted(
         by_row, key=lambda e: (e in below, positions.get(str(e), len(positions)), _name(e))
     )
-    board = Board([record for entry in order for record in by_row[entry]])
+    board = Board([record for entry in order for record in by_row[entry]], cells)
     standings = [
         Standing(
             entry=entry,
@@ -221,7 +223,7 @@ def cost_of(records: Iterable[Record]) -> Cost:
     )
 
 
-def _state(records: Sequence[Record], cells: Sequence[Place], metric: str, primary: bool) -> str:
+def _state(records: Sequence[Record], cells: Collection[Place], metric: str, primary: bool) -> str:
     """Return why a row is not ranked by a metric; empty if it is."""
     seeds = len({r.seed for r in records}) or 1
     expected = len(cells) * seeds
