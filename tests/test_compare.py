@@ -171,7 +171,12 @@ def test_improvements_fail_when_both_sides_count_and_small_ones_do_not(tolerance
 
 def test_a_missing_or_failing_cell_of_the_reference_fails():
     reference = [record("iid"), record("drift"), record("gravity")]
-    now = [record("iid", auc=0.1), record("iid"), record("drift", status="timeout"), record("components")]
+    now = [
+        record("iid", auc=0.1),
+        record("iid"),
+        record("drift", status="timeout"),
+        record("components"),
+    ]
     found = against(now, reference, AUC, two_sided=True)
     # Of several records of a cell the last counts; a cell in the results alone is new.
     assert [(d.verdict, d.fails) for d in found.differences] == [

@@ -194,14 +194,9 @@ def compare(
     for conditions in common:
         expected, present = reference.boards[conditions], now.boards[conditions]
         # Of these environments, or of these settings and seeds, nothing is there now.
-        environments = {c.environment for c in present}
-        rows = {(c.setting, c.seed) for c in present}
-        outside = {
-            c
-            for c in expected
-            if c.environment not in environments or (c.setting, c.seed) not in rows
-        }
-        if outside:
+        envs, rows = {c.environment for c in present}, {(c.setting, c.seed) for c in present}
+        inside = {c for c in expected if c.environment in envs and (c.setting, c.seed) in rows}
+        if outside := expected.keys() - inside:
             notes.append(
                 f"Missing in {now.where}: {len(outside)} cells of the reference (split "
                 f"{conditions.split}; environments {_listed(c.environment for c in outside)}; "
@@ -211,8 +206,7 @@ def compare(
         for unit, cells in _units(expected, by).items():
             pairs = [(expected[cell], present.get(cell)) for cell in cells]
             compared = _compare_unit(unit, pairs, used, two_sided=two_sided)
-            whole = outside.issuperset(cells)
-            differences += [replace(d, outside=whole) for d in compared]
+            differences += [replace(d, outside=outside >= {*cells}) for d in compared]
         for cell in present.keys() - expected.keys():
             values = [(t, present[cell].value(t.metric)) for t in used]
             new += [Difference(*_parts(cell), t, NAN, value, "new") for t, value in values]
@@ -235,10 +229,8 @@ def _require_common(now: RecordSet, reference: RecordSet, common: Sequence[Condi
         why = f"results of different splits, protocols or limits are not compared; {'; '.join(has)}"
     elif not any(reference.boards[c].keys() & now.boards[c].keys() for c in common):
         expected, present = (str(records.records[0].cell) for records in (reference, now))
-        why = (
-            f"no cell of {reference.where} (such as {expected}) is in {now.where} (which has "
-            f"{present})"
-        )
+        which = f"(such as {expected}) is in {now.where} (which has {present})"
+        why = f"no cell of {reference.where} {which}"
     else:
         return
     raise NothingInCommonError(f"nothing in common: {why}")
