@@ -142,4 +142,4 @@ def _render(options: argparse.Namespace, header: Reproduction, records: list[Rec
         publish(directory, header, records, returns, figures=False, other=other)
     if options.verbosity >= 0:
         console.print(f"tables, figures and claims in {directory / 'README.md'}")
-    return int(not all(r.ok for r in header.own(records)))
+    return int(not all(r.ok for r in header.select(records)))
