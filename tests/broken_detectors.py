@@ -557,7 +557,7 @@ class OnsetInTheMiddle(Good):
 
 @breaks(
     "explain",
-    "explain_last gives other onset than explain, first at t = 1: expected the row of explain for "
+    "explain_last gives other onsets than explain, first at t = 1: expected the row of explain for "
     "the latest update",
 )
 class LateWithWhy(Good):

@@ -6,9 +6,9 @@ import pytest
 from helpers_plugins import install
 
 from oodd_eval.cli import main as cli
-from oodd_eval.testing import detector_checks
+from oodd_eval.testing import CHECKS
 
-NAMES = [check.name for check in detector_checks()]
+NAMES = list(CHECKS)
 
 PLUGIN = """
 import ctypes

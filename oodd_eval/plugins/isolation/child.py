@@ -57,11 +57,11 @@ Stop = Callable[[], bool]  # tells whether the work is to end, such as `threadin
 
 
 class GivenUpError(OoddError, RuntimeError):
-    """A process has to end: the status and reason of its cell, and what is told of the process."""
+    """A process has to end: the status and reason of its cell, and how the process ended."""
 
-    def __init__(self, status: str, reason: str, told: str = "") -> None:
+    def __init__(self, status: str, reason: str, ending: str = "") -> None:
         super().__init__(reason)
-        self.status, self.reason, self.told = status, reason, told
+        self.status, self.reason, self.ending = status, reason, ending
 
 
 class Child:
