@@ -2,7 +2,7 @@
 
 A process of its own is given up when its detector crashes or hangs: then the check that it was at
 has failed, and a new process goes on with the next one. Such a process runs this module, too, as
-``python -m oodd_eval.plugins.conformance.session READ_FD WRITE_FD LIFELINE_FD``.
+``python -m oodd_eval.plugins.conformance.session CHANNEL_FD LIFELINE_FD``.
 """
 
 import os
@@ -10,6 +10,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, fields
 from typing import Any, Final
 from unittest.mock import patch
@@ -121,27 +122,26 @@ def supervise(
 
 def _one_process(request: dict[str, Any], limits: Limits) -> Iterator[Result]:
     """Yield results until all are there, or the process has ended: then the last one says how."""
-    child = Child(__name__, limits)
     start, ending, log, name = time.perf_counter(), "", "", request["checks"][0]
-    try:
-        child.channel.send(request)
-        for name in request["checks"]:
-            start = time.perf_counter()
-            child.start_clock()
-            yield _result(child.channel.receive(), name)
-    except GivenUpError as error:
-        ending = error.ending
-    except ChannelGarbledError:
-        ending = "wrote into the pipe to the harness"
-    except (ChannelClosedError, BrokenPipeError):
-        # A detector may have closed the pipe and gone on.
-        gone = child.wait_for_exit(seconds=1.0)
-        ending = "" if gone else "closed the pipe to the harness"
-    else:
-        return
-    finally:
-        log = child.end()
-        os.close(child.sending)
+    with closing(Child(__name__, limits)) as child:
+        try:
+            child.channel.send(request)
+            for name in request["checks"]:
+                start = time.perf_counter()
+                child.start_clock()
+                yield _result(child.channel.receive(), name)
+        except GivenUpError as error:
+            ending = error.ending
+        except ChannelGarbledError:
+            ending = "wrote into the pipe to the harness"
+        except (ChannelClosedError, ConnectionError):
+            # A detector may have closed the pipe and gone on.
+            gone = child.wait_for_exit(seconds=1.0)
+            ending = "" if gone else "closed the pipe to the harness"
+        else:
+            return
+        finally:
+            log = child.end()
     message = f"the process {ending or child.death()}"
     yield Result(name, "failed", message, time.perf_counter() - start, log)
 

@@ -1,7 +1,6 @@
 """Run one detector in a process of its own, and turn every way to fail into a status."""
 
 import math
-import os
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,13 +13,19 @@ from typing import Any, Final, TypeVar
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.plugins.isolation import ROW_BYTES, Channel, ChannelClosedError, ChannelGarbledError
+from oodd_eval.plugins.isolation import (
+    CHUNK,
+    CLOSED_SECONDS,
+    ROW_BYTES,
+    Channel,
+    ChannelClosedError,
+    ChannelGarbledError,
+)
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
 from oodd_eval.plugins.isolation.sandbox import Sandbox
 
-CHUNK: Final = 64  # trajectories that a worker scores at once
-
-_TOLD: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}  # by a worker, of itself
+_FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
+"""What a worker may say of itself."""
 
 _T = TypeVar("_T")
 _Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
@@ -86,10 +91,12 @@ def _isolated(
     stop: Stop,
     box: Sandbox | None,
 ) -> Outcome:
-    child = Child("oodd_eval.plugins.isolation.worker", limits, stop, box)
     outcome, expected = Outcome(), _Expected()
     # From another thread, so that neither side can deadlock on a full pipe.
-    with ThreadPoolExecutor(1) as pool:
+    with (
+        closing(Child("oodd_eval.plugins.isolation.worker", limits, stop, box)) as child,
+        ThreadPoolExecutor(1) as pool,
+    ):
         explains: Future[bool] = Future()
         parts = _noted("array", groups, expected), _noted("explanation", explained, expected)
         sent = pool.submit(_send, child, request, train, *parts, explains)
@@ -103,7 +110,7 @@ def _isolated(
         except ChannelClosedError:
             doing = "fitting" if outcome.seconds_fit is None else "scoring"
             outcome.status = "error"
-            if not child.wait_for_exit(seconds=5.0):
+            if not child.wait_for_exit(seconds=CLOSED_SECONDS):
                 outcome.reason = f"the worker closed its pipe while {doing}, without a result"
         finally:
             if not explains.done():
@@ -130,26 +137,23 @@ def _converse(
     while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
-            if message["status"] not in _TOLD:
+            if message["status"] not in _FAILURES:
                 raise ValueError(message["status"])
             raise GivenUpError(message["status"], _typed(message, "reason", str))
         if outcome.seconds_fit is None:
-            outcome.warm_up, told = message["warm_up"], _typed(message, "explains", bool)
+            outcome.warm_up, answer = message["warm_up"], _typed(message, "explains", bool)
             outcome.seconds_fit = _number(message, "seconds_fit", child.elapsed)
-            explains.set_result(told)
-        elif "pid" in message:
-            child.watch(_typed(message, "pid", int), forked=_typed(message, "forked", bool))
+            explains.set_result(answer)
         elif "peak_rss_mb" in message:
-            held = _number(message, "peak_rss_mb", memory)
+            peak = max(peak, _number(message, "peak_rss_mb", memory))
             if "seconds_score" in message:
                 seconds += _number(message, "seconds_score", child.elapsed)
-                peak = max(peak, held)
             else:
                 outcome.seconds_score = min(seconds, child.elapsed)
-                outcome.peak_rss_mb = max(child.together([peak, held]), child.peak / 1e6)
+                outcome.peak_rss_mb = max(peak, child.peak / 1e6)
         elif (kind := _typed(message, "type", str)) in arrays:
-            wanted, rows = expected.popleft()
-            if kind != wanted:
+            expected_kind, rows = expected.popleft()
+            if kind != expected_kind:
                 raise ValueError(kind)
             arrays[kind].append(channel.receive_array(4096 + ROW_BYTES * rows))
         else:
@@ -203,10 +207,10 @@ def _send(
         for group in explained if explains.result() else ():
             _send_group(channel, group, explain=True)
         channel.send({"group": False})
-    except BrokenPipeError:
+    except ConnectionError:
         pass  # The worker ended; the receiving side finds out why.
     finally:
-        os.close(child.sending)
+        child.hang_up()
 
 
 def _send_group(channel: Channel, group: Iterable[Trajectory], *, explain: bool) -> None:
