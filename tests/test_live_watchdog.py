@@ -86,7 +86,7 @@ def test_fresh_nominal_episodes_stay_within_alpha():
         calibration = [walk(seed) for seed in range(1000 * draw, 1000 * draw + 40)]
         watchdog = Watchdog.fit("mewma-a", TRAIN, calibration, 0.1)
         fresh = [walk(seed) for seed in range(20_000 + 30 * draw, 20_030 + 30 * draw)]
-        scores = map(watchdog._made.detector.score, fresh)
+        scores = map(watchdog._handle.detector.score, fresh)
         alarms += [watchdog.rule.first(s) is not None for s in scores]
         assert sum(map(watchdog._limits.faulty, fresh)) == 0
     assert 0.03 < np.mean(alarms) < 0.15
@@ -231,10 +231,10 @@ def test_a_detector_of_whole_episodes_explains_its_alarm():
 def test_detectors_are_shown_actions_if_they_look_at_them():
     watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.update(np.zeros(3))
-    assert watchdog._made.detector.action is None
+    assert watchdog._handle.detector.action is None
     watchdog.update(np.zeros(3), [0.5])
-    assert watchdog._made.detector.action.tolist() == [0.5]
-    assert not Watchdog.fit("mewma", TRAIN, CALIBRATION)._made.actions
+    assert watchdog._handle.detector.action.tolist() == [0.5]
+    assert not Watchdog.fit("mewma", TRAIN, CALIBRATION)._handle.actions
 
 
 def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
