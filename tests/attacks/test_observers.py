@@ -67,7 +67,7 @@ CHANGES = {
     "parameters of a plan": ("oodd_run_started(plan)",
                              "[u.parameters.update(x=1) for u in plan.units]"),
     "what is shown of a plan": ("oodd_run_started(plan)",
-                                "[u.shown.update(x=1) for u in plan.units]"),
+                                "[u.recorded.update(x=1) for u in plan.units]"),
     "a seed": ("oodd_run_started(plan)", f"[{SET}(u, 'seed', 7) for u in plan.units]"),
     "a key": ("oodd_run_started(plan)", f"[{SET}(u, 'scores_key', '../x') for u in plan.units]"),
     "the plug-in of a unit": ("oodd_unit_started(unit)", f"{SET}(unit, 'plugin', 'riqn')"),
