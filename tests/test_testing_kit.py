@@ -41,11 +41,6 @@ def apart(monkeypatch, tmp_path):
     os.environ.update(environment)
 
 
-def pattern(message):
-    escaped = re.escape(message).replace("<n>", r"-?[\d.]+").replace(r"<\.\.\.>", ".*")
-    return re.compile(escaped, re.DOTALL)
-
-
 WHOLE_KIT = ["fits-NoMood", "shape-OneShort", *(name for name in BROKEN if BROKEN[name].also)]
 """Those after which little else can be carried out, and those that fail several checks."""
 
@@ -62,7 +57,7 @@ def test_a_broken_detector_fails_its_check_with_its_message(name, apart, monkeyp
     run_tests(Trial(broken.spec), results.append, [broken.check])
     (result,) = results
     assert (result.name, result.status) == (broken.check, "failed")
-    assert pattern(broken.message).fullmatch(result.message), result.message
+    assert broken.message in result.message
 
 
 @pytest.mark.parametrize("name", WHOLE_KIT)
@@ -71,7 +66,7 @@ def test_of_the_whole_kit_a_broken_detector_fails_what_it_breaks_alone(name, apa
     report = run_checks(broken.spec)
     failed = {result.name: result.message for result in report.failed}
     assert set(failed) == {broken.check, *broken.also}, report
-    assert pattern(broken.message).fullmatch(failed[broken.check])
+    assert broken.message in failed[broken.check]
 
 
 def test_every_check_is_proven():

@@ -311,39 +311,39 @@ def probes(lengths: Mapping[str, Sequence[int]], seed: int) -> list[Probe]:
 
 
 def check_prefix(
-    found: Scores, whole: Scores, *, detector: str, where: str, horizon: int = 1
+    scores: Scores, whole: Scores, *, detector: str, where: str, horizon: int = 1
 ) -> None:
     """Raise `ContractError` when the scores of a prefix differ from those of the whole episode."""
-    if wrong := difference(found, whole, TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE):
+    if problem := difference(scores, whole, TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE):
         raise ContractError(
-            f"detector {detector!r} gives the first {len(found)} of {len(whole)} observations of "
-            f"{where} other scores when they are all it gets: {wrong}; expected the same, as a "
-            f"score may use nothing after its time and nothing of other episodes (`oodd-eval check "
-            f"{detector} -k prefix`)"
+            f"detector {detector!r} is not causal: scores of {where} change when only its first "
+            f"{len(scores)} of {len(whole)} observations are given: {problem}; a score may use "
+            "nothing after its time and nothing of other episodes "
+            f"(`oodd-eval check {detector} -k prefix`)"
         )
 
 
-def difference(found: Scores, whole: Scores, tolerance: float = 0.0) -> str:
+def difference(scores: Scores, whole: Scores, tolerance: float = 0.0) -> str:
     """Return where scores of first rows differ from the `whole` episode's; empty if nowhere.
 
     The tolerance is relative to how far scores vary around the score: to its distance from the
     k-th nearest other score of the episode, k being a tenth of all. So neither a constant that is
     added to scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
-    scores are equal, they have to be equal in `found`, too.
+    scores are equal, they have to be equal here, too.
     """
     import numpy as np  # noqa: PLC0415  see above
 
-    expected = whole[: len(found)]
+    expected = whole[: len(scores)]
     # Scores near the largest float overflow here; another check finds that they are too large.
     with np.errstate(invalid="ignore", over="ignore"):
-        same = (found == expected) | (np.isnan(found) & np.isnan(expected))
+        same = (scores == expected) | (np.isnan(scores) & np.isnan(expected))
         if tolerance and not same.all():
-            same |= np.abs(found - expected) <= tolerance * _spread(expected, whole)
+            same |= np.abs(scores - expected) <= tolerance * _spread(expected, whole)
     if same.all():
         return ""
     t = int(np.flatnonzero(~same)[0])
-    digits = 10 if f"{found[t]:.10g}" != f"{expected[t]:.10g}" else 17
-    return f"at t = {t} it is {found[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
+    digits = 10 if f"{scores[t]:.10g}" != f"{expected[t]:.10g}" else 17
+    return f"at t = {t} it is {scores[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
 
 
 def _spread(scores: Scores, whole: Scores) -> Scores:
@@ -354,10 +354,10 @@ def _spread(scores: Scores, whole: Scores) -> Scores:
     if not ordered.size:
         return np.zeros(len(scores))
     k, last = max(1, len(ordered) // 10), len(ordered) - 1
-    place, spread = np.searchsorted(ordered, scores), np.full(len(scores), np.inf)
+    position, spread = np.searchsorted(ordered, scores), np.full(len(scores), np.inf)
     # The k nearest ones and the score itself are neighbours among the ordered scores.
     for first in range(-k, 1):
-        low, high = place + first, place + first + k
+        low, high = position + first, position + first + k
         inside = (low >= 0) & (high <= last)
         farther = np.maximum(
             scores - ordered[low.clip(0, last)], ordered[high.clip(0, last)] - scores

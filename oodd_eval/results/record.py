@@ -216,7 +216,7 @@ class Record:
                     f"{where} is no record: per_trajectory.{name}: {len(tops)} numerators and "
                     f"{len(bottoms)} denominators, expected as many of both"
                 )
-        # Of a record that nobody has yet.
+        # Safe though frozen: the record has not been returned yet.
         object.__setattr__(record, "per_trajectory", _arrays(record.per_trajectory))
         return record
 

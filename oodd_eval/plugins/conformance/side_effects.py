@@ -168,7 +168,7 @@ def settings() -> dict[str, str]:
     directory = "removed"
     with contextlib.suppress(FileNotFoundError):
         directory = str(Path.cwd())
-    found: dict[str, object] = {
+    values: dict[str, object] = {
         "numpy error handling": np.geterr(),
         "numpy print options": np.get_printoptions(),
         "recursion limit": sys.getrecursionlimit(),
@@ -180,7 +180,7 @@ def settings() -> dict[str, str]:
         "torch gradients enabled": torch.is_grad_enabled() if torch else True,
         "torch deterministic algorithms": deterministic,
     }
-    return {name: str(value) for name, value in found.items()}
+    return {name: str(value) for name, value in values.items()}
 
 
 def outside(written: Iterable[str], here: Path) -> list[str]:
@@ -194,7 +194,7 @@ def outside(written: Iterable[str], here: Path) -> list[str]:
         str(path.relative_to(here) if path.is_relative_to(here) else path)
         for path in map(Path, dict.fromkeys(written))
         if "__pycache__" not in path.parts
-        and not any(path.is_relative_to(place) for place in allowed)
+        and not any(path.is_relative_to(directory) for directory in allowed)
         and not (path.is_relative_to(tempfile.gettempdir()) and not path.exists())
     ]
 
@@ -216,8 +216,8 @@ def seeded_generators(seed: int) -> Iterator[None]:
 @contextlib.contextmanager
 def _set_apart(here: Path) -> Iterator[None]:
     """Work in empty directories, with unusual generators and thread settings; then put all back."""
-    for place in (work := here / "work", temporary := here / "temporary"):
-        place.mkdir()
+    for directory in (work := here / "work", temporary := here / "temporary"):
+        directory.mkdir()
     variables = dict.fromkeys(_THREAD_VARIABLES, str(_UNUSUAL_THREADS))
     with (
         seeded_generators(_UNUSUAL_SEED),
@@ -235,17 +235,17 @@ def _set_apart(here: Path) -> Iterator[None]:
 def _generators() -> dict[str, object]:
     kind, words, *rest = np.random.get_state()  # noqa: NPY002
     numpy_state = kind, np.asarray(words).tobytes(), rest
-    found: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
+    states: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
     if torch := sys.modules.get("torch"):
-        found["torch"] = torch.get_rng_state().numpy().tobytes()
-    return found
+        states["torch"] = torch.get_rng_state().numpy().tobytes()
+    return states
 
 
 def _thread_settings() -> dict[str, str]:
-    found = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
+    values = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
     if torch := sys.modules.get("torch"):
-        found["torch.get_num_threads()"] = str(torch.get_num_threads())
-    return found
+        values["torch.get_num_threads()"] = str(torch.get_num_threads())
+    return values
 
 
 def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
@@ -276,7 +276,7 @@ def _peak_memory(end: Event) -> int:
 
 def _running() -> set[tuple[int, str]]:
     """Return the further threads and the children of this process: id and name."""
-    found = {
+    running = {
         (thread.ident or 0, f"{DAEMON if thread.daemon else 'thread'} {thread.name}")
         for thread in threading.enumerate()
         if thread is not threading.main_thread()
@@ -284,5 +284,5 @@ def _running() -> set[tuple[int, str]]:
     for child in psutil.Process().children():
         with contextlib.suppress(psutil.NoSuchProcess):
             if child.status() != psutil.STATUS_ZOMBIE:
-                found.add((child.pid, f"process {child.pid} ({child.name()})"))
-    return found
+                running.add((child.pid, f"process {child.pid} ({child.name()})"))
+    return running
