@@ -61,6 +61,18 @@ class RunLength:
         hours, rate
             Mean time between false alarms, and observations in a second.
 
+        Returns
+        -------
+        threshold : float
+            Of the statistic.
+        promise : RunLength
+            The mean time between false alarms with its interval.
+
+        Raises
+        ------
+        UsageError
+            For fewer than 20 episodes, or a time that they are too long for.
+
         Examples
         --------
         >>> largest = np.random.default_rng(0).exponential(size=400)

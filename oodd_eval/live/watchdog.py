@@ -308,7 +308,13 @@ class Watchdog:
         return number if isinstance(number, str) else self.sensors[number]
 
     def copy(self) -> Self:
-        """Return another watchdog with the same fit, for another robot, at the beginning."""
+        """Return a watchdog with the same fit, for another robot.
+
+        Returns
+        -------
+        Watchdog
+            At the beginning of an episode.
+        """
         other = copy.deepcopy(self)
         other.reset()
         return other
@@ -318,8 +324,8 @@ class Watchdog:
 
         Parameters
         ----------
-        directory
-            Where to; the detector's own files go into a directory ``detector`` in it.
+        directory : str or Path
+            The detector's own files go into a directory ``detector`` in it.
 
         Raises
         ------
@@ -352,9 +358,9 @@ class Watchdog:
 
         Parameters
         ----------
-        directory
-            Where it was saved.
-        detector
+        directory : str or Path
+            The directory that `save` was called with.
+        detector : Detector, optional
             An instance with the parameters of the saved one, where that had no name.
 
         Returns

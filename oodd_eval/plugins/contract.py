@@ -65,12 +65,17 @@ class Detector(Protocol):
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
-        """Learn from nominal trajectories, forgetting any earlier fit. The result is ignored.
+        """Learn from nominal trajectories, forgetting any earlier fit.
 
         Parameters
         ----------
-        nominal
+        nominal : sequence of Trajectory
             Training trajectories, all with the same numbers of sensors and actions.
+
+        Returns
+        -------
+        object
+            Ignored.
         """
 
     def score(self, trajectory: Trajectory) -> Scores:
@@ -78,13 +83,20 @@ class Detector(Protocol):
 
         Parameters
         ----------
-        trajectory
+        trajectory : Trajectory
             One episode with T transitions.
 
         Returns
         -------
         float64 array of shape (T + 1,)
             NaN in the leading undefined rows only.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            For another number of sensors than in training.
         """
 
 
@@ -114,6 +126,11 @@ class StreamingDetector(Detector, Protocol):
         -------
         float
             NaN where the score is undefined.
+
+        Raises
+        ------
+        TrajectoryError
+            For another number of readings than in training, or a reading that is not finite.
         """
 
 
@@ -126,7 +143,7 @@ class StorableDetector(Detector, Protocol):
 
         Parameters
         ----------
-        directory
+        directory : Path
             An empty directory.
         """
 
@@ -135,7 +152,7 @@ class StorableDetector(Detector, Protocol):
 
         Parameters
         ----------
-        directory
+        directory : Path
             Written by a detector with the same parameters, except those that do not decide the fit
             (`oodd_eval.plugins.parameters.parameter`).
 
@@ -246,12 +263,24 @@ def check_scores(
 
     Parameters
     ----------
-    scores, trajectory
-        What the detector returned, and was given (or its number of observations).
-    horizon, warm_up
+    scores : object
+        The value that the detector returned.
+    trajectory : Trajectory or int
+        The scored episode, or its number of observations.
+    horizon, warm_up : int
         Rows: NaN may stand in the leading ``max(horizon, warm_up)`` only.
-    detector, where
-        Names for the `ContractError` that is raised, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
+    detector, where : str
+        Names for messages, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
+
+    Returns
+    -------
+    float64 array of shape (T + 1,)
+        The scores.
+
+    Raises
+    ------
+    ContractError
+        When they do not honour the contract, or `warm_up` is no int from 0 to `MAX_WARM_UP`.
     """
     import numpy as np  # noqa: PLC0415  see above
 

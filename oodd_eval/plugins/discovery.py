@@ -336,37 +336,10 @@ def _implements(plugin: Plugin, hook: str) -> bool:
 
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
-    line = "a printable line of at most 1000 characters", _is_line
-    truth = "True or False", lambda value: isinstance(value, bool)
-    inputs, alarms = ("observations", "observations+actions"), ("cusum", "score")
-    expectations: dict[str, tuple[str, Callable[[Any], bool]]] = {
-        "name": (
-            "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
-            lambda value: _matches(SPEC_NAME, value),
-        ),
-        "factory": ("a function or class", callable),
-        "summary": line,
-        "reference": line,
-        "extra": line,
-        "fit_name": line,
-        "inputs": (" or ".join(inputs), inputs.__contains__),
-        "alarm": (" or ".join(alarms), alarms.__contains__),
-        "deterministic": truth,
-        "other_parameters": truth,
-        "horizon_decides_fit": truth,
-        "requires": (
-            "names of modules",
-            lambda value: isinstance(value, tuple | list) and all(map(_is_line, value)),
-        ),
-        "version": (
-            "a version such as 1.2",
-            lambda value: _matches("[A-Za-z0-9.+!_-]{0,64}", value),
-        ),
-        "parameters": ("a dataclass with fields of ASCII names, or None", _declares),
-    }
-    for name, (expected, fits) in expectations.items():
-        if not fits(value := getattr(spec, name)):
-            raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
+    for names, expected, fits in _FIELDS:
+        for name in names.split():
+            if not fits(value := getattr(spec, name)):
+                raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
 
 
 def _matches(pattern: str, value: object) -> bool:
@@ -400,6 +373,36 @@ def printable(reason: str) -> str:
         reason = f"{reason[:half]} ... {reason[-half:]}"
     # Halves of surrogate pairs, which no file takes, are not printable either.
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in reason)
+
+
+_FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
+    (
+        "name",
+        "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
+        lambda value: _matches(SPEC_NAME, value),
+    ),
+    ("factory", "a function or class", callable),
+    ("summary reference extra fit_name", "a printable line of at most 1000 characters", _is_line),
+    (
+        "inputs",
+        "observations or observations+actions",
+        ("observations", "observations+actions").__contains__,
+    ),
+    ("alarm", "cusum or score", ("cusum", "score").__contains__),
+    (
+        "deterministic other_parameters horizon_decides_fit",
+        "True or False",
+        lambda value: isinstance(value, bool),
+    ),
+    (
+        "requires",
+        "names of modules",
+        lambda value: isinstance(value, tuple | list) and all(map(_is_line, value)),
+    ),
+    ("version", "a version such as 1.2", lambda value: _matches("[A-Za-z0-9.+!_-]{0,64}", value)),
+    ("parameters", "a dataclass with fields of ASCII names, or None", _declares),
+)
+"""Fields of a spec, what is expected of them, and whether a value is."""
 
 
 def _foreign(point: EntryPoint) -> bool:

@@ -47,8 +47,12 @@ class ExplainingDetector(Detector, Protocol):
 
         Parameters
         ----------
-        trajectory
+        trajectory : Trajectory
             One episode, which a fitted detector may not have scored.
+
+        Returns
+        -------
+        Explanation
         """
 
 

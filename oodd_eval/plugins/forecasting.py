@@ -103,12 +103,12 @@ def anomaly_scores(
 
     Parameters
     ----------
-    observations
-        Of shape (T + 1, D).
-    errors
-        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, of shape
-        (T + 1 - horizon,).
-    horizon
+    observations : float32 array of shape (T + 1, D)
+        Standardized readings of one episode; only their number counts.
+    errors : float64 array of shape (T + 1 - horizon,)
+        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, in training
+        standard deviations.
+    horizon : int
         Prediction horizon in steps.
 
     Returns
