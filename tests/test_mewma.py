@@ -1,8 +1,5 @@
 """The vector autoregression and its chart, by hand and against slow, obvious forms of them."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from helpers_saved import assert_zero_scales_are_refused
@@ -224,17 +221,6 @@ def test_constant_sensor_gives_no_residual_and_its_change_is_seen(chart):
     rows = x.observations.copy()
     rows[50:, 3] = 0.0
     assert chart.score(Trajectory(rows, x.actions))[55] > np.nanmax(chart.score(x)) + 1
-
-
-def test_scoring_needs_numpy_alone():
-    code = (
-        "import sys\nimport numpy as np\n"
-        "from oodd_mewma import make_mewma\nfrom oodd_eval import Trajectory\n"
-        "x = Trajectory(np.random.default_rng(0).normal(size=(9, 2)), np.zeros((8, 1)))\n"
-        "make_mewma().fit([x, x]).score(x)\n"
-        "sys.exit(bool({'sklearn', 'scipy', 'torch'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_live_chart_with_actions_asks_for_them():

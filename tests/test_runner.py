@@ -5,7 +5,6 @@ import json
 import os
 import re
 import textwrap
-import time
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -295,33 +294,6 @@ def test_an_interrupted_run_keeps_what_was_finished(tiny_split, tmp_path, counti
     assert len(counting[1]()) == 1
 
 
-def test_a_worker_is_killed_when_the_run_is_interrupted(tiny_split, monkeypatch, tmp_path):
-    code = """
-    class Sleeps(Good):
-        def fit(self, nominal):
-            Path(PID).write_text(str(os.getpid()))
-            time.sleep(600)
-
-    @hookimpl
-    def oodd_detectors(): return offer(sleeps=Sleeps)
-    """
-    pid = tmp_path / "pid"
-    module = install(monkeypatch, tmp_path / "plugin", "sleeps", code)
-    module.write_text(f"PID = {str(pid)!r}\n" + module.read_text())
-
-    class Interrupt:
-        @hookimpl
-        def oodd_cell_finished(self, record):
-            while not (pid.exists() and pid.read_text()):
-                time.sleep(0.01)
-            raise KeyboardInterrupt
-
-    done = run_tiny(tiny_split, ["clock", "sleeps"], jobs=2, observer=Interrupt())
-    assert [r.detector for r in done.records] == ["clock"]
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(pid.read_text()), 0)
-
-
 def test_stop_on_failure_ends_the_run(tiny_split, monkeypatch, tmp_path):
     code = "@hookimpl\ndef oodd_detectors(): return offer(fails=lambda **_: None)"
     install(monkeypatch, tmp_path, "fails", code)
@@ -366,23 +338,6 @@ def test_rescoring_with_another_split_is_refused(tiny_split, tmp_path):
     other = [dataclasses.replace(r, split_digest="0" * 64) for r in records]
     with pytest.raises(ResultsError, match="digest 000000000000, but split 'tiny' here has"):
         rescore(other, ResultsDirectory(tmp_path / "out"), load_split(tiny_split))
-
-
-def test_a_worker_is_told_no_names(tiny_split, tmp_path):
-    data = load_split(tiny_split).environment("cartpole")
-    request = {"plugin": "trivial", "detector": "clock", "train": len(data.train)}
-    anomalous = data.anomalous("iid")
-    with (tmp_path / "sent").open("wb") as file:
-        chunks = [list(anomalous), list(data.twins)]
-        explains = Future()
-        explains.set_result(True)
-        child = _child(os.dup(file.fileno()))
-        _send(child, request, data.train, chunks, chunks[:1], explains)
-    sent = (tmp_path / "sent").read_bytes()
-    assert anomalous[0].observations.tobytes() in sent
-    for word in ("cartpole", "iid", "nominal", "calib", "test", "onset", "anom", "tiny"):
-        assert word.encode() not in sent
-    data.close()
 
 
 def test_an_error_of_reading_data_is_kept_for_the_caller():

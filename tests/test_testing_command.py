@@ -1,6 +1,7 @@
 """``oodd-eval check``: exit codes, what is printed, and detectors that end their process."""
 
 import re
+import sys
 
 import pytest
 from helpers_plugins import install
@@ -217,3 +218,13 @@ def test_other_ways_to_misuse_the_process_are_named(check, name, message):
     code, out, _ = check(name, "-k", "fits", "--memory", "300MB", "--timeout", "60")
     assert code == 1
     assert re.search(message, " ".join(out.split()))
+
+
+def test_without_pytest_the_extra_is_named(check, monkeypatch):
+    for name in [n for n in sys.modules if n.startswith("oodd_eval.plugins.conformance")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "oodd_eval.testing")
+    monkeypatch.setitem(sys.modules, "pytest", None)
+    code, _, err = check("fine")
+    assert code == 4
+    assert "pip install 'oodd-eval[check]'" in err
