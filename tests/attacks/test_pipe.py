@@ -354,6 +354,7 @@ def test_a_process_that_escaped_and_holds_the_channel_is_not_waited_for(converse
         "os.wait(); os._exit(4)\n"
     )
     monkeypatch.setitem(globals(), "WORKER", escape)
+    monkeypatch.setitem(globals(), "ROWS", 10**6)  # more than fits into the socket
     start = time.monotonic()
     assert "ended with exit code 4" in converse().reason
     assert time.monotonic() - start < 6

@@ -151,7 +151,8 @@ class Child:
         self.returncode = self._process.wait()
         if self._box and self.returncode > 128:  # So bubblewrap tells of a signal.
             self.returncode = 128 - self.returncode
-        # A process that escaped could hold the output open for ever: do not wait for it.
+        # A process that escaped could hold socket and output open for ever: do not wait for it.
+        self.hang_up()
         for thread in self._threads:
             thread.join(timeout=1.0)
         os.close(self._held)
