@@ -569,7 +569,7 @@ class PicklesSecretly(Pickles):
     extra, content = "model.bin", b"\x80\x04N."
 
 
-@breaks("saved-files", "save wrote extra.npz, which holds Python objects in")
+@breaks("saved-files", "save wrote extra.npz, which holds Python objects")
 class SavesObjects(Good):
     def save(self, directory):
         super().save(directory)

@@ -16,10 +16,8 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event
 from typing import IO, Any, Final
 from unittest.mock import patch
 
@@ -27,14 +25,13 @@ import numpy as np
 import psutil
 
 from oodd_eval.data.files import redirected
+from oodd_eval.plugins.isolation.worker import peak_rss_mb
 
 _THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
 
 # Set before code is watched, so that setting the usual value is seen as well.
 _UNUSUAL_THREADS: Final = 3
 _UNUSUAL_SEED: Final = 0x0DD
-
-_SAMPLE_SECONDS: Final = 0.005
 
 _CALLS: Final = "connect getaddrinfo gethostbyaddr gethostbyname sendmsg sendto"
 _NETWORK: Final = frozenset(f"socket.{call}" for call in _CALLS.split())
@@ -132,17 +129,16 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
         settings_before = {**settings_before, "working directory": str(Path.cwd())}
         printed = stack.enter_context(_captured())
         caught = stack.enter_context(warnings.catch_warnings(record=True, action="always"))
-        start, memory, end = time.perf_counter(), psutil.Process().memory_info().rss, Event()
-        with auditing(seen), ThreadPoolExecutor() as pool:
-            peak = pool.submit(_peak_memory, end)
+        with contextlib.suppress(OSError):  # Linux then forgets the peak so far.
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        start, memory = time.perf_counter(), peak_rss_mb()
+        with auditing(seen):
             try:
                 work()
             except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
                 seen.error = error
-            finally:
-                end.set()
         seen.seconds = time.perf_counter() - start
-        seen.megabytes = (peak.result() - memory) / 1e6
+        seen.megabytes = peak_rss_mb() - memory
         seen.random = [name for name, state in _generators().items() if generators[name] != state]
         seen.threads = _changes(threads, _thread_settings())
         seen.settings = _changes(settings_before, settings())
@@ -263,15 +259,6 @@ def _captured() -> Iterator[IO[str]]:
         contextlib.redirect_stderr(file),
     ):
         yield file
-
-
-def _peak_memory(end: Event) -> int:
-    """Return the largest resident memory of this process until the end."""
-    process, peak, done = psutil.Process(), 0, False
-    while not done:
-        done = end.wait(_SAMPLE_SECONDS)
-        peak = max(peak, process.memory_info().rss)
-    return peak
 
 
 def _running() -> set[tuple[int, str]]:

@@ -8,12 +8,11 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
-from oodd_eval.data.bounded import npy_header
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins.conformance.side_effects import seeded_generators
@@ -337,17 +336,14 @@ def _pickled(path: Path) -> str:
             for name in archive.namelist():
                 if Path(name).suffix in _PICKLE_SUFFIXES:
                     return f"which holds the pickle {name}"
-                with archive.open(name) as member:
-                    if name.endswith(".npy") and _holds_objects(member):
-                        return f"which holds Python objects in {name}"
-        return ""
     with path.open("rb") as file:
         # A pickle of protocol 2 or later begins with these two bytes.
-        if file.peek(2)[:2] in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}:
+        if file.read(2) in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}:
             return "a pickle by its first bytes"
-        holds_objects = path.suffix == ".npy" and _holds_objects(file)
-        return "which holds Python objects" if holds_objects else ""
-
-
-def _holds_objects(file: IO[bytes]) -> bool:
-    return npy_header(file)[0].hasobject
+    if path.suffix in {".npy", ".npz"}:
+        try:
+            arrays = np.load(path, allow_pickle=False)
+            [arrays[name] for name in getattr(arrays, "files", ())]
+        except ValueError:
+            return "which holds Python objects"
+    return ""

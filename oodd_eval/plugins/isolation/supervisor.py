@@ -5,7 +5,7 @@ import signal
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final, TypeVar
@@ -73,33 +73,18 @@ def run_isolated(
     exhausted. Scores come back in the order of the groups. When `stop` says True, the worker is
     killed and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
-    if limits.hidden is None:
-        return _isolated(request, train, groups, explained, limits, stop, None)
-    with closing(Sandbox(limits.hidden)) as box:
-        inside = box.taken(request)
-        outcome = _isolated(inside, train, groups, explained, limits, stop, box)
-        box.give(request)
-    return outcome
-
-
-def _isolated(
-    request: Mapping[str, Any],
-    train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]],
-    explained: Iterable[Iterable[Trajectory]],
-    limits: Limits,
-    stop: Stop,
-    box: Sandbox | None,
-) -> Outcome:
-    outcome, expected = Outcome(), _Expected()
-    # From another thread, so that neither side can deadlock on a full pipe.
-    with (
-        closing(Child("oodd_eval.plugins.isolation.worker", limits, stop, box)) as child,
-        ThreadPoolExecutor(1) as pool,
-    ):
+    outcome, expected, box, inside = Outcome(), _Expected(), None, request
+    with ExitStack() as stack:
+        if limits.hidden is not None:
+            box = stack.enter_context(closing(Sandbox(limits.hidden)))
+            inside = box.taken(request)
+        module = "oodd_eval.plugins.isolation.worker"
+        child = stack.enter_context(closing(Child(module, limits, stop, box)))
+        # From another thread, so that neither side can deadlock on a full socket.
+        pool = stack.enter_context(ThreadPoolExecutor(1))
         explains: Future[bool] = Future()
         parts = _noted("array", groups, expected), _noted("explanation", explained, expected)
-        sent = pool.submit(_send, child, request, train, *parts, explains)
+        sent = pool.submit(_send, child, inside, train, *parts, explains)
         try:
             _converse(child, outcome, explains, expected)
         except GivenUpError as error:
@@ -116,6 +101,8 @@ def _isolated(
             if not explains.done():
                 explains.set_result(False)
             outcome.log = child.end()
+        if box:
+            box.give(request)
     sent.result()
     if outcome.status == "error" and not outcome.reason:
         outcome.reason = f"the worker {child.death()} while {doing}"
