@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import FittedStateError, UsageError
-from oodd_eval.live import Reading
-from oodd_eval.live.endless import RunLength
 from oodd_eval.live.handle import DetectorHandle, streaming
+from oodd_eval.live.reading import Reading, RunLength
 from oodd_eval.live.stream import ACTION, OBSERVATION, Stream, StreamLimits
 from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, least_episodes
 from oodd_eval.metrics.cusum import Standardization
