@@ -1,10 +1,20 @@
-"""``oodd-eval check``: checks of a detector, an environment or an anomaly, told one by one."""
+"""``oodd-eval check``: check a detector, or an environment or anomaly of a plug-in."""
 
-import argparse
 import time
 from typing import Final
 
-from oodd_eval.cli import Parser, add_detector, add_limits, at_least, say, value
+import click
+
+from oodd_eval.cli import (
+    Converted,
+    Name,
+    Options,
+    command,
+    detector_options,
+    limit_options,
+    load,
+    say,
+)
 from oodd_eval.cli.terminal import discovered, know_own, make_console
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.errors import UnknownNameError
@@ -23,26 +33,35 @@ _STYLES: Final = {
 }
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    # fmt: off
-    add = parser.options(
-        run, "check rf", "check mine -k 'prefix or causality' -v", plugins=True
-    )
-    add("detector", metavar="NAME", help="a detector, or an environment or anomaly of a plug-in")
-    add("--env", metavar="NAME", help="where to try an anomaly (default: one that it is for)")
-    add_detector(add)
-    add("--seed", type=at_least(0), default=0, metavar="N", help="seed of a detector (default: 0)")
-    add("-k", dest="expression", metavar="EXPR",
-        help="only checks whose name matches, such as 'files or network'")
-    add("--expect", action="append", default=[], metavar="NAME=REASON", type=value(assignment),
-        help="a check that is known to fail, and why; if it passes, that is a failure")
-    add_limits(add, "a check", "10m")
-    # fmt: on
+@command("check rf", "check mine -k 'prefix or causality' -v", plugins=True)
+@click.argument(
+    "detector",
+    type=Name("detectors", "envs", "anomalies"),
+    help="a detector, or an environment or anomaly of a plug-in",
+)
+@click.option(
+    "--env", type=Name("envs"), help="where to try an anomaly (default: one that it is for)"
+)
+@detector_options
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="seed of a detector")
+@click.option(
+    "-k",
+    "expression",
+    metavar="EXPR",
+    help="only checks whose name matches, such as 'files or network'",
+)
+@click.option(
+    "--expect",
+    multiple=True,
+    type=Converted(assignment, "NAME=REASON"),
+    help="a check that is known to fail, and why; if it passes, that is a failure",
+)
+@limit_options("a check", "10m")
+def check(options: Options) -> int:
+    """Check that a detector honours the contract, or an environment or anomaly of a plug-in.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval check``: 1 when a check failed, 5 when none ran, else 0."""
+    The exit code is 1 when a check failed, and 5 when none ran.
+    """
     limits = Limits(options.timeout, options.memory)
     expecting, parameters = dict(options.expect), dict(options.param)
     wanted = expression(options.expression) if options.expression else lambda _: True
@@ -81,10 +100,8 @@ def run(options: argparse.Namespace) -> int:
     return 0 if good else 1
 
 
-def _own(options: argparse.Namespace, wanted: Predicate) -> int:
+def _own(options: Options, wanted: Predicate) -> int:
     """Check an environment or an anomaly of a plug-in; 1 when a check failed."""
-    from oodd_recording.checks import check_own
-
     specs = {spec.name: spec for spec in know_own(options)}
     spec, environment = specs[options.detector], options.detector
     if isinstance(spec, AnomalySpec):
@@ -92,7 +109,7 @@ def _own(options: argparse.Namespace, wanted: Predicate) -> int:
         environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
-    for name, carry_out in check_own(spec, environment):
+    for name, carry_out in load("oodd_recording.checks:check_own")(spec, environment):
         if wanted(name):
             start = time.perf_counter()
             wrong = carry_out()

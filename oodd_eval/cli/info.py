@@ -1,13 +1,12 @@
-"""``oodd-eval info``: all there is to know of one detector, environment or anomaly."""
+"""``oodd-eval info``: describe a detector, an environment or an anomaly."""
 
-import argparse
 import json
 from collections.abc import Iterator
 
-from oodd_recording.values import unit_of
+import click
 from tabulate import tabulate
 
-from oodd_eval.cli import Parser
+from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.ladder import rungs_of
@@ -19,14 +18,10 @@ from oodd_eval.plugins.parameters import parameters_of
 Lines = Iterator[tuple[str, str]]
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    add = parser.options(run, "info pe", "info hopper", "info gravity", plugins=True)
-    add("name", metavar="DETECTOR|ENV|ANOMALY")
-
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval info``."""
+@command("info pe", "info hopper", "info gravity", plugins=True)
+@click.argument("name", type=Name("detectors", "envs", "anomalies"), metavar="DETECTOR|ENV|ANOMALY")
+def info(options: Options) -> int:
+    """Print all there is to know of one detector, environment or anomaly."""
     name = options.name
     if name in ENVIRONMENTS:
         lines = _environment(ENVIRONMENTS[name])
@@ -77,6 +72,7 @@ def _own(spec: OwnSpec, origin: str) -> Lines:
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:
+    unit_of = load("oodd_recording.values:unit_of")
     of_paper = " of the paper" if info.id in TABLE1 else ""
     yield "anomaly", f"{info.id} ({info.title}{of_paper})"
     yield "group", info.group
