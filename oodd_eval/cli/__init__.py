@@ -63,7 +63,7 @@ class Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the arguments, with ``--primary a b`` as ``--primary=a --primary=b``."""
         words, option = [], ""
-        for word, following in zip(args, [*args[1:], "-"], strict=True):
+        for word, following in zip(args, [*args, "-"][1:], strict=True):
             if word in self._repeated and not following.startswith("-"):
                 option = word
                 continue

@@ -162,7 +162,7 @@ def _exit_code(arguments: list[str]) -> int:
         return 2
     except click.UsageError as error:
         where = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
-        return say(f"{error.format_message()}{where}", 4)
+        return say(f"{error.format_message().removesuffix('.')}{where}", 4)
     except OoddError as error:
         if "-v" in arguments:
             traceback.print_exc()
