@@ -102,7 +102,7 @@ def parameter(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def expression(text: str) -> Predicate:
+def expression(text: str | None) -> Predicate:
     """Return the test of cell ids that an expression of ``-k`` describes; an empty one passes all.
 
     Words are substrings, regardless of case; ``and``, ``or``, ``not`` and round brackets join them.

@@ -129,7 +129,9 @@ def parse(command):
     with patch.object(Command, "invoke", lambda _, context: contexts.append(context) or 0):
         assert main(shlex.split(command, comments=True)[1:]) == 0
     # Help has no options.
-    return SimpleNamespace(command=contexts[0].info_name, **contexts[0].params) if contexts else None
+    return (
+        SimpleNamespace(command=contexts[0].info_name, **contexts[0].params) if contexts else None
+    )
 
 
 class Session:

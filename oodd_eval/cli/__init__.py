@@ -129,14 +129,10 @@ class Group(click.Group):
         What the group is for.
     sections
         Commands by the headings of the help.
-    metavar
-        What the help shows in place of a command and its options.
     """
 
-    def __init__(
-        self, help_text: str, sections: Mapping[str, Commands], metavar: str = "COMMAND ..."
-    ) -> None:
-        super().__init__(help=help_text, no_args_is_help=False, subcommand_metavar=metavar)
+    def __init__(self, help_text: str, sections: Mapping[str, Commands]) -> None:
+        super().__init__(help=help_text, no_args_is_help=False, subcommand_metavar="COMMAND ...")
         self.sections = sections
         self.entries = {name: row for rows in sections.values() for name, row in rows.items()}
 
@@ -148,12 +144,11 @@ class Group(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         """Import a command; raise `UnknownNameError`, with a suggestion, if there is none."""
         if cmd_name not in self.entries:
-            kind = f"action of {ctx.info_name}" if ctx.parent else "command"
+            kind = f"command of {ctx.info_name}" if ctx.parent else "command"
             raise UnknownNameError(kind, cmd_name, self.entries)
         summary, target = self.entries[cmd_name]
         if isinstance(target, Mapping):
-            help_text = f"{summary[0].upper()}{summary[1:]}."
-            return Group(help_text, {"Actions": target}, "ACTION ...")
+            return Group(f"{summary[0].upper()}{summary[1:]}.", {"Commands": target})
         loaded: Command = load(target)
         return loaded
 
@@ -262,6 +257,8 @@ COUNT: Final = _named(click.IntRange(min=1), "N")
 HORIZONS: Final = Converted(partial(whole_numbers, least=1), "N,...")
 SEEDS: Final = Converted(partial(whole_numbers, least=0), "N,...")
 TIME: Final = Converted(seconds, "TIME")
+MEMORY: Final = Converted(memory_bytes, "SIZE")
+PARAMETER: Final = Converted(parameter, "K=V")
 
 _PLUGIN_OPTION: Final = (
     click.Option(
@@ -298,18 +295,13 @@ def together(*options: Decorator) -> Decorator:
 expression_option: Final = click.option(
     "-k",
     "expression",
-    default="",
     metavar="EXPR",
-    show_default=False,
     help="only cells whose id matches, such as 'hopper and not (iid or drift)'",
 )
 
 detector_options: Final = together(
     click.option(
-        "--param",
-        multiple=True,
-        type=Converted(parameter, "K=V"),
-        help="a parameter of the detector, V in JSON or plain text",
+        "--param", multiple=True, type=PARAMETER, help="of the detector; V is JSON or text"
     ),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
 )
@@ -319,12 +311,7 @@ def limit_options(process: str, timeout: str) -> Decorator:
     """Return the options that limit the time and the memory of a process."""
     return together(
         click.option("--timeout", default=timeout, type=TIME, help=f"wall-clock time of {process}"),
-        click.option(
-            "--memory",
-            default="8GB",
-            type=Converted(memory_bytes, "SIZE"),
-            help=f"resident memory of {process}",
-        ),
+        click.option("--memory", default="8GB", type=MEMORY, help=f"resident memory of {process}"),
     )
 
 
@@ -335,11 +322,8 @@ jobs_option: Final = click.option(
 
 def fit_options(timeout: str) -> Decorator:
     """Return the options that say where fits run and within which limits."""
-    device = click.option(
-        "--device",
-        type=click.Choice(["auto", "cpu", "cuda"]),
-        help="where networks compute: the parameter device of detectors that have it",
-    )
+    choice = click.Choice(["auto", "cpu", "cuda"])
+    device = click.option("--device", type=choice, help="where networks of detectors compute")
     return together(jobs_option, device, limit_options("a fit with its scores", timeout))
 
 

@@ -21,6 +21,7 @@ def _quantities(text: str) -> tuple[Quantity, ...]:
 
 
 _QUANTITIES: Final = Converted(_quantities, "NAME[UNIT],...")
+_GROUP: Final = Converted(assignment, "ANOMALY=sensor|dynamics")
 
 _output_option: Final = click.option(
     "--output", type=DIRECTORY, help="directory of the split (default: where splits are found)"
@@ -38,31 +39,15 @@ _split_argument: Final = click.argument(
 @click.option("--format", required=True, type=click.Choice([*FORMATS]), help="of the files")
 @click.option("--train", required=True, type=DIRECTORY, help="nominal episodes to fit on")
 @click.option(
-    "--calibration",
-    required=True,
-    type=DIRECTORY,
-    help="nominal episodes for the thresholds of alarms",
+    "--calibration", required=True, type=DIRECTORY, help="nominal episodes for alarm thresholds"
 )
 @click.option(
-    "--test",
-    type=DIRECTORY,
-    help="the place 'nominal' of twins, and one for each anomaly, named as the anomaly",
+    "--test", type=DIRECTORY, help="DIR/nominal has twins, DIR/ANOMALY the anomalous episodes"
 )
-@click.option(
-    "--sensors",
-    type=_QUANTITIES,
-    default=(),
-    show_default=False,
-    help="names of the sensors, if the files do not name them",
-)
-@click.option("--actions", type=_QUANTITIES, default=(), help="names of the actions")
+@click.option("--sensors", type=_QUANTITIES, help="sensors, if the files do not name them")
+@click.option("--actions", type=_QUANTITIES, help="actions, if the files do not name them")
 @click.option("--discrete", type=COUNT, default=0, help="actions are whole numbers from 0 to N - 1")
-@click.option(
-    "--group",
-    multiple=True,
-    type=Converted(assignment, "ANOMALY=sensor|dynamics"),
-    help="group of an anomaly of your own (default: dynamics)",
-)
+@click.option("--group", multiple=True, type=_GROUP, help="group of an anomaly (default: dynamics)")
 @_output_option
 def import_logs(options: Options) -> int:
     """Import logs of your own as an environment of a split."""
@@ -74,8 +59,8 @@ def import_logs(options: Options) -> int:
         train=options.train,
         calibration=options.calibration,
         test=options.test,
-        sensors=options.sensors,
-        actions=options.actions,
+        sensors=options.sensors or (),
+        actions=options.actions or (),
         discrete=options.discrete,
         groups=dict(options.group),
         output=options.output,
@@ -106,10 +91,7 @@ def verify(options: Options) -> int:
 
 @command("data fetch standard.tar.gz")
 @click.argument(
-    "source",
-    type=click.Path(),
-    metavar="FILE|DIR|URL",
-    help="a split's directory, or a tar or zip archive of it",
+    "source", type=click.Path(), help="directory, tar or zip archive of a split, or the URL of one"
 )
 @click.option("--digest", metavar="SHA256", help="the split's digest; another one is refused")
 @_output_option

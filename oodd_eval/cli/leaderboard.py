@@ -86,11 +86,7 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
 @click.option("--results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
 @click.option("--detector", "detectors", default="all", type=Names("detectors"), help=NAMES)
 @expression_option
-@click.option(
-    "--complete",
-    is_flag=True,
-    help="leave out those seeds of a row that lack cells which others have",
-)
+@click.option("--complete", is_flag=True, help="leave out seeds of a row that lack cells")
 @click.option(
     "--id", metavar="ID", help="name of the entry's directory (default: detectors and split)"
 )
@@ -114,7 +110,7 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
     "--curves",
     default="rows",
     type=click.Choice(["rows", "detectors", "none"]),
-    help="curves for the site: of every row, of each detector's plainest row, or none",
+    help="curves of every row, of each detector's plainest row, or none",
 )
 def submit(options: Options) -> int:
     """Write an entry from a results directory.
@@ -151,23 +147,15 @@ def submit(options: Options) -> int:
 
 @command("leaderboard verify leaderboard/results/paper-mini")
 @click.argument(
-    "paths",
-    nargs=-1,
-    type=DIRECTORY,
-    help=f"an entry, or a directory of entries (default: {RESULTS})",
+    "paths", nargs=-1, type=DIRECTORY, help=f"entries, or directories of them (default: {RESULTS})"
 )
 @click.option(
     "--changed-against",
     metavar="BRANCH",
-    help="check a pull request: the entries that were changed since the branch was left, that "
-    "nothing else was changed with them, and that the board builds",
+    help="check a pull request: entries changed since the branch, nothing else, and the board",
 )
 @_split_option
-@click.option(
-    "--rerun",
-    type=DIRECTORY,
-    help="results of leaderboard rerun, or of a run of your own, to compare one entry with",
-)
+@click.option("--rerun", type=DIRECTORY, help="results of a re-run to compare one entry with")
 @click.option("--grant", help=f"write the trust level that was reached into {GRANTS}, in this name")
 def verify(options: Options) -> int:
     """Check entries as data, running none of their code.

@@ -40,10 +40,7 @@ DATA: Final[Commands] = {
     "fetch": ("verify a copy of a split and install it", "oodd_eval.cli.data:fetch"),
     "export": ("write a split in another project's format", "oodd_eval.cli.data:export"),
     "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
-    "calibrate": (
-        "find the strengths of the ladder (extra sim)",
-        "oodd_recording.commands:calibrate",
-    ),
+    "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
     "page": ("write the pages on environments (extra sim)", "oodd_recording.commands:page"),
 }
 
@@ -52,7 +49,7 @@ LEADERBOARD: Final[Commands] = {
     "place": ("show where a run would stand on it", "oodd_eval.cli.board:place_run"),
     "submit": ("write an entry from a results directory", "oodd_eval.cli.leaderboard:submit"),
     "verify": ("check entries as data", "oodd_eval.cli.leaderboard:verify"),
-    "rerun": ("run an entry's detectors again on new seeds", "oodd_eval.cli.rerun:rerun"),
+    "rerun": ("run an entry's detectors again on new seeds", "oodd_recording.rerun:rerun"),
     "build": ("render tables and site from the entries", "oodd_eval.cli.leaderboard:build"),
 }
 
@@ -67,10 +64,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
-        "reproduce": (
-            "compute the paper's tables, figures and claims",
-            "oodd_paper.command:reproduce",
-        ),
+        "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),
     },
     "Look up": {
         "list": ("list what there is, one line each", "oodd_eval.cli.listing:list_names"),
@@ -82,10 +76,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "check": ("check that a detector honours the contract", "oodd_eval.cli.check:check"),
         "data": ("import, record, verify, fetch and export splits", DATA),
         "policies": ("train and evaluate nominal policies", POLICIES),
-        "completion": (
-            "print what makes a shell complete commands",
-            "oodd_eval.cli.main:completion",
-        ),
+        "completion": ("print a script for a shell's completion", "oodd_eval.cli.main:completion"),
     },
 }
 

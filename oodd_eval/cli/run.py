@@ -67,16 +67,9 @@ class _Configurable(Command):
 @click.option("-x", "stop", is_flag=True, help="stop at the first failure")
 @click.option("--limit", type=COUNT, help="use the first N trajectories of each part")
 @fit_options("30m")
+@click.option("--executor", default="local", help="local, or dask://HOST:PORT, a Dask cluster")
 @click.option(
-    "--executor",
-    default="local",
-    metavar="local|dask://HOST:PORT",
-    help="where fits run: here, or on a Dask cluster",
-)
-@click.option(
-    "--sandbox",
-    is_flag=True,
-    help="run detectors in bubblewrap: no network, no view of splits, results or the home",
+    "--sandbox", is_flag=True, help="run detectors without network, splits, results and home"
 )
 @click.option("--fresh", is_flag=True, help="fit again what the results directory has already")
 @click.option("--intervals", is_flag=True, help="print 95 % intervals in the tables")

@@ -3,6 +3,7 @@
 The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
 
+import time
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -20,7 +21,9 @@ from oodd_eval.cli import (
     Options,
     command,
     jobs_option,
+    say,
 )
+from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.terminal import know_own, make_console
 from oodd_eval.data.facts import (
     ANOMALIES,
@@ -30,12 +33,14 @@ from oodd_eval.data.facts import (
     SplitDefinition,
     join_condition,
 )
-from oodd_eval.data.own import EnvironmentSpec
+from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import assignment, select
+from oodd_eval.names import Predicate, assignment, select
+from oodd_eval.plugins.conformance import Report, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
+from oodd_recording.checks import check_own
 from oodd_recording.page import NAME as OVERVIEW
 from oodd_recording.page import write_pages
 from oodd_recording.policies import load_policy
@@ -279,3 +284,27 @@ def _must_know(options: Options) -> None:
     """Ask plug-ins for an environment that the benchmark does not have."""
     if options.environment not in ENVIRONMENTS:
         know_own(options)
+
+
+def check_custom(options: Options, selects: Predicate) -> int:
+    """Check an environment or an anomaly of a plug-in; 1 when a check failed, 5 when none ran."""
+    specs = {spec.name: spec for spec in know_own(options)}
+    spec, environment = specs[options.name], options.name
+    if isinstance(spec, AnomalySpec):
+        others = (s.name for s in specs.values() if isinstance(s, EnvironmentSpec))
+        environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
+    console, results = make_console(), []
+    console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
+    for name, check in check_own(spec, environment):
+        if selects(name):
+            start = time.perf_counter()
+            problem = check()
+            seconds = time.perf_counter() - start
+            results.append(Result(name, "failed" if problem else "passed", problem, seconds))
+            if options.verbosity >= 0 or problem:
+                console.print(results[-1].line(13), style=STYLES[results[-1].status])
+    report = Report(results)
+    if not results:
+        return say(f"no check matches -k {options.expression!r}", 5)
+    console.print(report.summary(), style="green" if report.ok else "bold red")
+    return 0 if report.ok else 1

@@ -17,7 +17,6 @@ from oodd_eval.cli import (
     expression_option,
     jobs_option,
     limit_options,
-    load,
     say,
 )
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
@@ -38,6 +37,7 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.keys import source_digest
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
+from oodd_recording.commands import record_split
 
 
 @command("leaderboard rerun leaderboard/results/paper-mini --output again", plugins=True)
@@ -74,7 +74,6 @@ def rerun(options: Options) -> int:
     check_installed(entry, plugins)
     boxed = not options.no_sandbox and _sandboxed()
     drawn = draw(entry, directory, names, sandbox=boxed)
-    record_split = load("oodd_recording.commands:record_split")
     record_split(definition_of(entry, drawn), options, names, directory / SPLIT_DIRECTORY)
     split = load_split(directory / SPLIT_DIRECTORY)
     plan = plan_of(entry, split, plugins, options.seed).matching(expression(options.expression))
