@@ -46,7 +46,7 @@ _split_argument: Final = click.argument(
 )
 @click.option("--sensors", type=_QUANTITIES, help="sensors, if the files do not name them")
 @click.option("--actions", type=_QUANTITIES, help="actions, if the files do not name them")
-@click.option("--discrete", type=COUNT, default=0, help="actions are whole numbers from 0 to N - 1")
+@click.option("--discrete", type=COUNT, help="actions are whole numbers from 0 to N - 1")
 @click.option("--group", multiple=True, type=_GROUP, help="group of an anomaly (default: dynamics)")
 @_output_option
 def import_logs(options: Options) -> int:
@@ -61,7 +61,7 @@ def import_logs(options: Options) -> int:
         test=options.test,
         sensors=options.sensors or (),
         actions=options.actions or (),
-        discrete=options.discrete,
+        discrete=options.discrete or 0,
         groups=dict(options.group),
         output=options.output,
         progress=lambda part: notes.print(f"{options.env} {part}"),

@@ -101,7 +101,7 @@ PROGRAM: Final = click.version_option(__version__, message="oodd-eval %(version)
 COMPLETION: Final = "_OODD_EVAL_COMPLETE"  # the variable in which shells ask for completions
 
 
-@command("completion bash", 'completion zsh > "${fpath[1]}/_oodd-eval"')
+@command("completion bash", "completion fish")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(options: Options) -> int:
     """Print what makes a shell complete commands, options and names of oodd-eval.
