@@ -63,26 +63,26 @@ class Cells:
     def pytest_collection_modifyitems(self, session: pytest.Session, items: list[Any]) -> None:
         """Add the tests before other plug-ins select among them."""
         parent = CellCollector.from_parent(session, name="oodd-eval", nodeid="oodd-eval")
-        parent.own = self
-        found = parent.collect()
+        parent.cells = self
+        tests = parent.collect()
         # pytest calls these hooks for tests in files; with them, reports count these tests, too.
-        for item in found:
+        for item in tests:
             session.ihook.pytest_itemcollected(item=item)
-        report = pytest.CollectReport(parent.nodeid, "passed", None, [*found])
+        report = pytest.CollectReport(parent.nodeid, "passed", None, [*tests])
         session.ihook.pytest_collectreport(report=report)
-        items += found
+        items += tests
 
     def check(self, cell: str, session: pytest.Session) -> None:
         """Raise `Regression` when a cell fails; the first call runs all selected ones."""
         if not self._records:
             self.run({item.name for item in session.items if isinstance(item, CellItem)})
-        record, found = self._records[cell], self._differences.get(cell, [])
+        record, differences = self._records[cell], self._differences.get(cell, [])
         if self.reference is None:
             if not record.ok:
                 raise Regression(f"{record.status}: {record.reason}")
-        elif any(d.verdict == "new" for d in found):
+        elif any(d.verdict == "new" for d in differences):
             pytest.skip(f"not in {self.reference.where}: nothing to compare with")
-        elif failures := [d for d in found if d.fails]:
+        elif failures := [d for d in differences if d.fails]:
             raise Regression(_explained(record, failures, self.reference.where))
 
     def run(self, chosen: set[str]) -> None:
@@ -105,11 +105,11 @@ class Cells:
 class CellCollector(pytest.Collector):
     """The parent of the tests, which stand in no file."""
 
-    own: Cells
+    cells: Cells
 
     def collect(self) -> list[pytest.Item]:
         """Return a test per cell."""
-        return [CellItem.from_parent(self, name=cell) for cell in self.own.cells]
+        return [CellItem.from_parent(self, name=cell) for cell in self.cells.cells]
 
 
 class CellItem(pytest.Item):
@@ -119,7 +119,7 @@ class CellItem(pytest.Item):
 
     def runtest(self) -> None:
         """Raise `Regression` when the cell does not come up to its reference."""
-        self.parent.own.check(self.name, self.session)
+        self.parent.cells.check(self.name, self.session)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Return the message alone: the traceback would lead through this module only."""
@@ -142,17 +142,19 @@ def _detectors(patterns: str, plugins: Plugins) -> list[str]:
 
 def _of_split(reference: RecordSet, split: Split, names: list[str]) -> RecordSet:
     """Return a reference's cells of these detectors and of this split as it is here."""
-    wanted = Conditions(split.name, split.digest, PROTOCOL, None)
-    here = list(reference.boards.get(wanted, {}).values())
-    if not here:
-        found = "; ".join(map(str, reference.boards)) or "no cells"
-        raise UsageError(f"nothing in common: {reference.where} has {found}, expected {wanted}")
-    own = RecordSet.of((r for r in here if r.detector in names), reference.where)
-    if not own.boards:
-        others = ", ".join(sorted({r.detector for r in here}))
+    conditions = Conditions(split.name, split.digest, PROTOCOL, None)
+    records = list(reference.boards.get(conditions, {}).values())
+    if not records:
+        others = "; ".join(map(str, reference.boards)) or "no cells"
+        raise UsageError(
+            f"nothing in common: {reference.where} has {others}, expected {conditions}"
+        )
+    selected = RecordSet.of((r for r in records if r.detector in names), reference.where)
+    if not selected.boards:
+        others = ", ".join(sorted({r.detector for r in records}))
         has = f"{reference.where} has no cell of {', '.join(names)}, only of {others}"
         raise UsageError(f"{has}: write one with oodd-eval compare DIR --write-reference FILE")
-    return own
+    return selected
 
 
 def _plan(
@@ -164,8 +166,8 @@ def _plan(
     if reference and not plain:
         has = f"{reference.where} has only cells with parameters of their own, such as {cells[0]}"
         raise UsageError(f"{has}; here detectors run with their defaults")
-    found = {cell.environment for cell in cells}
-    environments = [e for e in split.environments if not reference or e in found]
+    covered = {cell.environment for cell in cells}
+    environments = [e for e in split.environments if not reference or e in covered]
     if envs:
         environments = select("environment", envs, split.environments)
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
@@ -178,12 +180,12 @@ def _plan(
         seeds=sorted(seeds) or [0],
     )
     labels = {cell.label for cell in cells}
-    wanted = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
-    return plan.matching(wanted.__contains__)
+    selected = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
+    return plan.matching(selected.__contains__)
 
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
-    found = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
+    reason = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
     options = {
         "detector": record.detector,
         "env": record.environment,
@@ -193,4 +195,4 @@ def _explained(record: Record, failures: list[Difference], where: str) -> str:
         "seed": record.seed,
     }
     command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
-    return f"{found}\nthe reference is {where}; to run this cell alone:\n{command}"
+    return f"{reason}\nthe reference is {where}; to run this cell alone:\n{command}"

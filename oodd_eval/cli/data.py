@@ -98,13 +98,13 @@ def verify(options: Options) -> int:
 def fetch(options: Options) -> int:
     """Verify a copy of a split and install it; what an earlier call has brought is kept."""
     notes = make_console(quiet=options.verbosity < 0)
-    found = fetch_split(
+    fetched = fetch_split(
         options.source,
         output=options.output,
         digest=options.digest,
         progress=lambda file: notes.print(f"{file}  verified"),
     )
-    split, there = found.split, " already" if found.already else ""
+    split, there = fetched.split, " already" if fetched.already else ""
     make_console().print(f"split {split.name}, digest {split.digest}, is{there} in {split.path}")
     return 0
 
@@ -122,8 +122,8 @@ def export(options: Options) -> int:
     environments = select("environment", options.env, split.environments)
     notes = make_console(quiet=options.verbosity < 0)
     written = export_split(split, options.output, environments=environments, progress=notes.print)
-    told = f"Minari finds them with MINARI_DATASETS_PATH={options.output}"
-    make_console().print(f"{len(written)} datasets in {options.output}: {told}")
+    hint = f"Minari finds them with MINARI_DATASETS_PATH={options.output}"
+    make_console().print(f"{len(written)} datasets in {options.output}: {hint}")
     return 0
 
 

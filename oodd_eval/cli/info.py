@@ -29,15 +29,15 @@ def info(options: Options) -> int:
         lines = _anomaly(ANOMALIES[name])
     else:
         plugins = discovered(options)
-        own = plugins.own_specs
-        if name in own:
-            print(tabulate(_own(*own[name]), tablefmt="plain", disable_numparse=True))
+        custom = plugins.own_specs
+        if name in custom:
+            print(tabulate(_custom(*custom[name]), tablefmt="plain", disable_numparse=True))
             return 0
         try:
             offer = plugins.offer(name)
         except UnknownNameError:
-            known = [*ENVIRONMENTS, *ANOMALIES, *own, *plugins.offers]
-            raise UnknownNameError("detector, environment or anomaly", name, known) from None
+            names = [*ENVIRONMENTS, *ANOMALIES, *custom, *plugins.offers]
+            raise UnknownNameError("detector, environment or anomaly", name, names) from None
         lines = _detector(offer)
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
@@ -55,7 +55,7 @@ def _environment(info: EnvironmentInfo) -> Lines:
         yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
 
 
-def _own(spec: OwnSpec, origin: str) -> Lines:
+def _custom(spec: OwnSpec, origin: str) -> Lines:
     if isinstance(spec, AnomalySpec):
         yield "anomaly", f"{spec.name}, {origin}"
         yield "group", spec.group
@@ -81,8 +81,8 @@ def _anomaly(info: AnomalyInfo) -> Lines:
         rungs = rungs_of(environment, info.id)
         ends = f"{rungs['kept99'].strength:.3g} to {[*rungs.values()][-1].strength:.3g}"
         strongest = [*rungs][-1]
-        told = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
-        yield f"strength in {environment}", told
+        text = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
+        yield f"strength in {environment}", text
 
 
 def _detector(offer: Offer) -> Lines:
@@ -95,8 +95,8 @@ def _detector(offer: Offer) -> Lines:
     yield "looks at", spec.inputs.replace("+", " and ")
     yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
-    for i, (name, known) in enumerate(parameters_of(spec.parameters).items()):
-        default = f"{name} = {json.dumps(known.default, default=str)}"
-        yield "" if i else "parameters", f"{default}  {known.help}".rstrip()
+    for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):
+        default = f"{name} = {json.dumps(parameter.default, default=str)}"
+        yield "" if i else "parameters", f"{default}  {parameter.help}".rstrip()
     if spec.other_parameters:
         yield "", "and any others"

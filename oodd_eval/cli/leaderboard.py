@@ -123,23 +123,23 @@ def submit(options: Options) -> int:
     statement = submission.Statement(**texts, primary=options.primary)
     chosen = ("detectors", "complete", "scores", "curves", "split")
     how = {name: getattr(options, name) for name in chosen} | {"cells": options.expression}
-    made = submission.submit(options.directory, options.results, statement, **how)
-    console, place = make_console(), made.place
-    for line in made.left_out if options.verbosity >= 0 else ():
+    submitted = submission.submit(options.directory, options.results, statement, **how)
+    console, path = make_console(), submitted.place
+    for line in submitted.left_out if options.verbosity >= 0 else ():
         console.print(f"left out: {line}")
-    report(console, made.verdict, options.verbosity)
-    if not made.verdict.ok:
-        console.print(f"nothing was written to {place}")
+    report(console, submitted.verdict, options.verbosity)
+    if not submitted.verdict.ok:
+        console.print(f"nothing was written to {path}")
         return 1
     if options.verbosity >= 0:
-        size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file())
+        size = sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
         if size > submission.LARGE:
             advice = "leave the scores or some curves out (--curves), or submit fewer rows"
             console.print(f"  note: so large an entry is a burden to the repository: {advice}")
         console.print(
-            f"\nwritten to {place}, {size / 1e6:.2g} MB; next:\n"
-            f"  oodd-eval leaderboard place {place}\n"
-            f"  git add {place}\n"
+            f"\nwritten to {path}, {size / 1e6:.2g} MB; next:\n"
+            f"  oodd-eval leaderboard place {path}\n"
+            f"  git add {path}\n"
             "commit it alone, and open a pull request (docs/submitting.md)"
         )
     return 0
@@ -226,7 +226,7 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
 
 
 def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
-    """Print what was found for one entry, every problem with its entry, place and field."""
+    """Print what was found for one entry, every problem with its entry, position and field."""
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
         cells = f"{len(verdict.records)} cells of {', '.join(entry.detectors)}"
@@ -235,10 +235,10 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
             console.print(f"  trust level established here: {verdict.reached}")
     else:
         console.print(f"{verdict.name}: refused, {findings.count} problems")
-    shown = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
-    lines = [f"{verdict.name}: {problem.text}" for problem in shown]
-    if findings.count > len(shown):
-        lines.append(f"and {findings.count - len(shown)} more")
+    problems = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
+    lines = [f"{verdict.name}: {problem.text}" for problem in problems]
+    if findings.count > len(problems):
+        lines.append(f"and {findings.count - len(problems)} more")
     lines += [f"re-run: {line}" for line in (verdict.rerun.lines if verdict.rerun else ())]
     lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]
     for line in lines:

@@ -45,12 +45,12 @@ def rows(kind: str, plugins: Plugins) -> Rows:
         case "envs":
             for e in ENVIRONMENTS.values():
                 yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
-            for env, origin in _own(plugins, EnvironmentSpec):
+            for env, origin in _custom(plugins, EnvironmentSpec):
                 yield env.name, origin, f"{len(env.sensors)} sensors, its own policy"
         case "anomalies":
             for a in ANOMALIES.values():
                 yield a.id, a.group, a.summary
-            for anomaly, origin in _own(plugins, AnomalySpec):
+            for anomaly, origin in _custom(plugins, AnomalySpec):
                 yield anomaly.name, anomaly.group, f"{anomaly.summary} ({origin})"
         case "splits":
             yield from _splits()
@@ -58,7 +58,7 @@ def rows(kind: str, plugins: Plugins) -> Rows:
             yield from _metrics()
 
 
-def _own(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
+def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
     """Yield the environments, or the anomalies, of plug-ins with their origin."""
     for spec, origin in plugins.own_specs.values():
         if isinstance(spec, kind):

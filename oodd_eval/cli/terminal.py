@@ -47,11 +47,11 @@ def discovered(options: Options) -> Plugins:
     return plugins
 
 
-def know_own(options: Options) -> list[OwnSpec]:
+def register_custom(options: Options) -> list[OwnSpec]:
     """Make environments and anomalies of plug-ins known in this process; return them."""
-    found = [spec for spec, _ in discovered(options).own_specs.values()]
-    register(found)
-    return found
+    specs = [spec for spec, _ in discovered(options).own_specs.values()]
+    register(specs)
+    return specs
 
 
 class TerminalReporter:

@@ -24,7 +24,7 @@ from oodd_eval.cli import (
     say,
 )
 from oodd_eval.cli.check import STYLES
-from oodd_eval.cli.terminal import know_own, make_console
+from oodd_eval.cli.terminal import make_console, register_custom
 from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
@@ -55,12 +55,12 @@ def _strengths(text: str) -> list[tuple[str, float]]:
     """Return conditions with their strengths from ``ANOMALY=NUMBER,...``."""
     kind, numbers = assignment(text)
     try:
-        found = [float(number) for number in numbers.split(",")]
+        strengths = [float(number) for number in numbers.split(",")]
     except ValueError:
         raise UsageError(f"{text!r}, expected ANOMALY=NUMBER,...") from None
-    if len(found) == 1:
-        return [(kind, found[0])]
-    return [(join_condition(kind, f"{strength:g}"), strength) for strength in found]
+    if len(strengths) == 1:
+        return [(kind, strengths[0])]
+    return [(join_condition(kind, f"{strength:g}"), strength) for strength in strengths]
 
 
 @command(
@@ -111,9 +111,9 @@ def build(options: Options) -> int:
     """Record a split, which needs the extra sim; what an earlier call has recorded is kept."""
     environments = list(ENVIRONMENTS)
     if options.env != "all" or options.strength:
-        own = [s.name for s in know_own(options) if isinstance(s, EnvironmentSpec)]
+        custom = [s.name for s in register_custom(options) if isinstance(s, EnvironmentSpec)]
         if options.env != "all":
-            environments = select("environment", options.env, [*ENVIRONMENTS, *own])
+            environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
     record_split(_definition(options), options, environments, options.output)
     return 0
 
@@ -148,17 +148,17 @@ def _definition(options: Options) -> SplitDefinition:
         "seed-base": options.seed_base,
     }
     others, strengths = {"cap": cap, "noise": options.noise}, dict(chain(*options.strength))
-    given = [n for n, size in {**sizes, **others}.items() if size is not None]
+    set_options = [n for n, size in {**sizes, **others}.items() if size is not None]
     if name in SPLITS:
-        given += [n for n in ("base", "suite", "strength") if getattr(options, n)]
-        if given:
-            other = f"--{given[0]} would make another; give that a name of its own"
+        set_options += [n for n in ("base", "suite", "strength") if getattr(options, n)]
+        if set_options:
+            other = f"--{set_options[0]} would make another; give that a name of its own"
             raise UsageError(f"split {name!r} is published: {other}")
         return SPLITS[name]
     if not name.isprintable() or set(name) & set("/@: "):
         raise UsageError(f"{name!r} cannot be a split's name: it holds one of '/@: '")
     if options.base:
-        if given or bool(options.suite) == bool(strengths):
+        if set_options or bool(options.suite) == bool(strengths):
             raise UsageError(
                 f"--base {options.base} gives split {name!r} its sizes and seeds: expected "
                 "--suite ladder, --suite paper or --strength, and none of "
@@ -167,8 +167,8 @@ def _definition(options: Options) -> SplitDefinition:
         taken = load_split(options.base).manifest["definition"]
         if "seed_base" not in taken:
             raise UsageError(f"--base {options.base} was imported: expected a recorded split")
-        own = {"suite": options.suite or "table1", "strengths": strengths}
-        return SplitDefinition(**{**taken, "name": name, "base": options.base, **own})
+        changed = {"suite": options.suite or "table1", "strengths": strengths}
+        return SplitDefinition(**{**taken, "name": name, "base": options.base, **changed})
     if options.suite:
         raise UsageError(f"--suite {options.suite} needs --base, a split to take training from")
     if missing := [f"--{n}" for n, size in sizes.items() if size is None]:
@@ -208,7 +208,7 @@ def calibrate(options: Options) -> int:
     """Find the strengths of the ladder; returns that an earlier call has measured are kept."""
     notes = make_console(quiet=options.verbosity < 0)
     work = options.work or options.output.with_name(options.output.name + ".work")
-    found = find_strengths(
+    strengths = find_strengths(
         options.output,
         work,
         environments=select("environment", options.env, ENVIRONMENTS),
@@ -217,9 +217,9 @@ def calibrate(options: Options) -> int:
         jobs=options.jobs,
         progress=notes.print,
     )
-    count = sum(map(len, found.values()))
+    count = sum(map(len, strengths.values()))
     make_console().print(
-        f"strengths of {count} kinds in {len(found)} environments: {options.output}"
+        f"strengths of {count} kinds in {len(strengths)} environments: {options.output}"
     )
     return 0
 
@@ -271,11 +271,11 @@ def evaluate(options: Options) -> int:
     """Print the mean return of a policy over fresh nominal episodes."""
     name = options.environment
     _must_know(options)
-    found = evaluate_policy(
+    returns = evaluate_policy(
         name, load_policy(name, options.policy), episodes=options.episodes, noise=options.noise
     )
     paper = f" (paper: {ENVIRONMENTS[name].paper_return})" if name in ENVIRONMENTS else ""
-    mean = f"{found.mean():.1f} ± {found.std():.1f}"
+    mean = f"{returns.mean():.1f} ± {returns.std():.1f}"
     make_console().print(f"{name}: return {mean} over {options.episodes} episodes{paper}")
     return 0
 
@@ -283,12 +283,12 @@ def evaluate(options: Options) -> int:
 def _must_know(options: Options) -> None:
     """Ask plug-ins for an environment that the benchmark does not have."""
     if options.environment not in ENVIRONMENTS:
-        know_own(options)
+        register_custom(options)
 
 
 def check_custom(options: Options, selects: Predicate) -> int:
     """Check an environment or an anomaly of a plug-in; 1 when a check failed, 5 when none ran."""
-    specs = {spec.name: spec for spec in know_own(options)}
+    specs = {spec.name: spec for spec in register_custom(options)}
     spec, environment = specs[options.name], options.name
     if isinstance(spec, AnomalySpec):
         others = (s.name for s in specs.values() if isinstance(s, EnvironmentSpec))

@@ -110,10 +110,12 @@ def check_installed(entry: SubmittedEntry, plugins: Plugins) -> None:
         here = name, offer.version, source_digest(offer.module)
         there = record.plugin, record.detector_version, record.plugin_source
         if here != there:
-            own, other = (f"{p} {version}, source {s[:12]}" for p, version, s in (here, there))
+            installed, submitted = (
+                f"{p} {version}, source {s[:12]}" for p, version, s in (here, there)
+            )
             raise UsageError(
-                f"{record.detector} is installed as {own}, but {entry.meta.id} has {other}: "
-                "install that"
+                f"{record.detector} is installed as {installed}, but {entry.meta.id} has "
+                f"{submitted}: install that"
             )
 
 
@@ -136,8 +138,8 @@ def plan_of(
             parameters=record.parameters,
         )
         for environment in split.environments
-        for (own, _, seed), record in fits.items()
-        if own == environment and (seeds is None or seed in seeds)
+        for (submitted, _, seed), record in fits.items()
+        if submitted == environment and (seeds is None or seed in seeds)
     ]
     units = tuple(unit for plan in plans for unit in plan.units)
     if not units:
