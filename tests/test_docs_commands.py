@@ -188,31 +188,6 @@ def test_python_of_a_page_runs(path, tmp_path, monkeypatch):
         exec(compile(block, name(path), "exec"), namespace)  # noqa: S102  the documents' own
 
 
-def test_commands_are_found_in_blocks_and_in_indented_lines():
-    text = (
-        "    oodd-eval list envs\n\n```sh\n# no command\n$ oodd-eval show a \\\n   --wide\n```\n"
-        "```text\noodd-eval not this\n    oodd-eval nor this\n```\n```sh\ngit push\n```\n"
-    )
-    assert commands(text) == ["oodd-eval list envs", "oodd-eval show a     --wide", "git push"]
-
-
-@pytest.mark.parametrize(
-    ("shown", "run"),
-    [
-        ("oodd-eval list envs", "oodd-eval list envs"),
-        ("oodd-eval run --detector a,b --env all", "oodd-eval run --detector a,b --env cartpole"),
-        (
-            "oodd-eval run --detector npn --env ant",
-            "oodd-eval run --detector npn --param updates=2 --param members=1 --env ant --limit 2",
-        ),
-        ("oodd-eval reproduce --tier full", "oodd-eval reproduce --tier full --plan"),
-        ("oodd-eval reproduce --plan", "oodd-eval reproduce --plan"),
-    ],
-)  # fmt: skip
-def test_long_commands_are_made_quick(shown, run):
-    assert quick(shown) == run
-
-
 def test_rules_have_reasons_and_are_needed():
     shown = [command for path in WITH_COMMANDS for command in commands(path.read_text())]
     assert all(rule.why for rule in (*NOT_RUN, *PARSED_ONLY, *QUICKER))
