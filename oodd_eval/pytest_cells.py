@@ -186,13 +186,9 @@ def _plan(
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
     reason = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
-    options = {
-        "detector": record.detector,
-        "env": record.environment,
-        "anomaly": record.condition,
-        "split": record.split,
-        "horizon": record.horizon,
-        "seed": record.seed,
-    }
-    command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
+    command = (
+        f"oodd-eval run --detector {record.detector} --env {record.environment} "
+        f"--anomaly {record.condition} --split {record.split} --horizon {record.horizon} "
+        f"--seed {record.seed}"
+    )
     return f"{reason}\nthe reference is {where}; to run this cell alone:\n{command}"

@@ -24,6 +24,7 @@ Options: TypeAlias = SimpleNamespace
 Commands: TypeAlias = Mapping[str, tuple[str, "str | Commands"]]
 """A summary for each name, with ``module:attribute`` of a command, or the commands of a group."""
 
+Items: TypeAlias = list[CompletionItem[str]]
 Handler: TypeAlias = Callable[[Options], int]
 Decorator: TypeAlias = Callable[[Handler], Handler]
 
@@ -167,7 +168,7 @@ class Group(click.Group):
         examples = (c.examples[0] for c in commands if isinstance(c, Command))
         write_section(formatter, "Examples", [f"oodd-eval {line}" for line in examples])
 
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> Items:
         """Complete names of commands without importing them, and options."""
         rows = [(name, row[0]) for name, row in self.entries.items() if name.startswith(incomplete)]
         names = [CompletionItem(name, help=summary) for name, summary in rows]
@@ -200,8 +201,8 @@ class Converted(click.ParamType[Any]):
             raise UsageError(f"{option} is {error}") from None
 
 
-class Name(click.ParamType[str]):
-    """The type of an option with a name, which shells complete.
+class Names(click.ParamType[str]):
+    """The type of an option with names separated by commas, of which shells complete the last.
 
     Parameters
     ----------
@@ -209,32 +210,23 @@ class Name(click.ParamType[str]):
         Kinds of names that the option takes, as ``oodd-eval list`` knows them.
     """
 
-    name = "name"
+    name = "names"
 
     def __init__(self, *kinds: str) -> None:
         self._kinds = kinds
 
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        """Return the names that begin like an incomplete one."""
-        del ctx, param
-        names = chain.from_iterable(map(_names, self._kinds))
-        return [CompletionItem(name) for name in names if name.startswith(incomplete)]
-
-
-class Names(Name):
-    """The type of an option with names separated by commas, of which shells complete the last."""
-
-    name = "names"
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
         """Return the list with each name that begins like its last one."""
+        del ctx, param
         before, comma, last = incomplete.rpartition(",")
-        items = super().shell_complete(ctx, param, last)
-        return [CompletionItem(before + comma + item.value) for item in items]
+        names = chain.from_iterable(map(_names, self._kinds))
+        return [CompletionItem(before + comma + name) for name in names if name.startswith(last)]
+
+
+class Name(Names):
+    """The type of an option with one name."""
+
+    name = "name"
 
 
 def _names(kind: str) -> Iterable[str]:

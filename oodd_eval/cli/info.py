@@ -30,15 +30,11 @@ def info(options: Options) -> int:
     else:
         plugins = discovered(options)
         custom = plugins.own_specs
-        if name in custom:
-            print(tabulate(_custom(*custom[name]), tablefmt="plain", disable_numparse=True))
-            return 0
         try:
-            offer = plugins.offer(name)
+            lines = _custom(*custom[name]) if name in custom else _detector(plugins.offer(name))
         except UnknownNameError:
             names = [*ENVIRONMENTS, *ANOMALIES, *custom, *plugins.offers]
             raise UnknownNameError("detector, environment or anomaly", name, names) from None
-        lines = _detector(offer)
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
 

@@ -80,16 +80,12 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
 
 
 @command("leaderboard submit oodd-results --id mine --title 'My detector'", repeated=["--primary"])
-@click.argument(
-    "directory", type=DIRECTORY, help="results directory, written by oodd-eval run or reproduce"
-)
+@click.argument("directory", type=DIRECTORY, help="results of oodd-eval run or reproduce")
 @click.option("--results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
 @click.option("--detector", "detectors", default="all", type=Names("detectors"), help=NAMES)
 @expression_option
 @click.option("--complete", is_flag=True, help="leave out seeds of a row that lack cells")
-@click.option(
-    "--id", metavar="ID", help="name of the entry's directory (default: detectors and split)"
-)
+@click.option("--id", help="name of the entry's directory (default: detectors and split)")
 @click.option("--title", help="one line, shown on the board")
 @click.option("--submitter", help="who stands behind the results")
 @click.option("--citation", help="how to cite the method")
@@ -98,13 +94,10 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
     "--primary",
     multiple=True,
     metavar="ROW...",
-    help="rows that are ranked for their detectors, such as 'riqn[updates=9000]' (default: of each "
-    "detector the one with default parameters and the shortest horizon)",
+    help="ranked rows, such as 'riqn[updates=9000]' (default: default parameters, least horizon)",
 )
 @click.option("--caption", help="a note above the tables, such as a reduced setting")
-@click.option(
-    "--scores", is_flag=True, help="include every score, so that others can recompute the metrics"
-)
+@click.option("--scores", is_flag=True, help="include every score, so that others can recompute")
 @_split_option
 @click.option(
     "--curves",

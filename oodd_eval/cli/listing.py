@@ -21,11 +21,7 @@ KINDS: Final = ("detectors", "envs", "anomalies", "splits", "metrics")
 
 
 @command("list detectors", "list metrics", plugins=True)
-@click.argument(
-    "kind",
-    metavar="|".join(KINDS),
-    shell_complete=lambda *arguments: [kind for kind in KINDS if kind.startswith(arguments[-1])],
-)
+@click.argument("kind", metavar="|".join(KINDS), shell_complete=click.Choice(KINDS).shell_complete)
 def list_names(options: Options) -> int:
     """List what there is, one line each, the name first.
 
