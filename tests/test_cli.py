@@ -355,26 +355,6 @@ def test_verify_tells_sound_data_from_changed_data(run, tiny_split, tmp_path):
     assert "does not match the manifest" in err
 
 
-@pytest.mark.parametrize("name", ["tiny", "here", "./here"])
-def test_every_command_finds_the_same_splits(run, tiny_split, name):
-    shutil.copytree(tiny_split, "here")
-    code, out, _ = run("data", "info", name)
-    assert code == 0
-    assert "tiny" in out
-    assert run(*CLOCK, "--split", name, "--collect-only", "-q") == (0, "8 cells in 1 fits\n", "")
-
-
-def test_a_damaged_split_is_named_by_the_list(run, tiny_split, monkeypatch, tmp_path):
-    shutil.copytree(tiny_split, tmp_path / "splits" / "tiny")
-    monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "splits"))
-    manifest = tmp_path / "splits" / "tiny" / "manifest.json"
-    plain = json.loads(manifest.read_text())
-    manifest.write_text(json.dumps(plain | {"digest": "0" * 64}))
-    code, _, err = run("list", "splits")
-    assert code == 4
-    assert str(manifest.parent) in err
-
-
 @pytest.mark.parametrize(
     ("missing", "arguments", "extra"),
     [

@@ -69,12 +69,6 @@ def test_a_directory_in_use_is_left_alone(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_project(Project("slow"), tmp_path / "file" / "below")
-
-
 def test_nothing_is_left_to_fill_in():
     for path, text in Project("slow-drift").render().items():
         assert not re.search("@[A-Z]+@|TODO|FIXME|<<|>>|{{", path + text), path

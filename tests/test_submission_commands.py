@@ -117,22 +117,6 @@ def test_an_id_is_a_plain_name(submissions, tmp_path, name, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_nobody_claims_a_level_of_trust(submissions, tmp_path, capsys):
-    assert submit(submissions, tmp_path, "--trust", "re-scored") == 4
-    assert "--trust" in capsys.readouterr().err
-
-
-def test_limited_results_are_no_entry(submissions, tmp_path, capsys):
-    from oodd_eval.api import evaluate
-
-    evaluate("clock", submissions.split, anomalies="iid", limit=2, output=tmp_path / "out")
-    code = cli.main(
-        ["leaderboard", "submit", str(tmp_path / "out"), "--results", str(tmp_path / "entries")]
-    )  # fmt: skip
-    assert code == 4
-    assert "used --limit 2" in capsys.readouterr().err
-
-
 def test_missing_anomalies_are_said_before_anything_is_written(submissions, tmp_path, capsys):
     from oodd_eval.api import evaluate
 
@@ -207,17 +191,6 @@ def test_a_detectors_name_belongs_to_one_distribution(submissions, tmp_path, cap
     second.write()
     assert verify(submissions, tmp_path) == 1
     assert "a name stands for one detector" in capsys.readouterr().out
-
-
-def test_few_problems_are_printed_unless_all_are_wanted(submissions, tmp_path, capsys):
-    draft = Draft(submissions.plain, tmp_path)
-    for record in draft.records:
-        record["metrics"]["auc"].update(low=0.123, high=0.124, n=1)
-    draft.write()
-    assert verify(submissions, draft.path) == 1
-    assert "  and " in capsys.readouterr().out
-    assert verify(submissions, draft.path, "-v") == 1
-    assert "  and " not in capsys.readouterr().out
 
 
 def test_verifying_imports_no_plugin(submissions, tmp_path, monkeypatch):

@@ -182,14 +182,6 @@ def test_a_hang_is_ended_by_the_limit(check):
     assert "the process was not done after 4 s (--timeout)" in " ".join(out.split())
 
 
-def test_a_crash_in_fit_is_told_once(check):
-    code, out, _ = check("crashes")
-    assert code == 1
-    assert [n for n, s in statuses(out).items() if s == "FAILED"] == ["fits"]
-    assert "killed by SIGSEGV" in out
-    assert "not tried: check 'fits' ended its process" in out
-
-
 def test_after_three_dead_processes_the_rest_are_not_tried(check):
     code, out, _ = check("exitsoften")
     assert code == 1
