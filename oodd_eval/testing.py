@@ -37,7 +37,13 @@ __all__ = [
 
 
 class NonConformingError(ContractError, AssertionError):
-    """A detector failed checks; the message has a line for each, `report` has all results."""
+    """A detector failed checks; the message has a line for each of them.
+
+    Parameters
+    ----------
+    report
+        The results of all checks.
+    """
 
     def __init__(self, report: Report) -> None:
         lines = [result.line() for result in report.failed]
@@ -46,12 +52,18 @@ class NonConformingError(ContractError, AssertionError):
 
 
 def detector_checks() -> list[Check]:
-    """Return all checks, for ``pytest.mark.parametrize``; each is called with a factory."""
+    """Return all checks, for ``pytest.mark.parametrize``.
+
+    Returns
+    -------
+    list of Check
+        In the order in which they run; each is called with a factory.
+    """
     return list(CHECKS.values())
 
 
 def test_contract(check: Check, detector: Factory | Trial) -> None:
-    """Carry out one check on what the fixture `detector` gives."""
+    """Run one check on the factory that the fixture `detector` returns."""
     check(detector)
 
 
@@ -74,6 +86,16 @@ def run_checks(
         Names of checks that are known to fail, with the reason; one that passes is not all right.
     arguments
         ``horizon`` (1), ``seed`` (0) and ``parameters`` that the factory is called with.
+
+    Returns
+    -------
+    Report
+        The result of every check, in the order of `detector_checks`.
+
+    Raises
+    ------
+    UnknownNameError
+        When there is no check of a name among the expected failures.
     """
     check_known("check", CHECKS, *(expected_failures or {}))
     results = carry_out(Trial(factory, **arguments), CHECKS)
@@ -89,6 +111,11 @@ def check_detector(
     ----------
     factory, expected_failures, arguments
         As in `run_checks`.
+
+    Returns
+    -------
+    Report
+        The result of every check, as in `run_checks`.
 
     Raises
     ------

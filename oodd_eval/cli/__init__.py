@@ -230,6 +230,7 @@ class Name(Names):
 
 
 def _names(kind: str) -> Iterable[str]:
+    """Return the names of a kind, of plug-ins too."""
     if kind == "metrics":
         return [*load("oodd_eval.metrics.catalogue:NAMES")]
     # Forms such as (pyod:NAME) are listed, too.
@@ -257,7 +258,7 @@ _PLUGIN_OPTION: Final = (
         ["-p", "disabled"],
         multiple=True,
         metavar="no:NAME",
-        type=Converted(_left_out, "no:NAME"),
+        type=Converted(_left_out, "NAME"),
         help="leave a plug-in out (see also OODD_EVAL_PLUGINS)",
     ),
 )
@@ -293,7 +294,10 @@ expression_option: Final = click.option(
 
 detector_options: Final = together(
     click.option(
-        "--param", multiple=True, type=PARAMETER, help="of the detector; V is JSON or text"
+        "--param",
+        multiple=True,
+        type=PARAMETER,
+        help="a parameter of the detector; V is JSON or text",
     ),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
 )
