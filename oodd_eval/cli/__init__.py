@@ -293,12 +293,7 @@ expression_option: Final = click.option(
 )
 
 detector_options: Final = together(
-    click.option(
-        "--param",
-        multiple=True,
-        type=PARAMETER,
-        help="a parameter of the detector; V is JSON or text",
-    ),
+    click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text"),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
 )
 
