@@ -288,7 +288,7 @@ def test_a_split_that_is_not_here_comes_with_the_command_that_builds_it(
         (["--tier", "mimi"], "did you mean 'mini'"),
         (["--tier", "mini", "--only", "table-6"], "unknown table or figure 'table-6'"),
         (["--tier", "mini", "--budget", "soon"], "a time such as"),
-        (["--tier", "mini", "--jobs", "0"], "--jobs is '0'"),
+        (["--tier", "mini", "--jobs", "0"], "'--jobs'"),
         (["--tier", "mini", "--device", "tpu"], "'--device'"),
         (["--tier", "mini", "--records", "x"], "--records is what --render-only reads"),
         (["--render-only"], "no reproduction in"),
