@@ -17,7 +17,6 @@ from oodd_eval.metrics.catalogue import (
     RANKING,
     UNDEFINED,
     metric_info,
-    split_name,
 )
 
 
@@ -50,9 +49,7 @@ def test_the_suffix_of_a_level_is_understood():
     assert info.summary.endswith("in at most 10 % of nominal episodes")
     assert metric_info("threshold_at_1pct").title == "Threshold at 1 %"
     for name in NAMES:
-        base, suffix = split_name(name)
-        assert name == (f"{base}_{suffix}" if suffix else base)
-        assert bool(suffix) == bool(metric_info(name).level)
+        assert bool(metric_info(name).level) == ("_at_" in name)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +84,7 @@ def test_kinds_of_intervals():
     kinds = {name: metric_info(name).interval for name in NAMES}
     assert {n for n in NAMES if kinds[n] == "exact"} == {f"false_episodes_{s}" for s in LEVELS}
     assert {n for n in NAMES if not kinds[n]} == {f"threshold_{s}" for s in LEVELS}
-    assert {split_name(n)[0] for n in NAMES if kinds[n] == "mean"} == {
+    assert {n.partition("_at_")[0] for n in NAMES if kinds[n] == "mean"} == {
         "delay", "delay_null", "delay_censored", "delay_censored_null", "onset_error",
     }  # fmt: skip
 
@@ -114,6 +111,6 @@ def test_the_documented_metrics_are_those_of_the_catalogue():
         *(n for n in METRICS if n.startswith("auc")),
         *own,
         "threshold",
-        *(split_name(name)[0] for name in ATTRIBUTION),
+        *(name.partition("_at_")[0] for name in ATTRIBUTION),
         *(n for n in METRICS if not n.startswith("auc")),
     ]

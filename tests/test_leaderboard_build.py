@@ -19,8 +19,7 @@ from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import cells, page
-from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
-from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics import catalogue

@@ -20,8 +20,14 @@ from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.site import gridded, packed
-from oodd_eval.leaderboard.site.data import WITH_INTERVALS, part_name, selections, site_data
-from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
+from oodd_eval.leaderboard.site.data import (
+    WITH_INTERVALS,
+    part_name,
+    selections,
+    shipped_split,
+    shown_episodes,
+    site_data,
+)
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.results.curve_file import read_curves
 

@@ -15,13 +15,11 @@ from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale, started, suite_parts
 from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.changes import changes_against
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.grants import GRANTS
-from oodd_eval.leaderboard.rerun import read_order
+from oodd_eval.leaderboard.entry import GRANTS, read_entries
+from oodd_eval.leaderboard.verify import EntryVerdict, changes_against, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
-from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
+from oodd_eval.leaderboard.verify.rerun import read_order
 from oodd_eval.results.directory import ResultsDirectory
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
@@ -134,7 +132,7 @@ def submit(options: argparse.Namespace) -> int:
     chosen = ("detectors", "cells", "complete", "scores", "curves", "split")
     how = {name: getattr(options, name) for name in chosen}
     made = submission.submit(options.directory, options.results, statement, **how)
-    console, place = make_console(), made.place
+    console, place = make_console(), made.path
     for line in made.left_out if options.verbosity >= 0 else ():
         console.print(f"left out: {line}")
     report(console, made.verdict, options.verbosity)

@@ -57,8 +57,8 @@ def place(
     same = {row for row, own in by_row.items() if row in theirs and _within(own, theirs[row])}
     new = {row: own for row, own in by_row.items() if row not in same}
     replaced = new.keys() & theirs.keys()
-    expected = {r.place for r in board.records}
-    has = [{r.place for r in own if r.ok} & expected for own in new.values()]
+    expected = {r.position for r in board.records}
+    has = [{r.position for r in own if r.ok} & expected for own in new.values()]
     cells = set.intersection(*has) if has and expected not in has else expected
     if not cells:
         raise UsageError(
@@ -72,7 +72,7 @@ def place(
     chosen |= {row.detector: row for row in new if str(row) in primary and row.detector in chosen}
     # With too few seeds a primary row has no rank. A variant has the one that it would have.
     first = first | {row for row in chosen.values() if not has_few_seeds(new[row])}
-    used = [r for own in (theirs | new).values() for r in own if r.place in cells]
+    used = [r for own in (theirs | new).values() for r in own if r.position in cells]
     found = {row: _lacking(own, expected) for row, own in new.items()}
     return Placement(
         ranks=ranked(used, first, board.rerun and board.rerun | new.keys()),
@@ -87,8 +87,8 @@ def place(
 
 def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:
     """Tell whether all numbers of a row are among those of another."""
-    known = {(r.place, r.seed, r.status): r.per_trajectory for r in others}
-    keys = [(r.place, r.seed, r.status) for r in own]
+    known = {(r.position, r.seed, r.status): r.per_trajectory for r in others}
+    keys = [(r.position, r.seed, r.status) for r in own]
     return all(
         key in known and same_terms(known[key], r.per_trajectory)
         for key, r in zip(keys, own, strict=True)
@@ -101,7 +101,9 @@ def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
     sizes = grouped(expected, lambda cell: cell[0])
     parts = []
     for seed, own in sorted(found.items()):
-        missing = grouped(sorted(expected - {r.place for r in own if r.ok}), lambda cell: cell[0])
+        missing = grouped(
+            sorted(expected - {r.position for r in own if r.ok}), lambda cell: cell[0]
+        )
         named = [
             e if len(cells) == len(sizes[e]) else ", ".join(map("/".join, cells))
             for e, cells in missing.items()

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard.entry import SubmittedEntry, row_of
-from oodd_eval.leaderboard.grants import Trust
+from oodd_eval.leaderboard.entry import SubmittedEntry, Trust, row_of
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -49,7 +48,7 @@ class LeaderboardSection:
         return f"{TABLES}/{self.name}-{kind}.csv"
 
     @property
-    def place(self) -> tuple[int, str, int, int, str]:
+    def sort_key(self) -> tuple[int, str, int, int, str]:
         """Order of the boards, see `sections`."""
         board = self.ranks.board
         name = board.split.partition("@")[0]
@@ -107,7 +106,7 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
         ranks = ranked(board.records, _primary(board.records, sources, rerun), rerun)
         own = {entry.meta.id: entry for entry in sources.values()}
         found.append(LeaderboardSection(ranks, [own[name] for name in sorted(own)], sources))
-    return sorted(found, key=lambda section: section.place)
+    return sorted(found, key=lambda section: section.sort_key)
 
 
 def _primary(
@@ -121,7 +120,7 @@ def _primary(
     found = {row.detector: row for row in primary_settings(records, rerun)}
     cells: dict[Setting, set[tuple[str, str]]] = {}
     for r in records:
-        cells.setdefault(r.setting, set()).add(r.place)
+        cells.setdefault(r.setting, set()).add(r.position)
     declared: dict[str, Setting] = {}
     for row, entry in sources.items():
         if str(row) not in entry.meta.primary:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, LEVELS
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
 from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
 Floats = NDArray[np.float64]
@@ -195,15 +195,15 @@ def guaranteed_contributions(
         Made by `GuaranteedAlarm.fit`.
     """
     loud, quiet = ([rule.first(scores) for scores in part] for part in (anomalous, twins))
-    found = {"false_episodes": mean_of([float(first is not None) for first in quiet])}
+    alarms = [float(first is not None) for first in quiet]
+    contributions = {"false_episodes": mean_of(alarms)}
     lengths = [[len(scores) for scores in part] for part in (anomalous, twins)]
     ends = list(map(min, *lengths))
-    own = _from_effect(loud, lengths[0], ends, effects)
     nulls = _from_effect(quiet, lengths[1], ends, effects)
-    for name, contribution in own.items():
-        found[name] = contribution
-        found[f"{name}_null"] = nulls[name]
-    return found
+    for name, contribution in _from_effect(loud, lengths[0], ends, effects).items():
+        contributions[name] = contribution
+        contributions[f"{name}_null"] = nulls[name]
+    return {name: contributions[name] for name in GUARANTEED}
 
 
 def _from_effect(
@@ -228,12 +228,12 @@ def _from_effect(
         delays.append(delay if defined else nothing)
         missed.append(float(first is None) if defined else nothing)
         censored.append((remainder if first is None else delay) if defined else nothing)
-        for k, found in within.items():
+        for k, shares in within.items():
             seen = first is not None and first < end and delay < k
-            found.append(float(seen) if defined and effect < end else nothing)
+            shares.append(float(seen) if defined and effect < end else nothing)
     values = {"early": early, "delay": delays, "missed": missed, "delay_censored": censored}
-    values |= {f"found_within_{k}": found for k, found in within.items()}
-    return {name: mean_of(own) for name, own in values.items()}
+    values |= {f"found_within_{k}": shares for k, shares in within.items()}
+    return {name: mean_of(terms) for name, terms in values.items()}
 
 
 def attribution_contributions(

@@ -117,7 +117,7 @@ def compare(
         seeds = grouped((r for r in records if r.setting == setting), lambda r: r.seed)
         rows[str(setting)] = {
             seed: {
-                r.place: _signed(contribution(r, metric), sign)
+                r.position: _signed(contribution(r, metric), sign)
                 for r in own
                 if r.ok and metric in r.per_trajectory
             }

@@ -164,7 +164,7 @@ class Record:
         return join_condition(self.anomaly, self.strength)
 
     @property
-    def place(self) -> tuple[str, str]:
+    def position(self) -> tuple[str, str]:
         """Environment and condition: the column of a board that the record belongs to."""
         return self.environment, self.condition
 

@@ -9,14 +9,18 @@ sorts and draws.
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Quantity, paper_tables
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
-from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, RANKING, metric_info
@@ -59,6 +63,9 @@ ENTRY_FIELDS: Final = ("id", "title", "submitter", "created", "citation", "url",
 RANKING_PLACE: Final = WITH_INTERVALS.index(RANKING)
 
 _ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
+
+SHOWN: Final = 3  # sensors of an episode: those that leave their twin's course most
+STEPS: Final = 250  # steps between the least and the largest value: one a pixel
 
 Json = dict[str, Any]
 Units = Mapping[str, list[Json]]  # curves of single cells by the id of their entry
@@ -425,3 +432,45 @@ def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
         for others, named in anomalies.items()
     }
     return {key: chosen for key, chosen in found.items() if chosen}
+
+
+def shipped_split(digest: str) -> Split | None:
+    """Return the split with a digest if it comes with the package.
+
+    The site shows no sensors of other splits, so that its files do not depend on which splits a
+    machine has; entries hold scores, not observations.
+    """
+    splits = (Split(path.parent) for path in SHIPPED.glob("*/manifest.json"))
+    return next((split for split in splits if split.digest == digest), None)
+
+
+def shown_episodes(split: Split, environment: str, episodes: Iterable[tuple[str, int]]) -> Json:
+    """Return the sensors of test episodes by ``anomaly/index``.
+
+    Each sensor has its name with unit, a step, and in whole numbers of steps what the episode and
+    its nominal twin read from row 0 on.
+    """
+    data = split.environment(environment)
+    return {f"{a}/{i}": _sensors(data, a, i) for a, i in sorted(set(episodes))}
+
+
+def _sensors(data: EnvironmentData, anomaly: str, index: int) -> list[Json]:
+    episode, twin = data.anomalous(anomaly)[index].observations, data.twins[index].observations
+    both = min(len(episode), len(twin))
+    spread = np.maximum(twin.std(axis=0), 1e-6)
+    apart = np.abs(episode[:both] - twin[:both]).mean(axis=0) / spread
+    return [
+        _sensor(_title(data.sensors[d]), episode[:, d], twin[:, d])
+        for d in np.argsort(-apart, kind="stable")[:SHOWN]
+    ]
+
+
+def _title(sensor: Quantity) -> str:
+    return sensor.name if sensor.unit == "1" else f"{sensor.name} ({sensor.unit})"
+
+
+def _sensor(name: str, episode: NDArray[Any], twin: NDArray[Any]) -> Json:
+    values = np.concatenate([episode, twin]).astype(np.float64)
+    step = float(f"{max(np.ptp(values) / STEPS, 1e-9):.2g}")
+    whole = np.round(values / step).astype(int).tolist()
+    return {"name": name, "step": step, "own": whole[: len(episode)], "twin": whole[len(episode) :]}

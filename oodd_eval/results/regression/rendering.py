@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.results.regression import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.tables.board import grouped
 from oodd_eval.results.tables.layout import Table
@@ -130,7 +130,7 @@ def _number(value: float, metric: str) -> str:
     """Return a figure with as many digits as a tolerance may need."""
     if math.isnan(value):
         return UNDEFINED
-    return f"{value:.2f}" if metric.startswith("delay") else f"{value:.4f}"
+    return f"{value:.2f}" if metric_info(metric).unit == "steps" else f"{value:.4f}"
 
 
 def _rich(table: Table, colours: Sequence[str], console: Console) -> RichTable:

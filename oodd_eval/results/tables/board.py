@@ -287,7 +287,7 @@ def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ())
     by_row = grouped(records, lambda r: r.setting)
 
     def order(row: Setting) -> tuple[Any, ...]:
-        cells, few = {r.place for r in by_row[row]}, has_few_seeds(by_row[row])
+        cells, few = {r.position for r in by_row[row]}, has_few_seeds(by_row[row])
         return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
 
     found: dict[str, Setting] = {}
@@ -308,7 +308,7 @@ def ranked(
     these and push nobody down. `ResultsError`: ranked rows differ in their numbers of test
     trajectories, or two rows have one name.
     """
-    own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.place))
+    own = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.position))
     by_row = grouped(own, lambda r: r.setting)
     labels = Counter(map(str, by_row))
     if twice := [label for label, n in labels.items() if n > 1]:
@@ -317,7 +317,7 @@ def ranked(
             "tell rows apart: give one of the detectors another name"
         )
     first = primary_settings(records) if primary is None else set(primary)
-    cells = {r.place for r in records}
+    cells = {r.position for r in records}
     states = {e: _state(own, len(cells), RANKING, e in first) for e, own in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
     ranking, rows = _ranking(by_row, states, first - below, RANKING)
@@ -377,7 +377,7 @@ def _ranking(
             own = contribution(r, metric)
             if metric_info(metric).better == "lower":
                 own = Contribution(-own.numerator, own.denominator)
-            row.setdefault(r.seed, {})[r.place] = own
+            row.setdefault(r.seed, {})[r.position] = own
     return rank(rows, {str(entry) for entry in primary}), rows
 
 

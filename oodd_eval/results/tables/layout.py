@@ -143,7 +143,7 @@ def guaranteed(
     names = _present(board, (f"{name}_{suffix}" for name in bases))
     if not names:
         return None
-    with_ends = [n for n in names if intervals or n.startswith("false_episodes")]
+    with_ends = [n for n in names if intervals or metric_info(n).interval == "exact"]
     columns = _overall(board, names, with_ends, level=False)
     level = f"{100 * catalogue.LEVELS[suffix]:g} %"
     title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
