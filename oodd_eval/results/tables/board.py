@@ -20,7 +20,7 @@ from oodd_eval.metrics.bootstrap import (
     nan_mean,
 )
 from oodd_eval.metrics.catalogue import ALARM_RANKING, NAMES, RANKING, metric_info
-from oodd_eval.metrics.ranking import Place, Ranking, rank, win_rates
+from oodd_eval.metrics.ranking import Position, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 
@@ -176,7 +176,7 @@ class Board:
         one, two = (mean_over_cells(v for place in both for v in side[place]) for side in own)
         return one, two, len(both)
 
-    def _defined(self, entry: Setting, metric: str) -> dict[Place, list[tuple[int, float]]]:
+    def _defined(self, entry: Setting, metric: str) -> dict[Position, list[tuple[int, float]]]:
         """Return detector seeds and values of the cells in which a row has a mean."""
         found = {}
         for e, a in itertools.product(self.environments, self.anomalies):
@@ -360,7 +360,7 @@ def ranked(
     return RankedBoard(board, standings, ranking, alarms, rates)
 
 
-_Rows = dict[str, dict[int, dict[Place, Contribution]]]
+_Rows = dict[str, dict[int, dict[Position, Contribution]]]
 
 
 def _ranking(
