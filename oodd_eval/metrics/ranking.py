@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
@@ -226,8 +227,10 @@ class _PairBootstrap:
         with np.errstate(divide="ignore", invalid="ignore"):
             observed = differences / np.sqrt(self._observed_variances(row, columns, effects))
         observed = np.where(np.abs(differences) > NOISE, observed, 0.0)
+        # These products are small: threads of a matrix library would wait for one another.
+        with threadpool_limits(1, user_api="blas"):
+            studentized = self._studentized(row, columns, effects)
         signs, sizes = np.sign(observed)[:, None], np.abs(observed)[:, None]
-        studentized = np.where(signs == 0, 0.0, self._studentized(row, columns, effects))
         studentized = np.where(signs < 0, -studentized, studentized)
         # A resample at the observed difference is beyond it for both sides.
         beyond = np.count_nonzero(studentized >= sizes * (1 - _ROUNDING), axis=1)
@@ -235,8 +238,8 @@ class _PairBootstrap:
         counts = np.where(observed == 0, self.resamples, [beyond, within])
         p = (1 + counts) / (self.resamples + 1)
         if self.extended:
-            for i in np.flatnonzero(counts[0] < ENOUGH):
-                p[0, i] = self._extended(studentized[i], abs(observed[i]))
+            for rare in np.flatnonzero(counts[0] < ENOUGH):
+                p[0, rare] = self._extended(studentized[rare], abs(observed[rare]))
         # No p-value is below the chance that all seeds have the signs that they have.
         p = np.maximum(p, 2.0 ** -len(self._n))
         tests = []
