@@ -13,7 +13,7 @@ from oodd_eval.cli import EXPRESSION, NAMES, Parser, board, rerun, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.build import STALE, differences, stale, started, suite_parts
+from oodd_eval.leaderboard.build import STALE, differences, stale, suite_parts
 from oodd_eval.leaderboard.build import build as build_board
 from oodd_eval.leaderboard.entry import GRANTS, read_entries
 from oodd_eval.leaderboard.verify import EntryVerdict, changes_against, grant
@@ -92,13 +92,12 @@ def build(options: argparse.Namespace) -> int:
     """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
     output = Path(options.output)
     with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
-        suites = started(lambda: suite_parts(output))
         show("entries")
         entries = read_entries(options.results)
         if not entries:
             return say(f"no entries in {options.results}", 5)
         target = Path(fresh) if options.check else output
-        written = build_board(entries, target, suites, on_part=show)
+        written = build_board(entries, target, lambda: suite_parts(output), on_part=show)
         lines = differences(target, output) if options.check else []
     if not options.check:
         if options.verbosity >= 0:

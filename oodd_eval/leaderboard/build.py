@@ -1,16 +1,13 @@
 """The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
 import contextlib
-import multiprocessing
-import os
 import re
-import sys
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import GROUPS, SPLITS
@@ -36,8 +33,6 @@ from oodd_eval.results.tables.board import Board, primary_settings
 from oodd_eval.results.tables.layout import Table
 from oodd_eval.results.tables.rendering import escape
 from oodd_eval.results.tables.rendering import markdown as table
-
-Made = TypeVar("Made")
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -106,7 +101,6 @@ def build(
     found = sections(entries)
     on_part("suites")
     further = suites()
-    beside = started(lambda: site.files(found, further.power, project=repository()))
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files: dict[str, str | bytes] = {PAGE: page(found, further.page, site=address)}
@@ -118,7 +112,8 @@ def build(
     files[PUBLISHED] = published_bytes(found, further.published)
     files[CELLS] = cells(found, further.cells)
     on_part("site")
-    files |= {f"{SITE}/{name}": content for name, content in beside().items()}
+    parts = site.files(found, further.power, project=repository())
+    files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
             write_text(output / name, content)
@@ -127,37 +122,6 @@ def build(
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
-
-
-def started(function: Callable[[], Made]) -> Callable[[], Made]:
-    """Run a function in a forked process; return a function that waits for its result.
-
-    Where no process can be forked, or the function fails there, waiting calls it in this process,
-    which raises its error.
-    """
-    if sys.platform != "linux":
-        return function
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-
-    def work() -> None:
-        with contextlib.suppress(BaseException):
-            sender.send(function())
-        os._exit(0)  # what this process has begun is not to be finished twice
-
-    process = context.Process(target=work, daemon=True)
-    process.start()
-    sender.close()
-
-    def wait() -> Made:
-        try:
-            made: Made = receiver.recv()
-        except EOFError:
-            made = function()
-        process.join()
-        return made
-
-    return wait
 
 
 def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:

@@ -65,7 +65,7 @@ class Published(NamedTuple):
     @property
     def suites(self) -> dict[str, Board]:
         """The boards of further suites with several strengths, by name; reading them takes long."""
-        records = read_records(self.file, wanted=lambda line: _OF_SUITE in line)
+        records = read_records(self.file, matches=lambda line: _OF_SUITE in line)
         by_suite = grouped(records, lambda r: str(r.provenance["suite"]))
         return {name: Board(own) for name, own in by_suite.items()}
 
@@ -121,7 +121,7 @@ def read_published(file: Path | None = None) -> Published:
     """Read the boards of the file, by default the one of this installation."""
     file = file or published_file()
     found = []
-    for board in boards(read_records(file, wanted=lambda line: _OF_SUITE not in line)):
+    for board in boards(read_records(file, matches=lambda line: _OF_SUITE not in line)):
         origin = {r.setting: r.provenance for r in board.records}
         entries, trust = ({row: own[k] for row, own in origin.items()} for k in ("entry", "trust"))
         primary = {row for row, own in origin.items() if own["primary"]}

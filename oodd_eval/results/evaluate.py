@@ -14,7 +14,7 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
-from oodd_eval.metrics.bootstrap import bounds, cell_samples, drawn_cell, mean_interval
+from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, IntervalKind, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
@@ -82,10 +82,8 @@ def _interval(
     kind: IntervalKind, environment: str, median: bool, numerator: bytes, denominator: bytes
 ) -> tuple[float, float]:
     """Return the interval of a metric. Many metrics of a detector have the same terms."""
-    own = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
-    if own.n and (kind == "mean" or (kind == "share" and own.value not in (0.0, 1.0))):
-        return bounds(cell_samples(environment, own), own.value, [own.n])  # the same, sooner
-    return mean_interval([drawn_cell(environment, 0, own)], kind=kind)
+    terms = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
+    return mean_interval([drawn_cell(environment, 0, terms)], kind=kind)
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
@@ -131,10 +129,10 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
             units.setdefault((record.environment, record.scores), []).append(record)
     fresh: dict[tuple[str, ...], Record] = {}
     with split.opened() as environment:
-        for (name, _), own in units.items():
+        for (name, _), unit in units.items():
             data = environment(name)
-            found = evaluated(own, stored_scores(own, results, data), data)
-            fresh |= {record.identity: record for record in found}
+            again = evaluated(unit, stored_scores(unit, results, data), data)
+            fresh |= {record.identity: record for record in again}
     return [fresh.get(record.identity, record) for record in records]
 
 

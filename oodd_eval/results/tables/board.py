@@ -1,5 +1,6 @@
 """Records arranged for comparison: rows of detectors with means over cells, and their rankings."""
 
+import functools
 import itertools
 import math
 from collections import Counter
@@ -12,13 +13,7 @@ import numpy as np
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import (
-    DrawnCells,
-    drawn_cells,
-    mean_interval,
-    mean_over_cells,
-    nan_mean,
-)
+from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import ALARM_RANKING, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position, Ranking, rank, win_rates
 from oodd_eval.results.identity import Setting
@@ -61,9 +56,7 @@ class _RowCells:
         for n in {len(terms[0]) for _, _, terms in stored}:
             names, seeds, own = zip(*(one for one in stored if len(one[2][0]) == n), strict=True)
             both = np.array(own)
-            drawn = drawn_cells(
-                environment, seeds, both[:, 0], both[:, 1], median=_is_median(metric)
-            )
+            drawn = DrawnCells(environment, seeds, both[:, 0], both[:, 1], _is_median(metric))
             self._drawn.append((drawn, names))
             self._values += zip(names, seeds, drawn.values, strict=True)
 
@@ -89,6 +82,7 @@ class Board:
         self.protocol, self.limit = first.protocol, first.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         self._made: dict[tuple[object, ...], Any] = {}
+        self._row_cells = functools.lru_cache(maxsize=256)(self._uncached_row_cells)
         self._places = {(e, a) for _, e, a in self._cells}
         self._plugins: dict[Setting, str] = {}
         for (setting, _, _), own in self._cells.items():
@@ -150,7 +144,7 @@ class Board:
         blank = self._once(self._without_value, entry, environments, anomalies)
         if blank.state:
             return blank
-        own = [self._once(self._row_cells, entry, e, metric) for e in environments]
+        own = [self._row_cells(entry, e, metric) for e in environments]
         value = mean_over_cells(pair for one in own for pair in one.values(anomalies))
         ends = NAN, NAN
         if intervals and (drawn := [c for one in own for c in one.drawn(anomalies)]):
@@ -181,12 +175,12 @@ class Board:
         found = {}
         for e, a in itertools.product(self.environments, self.anomalies):
             if all(r.ok for r in self._cells.get((entry, e, a), ())):
-                values = self._once(self._row_cells, entry, e, metric).values([a])
+                values = self._row_cells(entry, e, metric).values([a])
                 if not math.isnan(mean_over_cells(values)):
                     found[e, a] = values
         return found
 
-    def _row_cells(self, entry: Setting, environment: str, metric: str) -> _RowCells:
+    def _uncached_row_cells(self, entry: Setting, environment: str, metric: str) -> _RowCells:
         """Return a row's metric in the cells of an environment."""
         found = ((a, self._cells.get((entry, environment, a), ())) for a in self.anomalies)
         return _RowCells([(a, r) for a, own in found for r in own], environment, metric)
