@@ -21,9 +21,8 @@ from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
-from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, RANKING, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve
@@ -158,10 +157,9 @@ def _metric(name: str) -> Json:
 
 def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) -> Json:
     ranks, board = section.ranks, section.ranks.board
-    found = {name for r in board.records for name in r.metrics}
-    # The plain ones stand there even where every cell of the board has failed.
-    by_level = [f"{m}_{suffix}" for suffix in LEVELS for m in (*GUARANTEED, "threshold")]
-    names = [*METRICS, *(name for name in (*by_level, *catalogue.ATTRIBUTION) if name in found)]
+    present = {name for r in board.records for name in r.metrics}
+    # Where every cell has failed, the page still shows the metrics without a level.
+    names = [name for name in NAMES if name in present] or [*METRICS]
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
     chosen = selections(cells)

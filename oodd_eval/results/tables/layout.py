@@ -216,7 +216,8 @@ def anomaly_groups(
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric without a level, mean over all cells, with nulls and the placebo."""
-    columns = _overall(board, catalogue.METRICS, catalogue.METRICS if intervals else ())
+    names = _present(board, catalogue.METRICS) or [*catalogue.METRICS]
+    columns = _overall(board, names, names if intervals else ())
     return _by_metric(board, "All metrics, mean over cells", columns)
 
 
