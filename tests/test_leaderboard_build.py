@@ -6,7 +6,6 @@ import gzip
 import io
 import os
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -142,19 +141,6 @@ def test_the_site_links_to_the_projects_address(tmp_path, monkeypatch):
     monkeypatch.setattr(leaderboard_build.site, "files", lambda *_, project: {"project": project})
     leaderboard_build.build(entries()[:1], tmp_path)
     assert (tmp_path / "site" / "project").read_text() == "https://example.org/oodd-eval"
-
-
-def test_what_fails_in_a_process_of_its_own_fails_here(capfd):
-    here = os.getpid()
-
-    def fails():
-        raise ResultsError(f"in another process: {os.getpid() != here}")
-
-    assert (leaderboard_build.started(os.getpid)() != here) == (sys.platform == "linux")
-    wait = leaderboard_build.started(fails)
-    with pytest.raises(ResultsError, match="in another process: False"):
-        wait()
-    assert capfd.readouterr() == ("", "")
 
 
 def lines_of(text):
