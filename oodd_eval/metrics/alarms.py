@@ -72,6 +72,11 @@ class GuaranteedAlarm:
             score itself, for a detector that accumulates by itself; the threshold is from all.
         confidence
             See `quantile_rank`.
+
+        Returns
+        -------
+        GuaranteedAlarm
+            Its threshold is infinite where there are too few episodes for the level.
         """
         return cls.fits(calibration, [level], kind, confidence)[0]
 
@@ -159,6 +164,11 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     kind
         The statistic: with the CUSUM half of them standardize the scores.
 
+    Returns
+    -------
+    dict
+        Share of nominal episodes with an alarm by suffix, the largest first.
+
     Examples
     --------
     >>> list(offered_levels(40, "cusum")), list(offered_levels(40, "score"))
@@ -193,6 +203,11 @@ def guaranteed_contributions(
         The first row of each anomalous trajectory that differs from its twin.
     rule
         Made by `GuaranteedAlarm.fit`.
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
     """
     loud, quiet = ([rule.first(scores) for scores in part] for part in (anomalous, twins))
     alarms = [float(first is not None) for first in quiet]
@@ -261,6 +276,11 @@ def attribution_contributions(
         The first row of each trajectory that differs from its twin.
     rule
         Made by `GuaranteedAlarm.fit`.
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
     """
     named, errors = np.full((2, len(anomalous)), np.nan)
     for i, (scores, effect) in enumerate(zip(anomalous, effects, strict=True)):

@@ -47,8 +47,14 @@ Row = Mapping[int, Mapping[Position, Contribution]]  # by detector seed and cell
 class PairTest:
     """The test of one ordered pair of rows: whether the first is better than the second.
 
-    The difference is that of their means over all cells, with its paired 95 % interval; `p` is the
-    one-sided p-value of "not better", and `p_holm` the same after Holm's correction.
+    Attributes
+    ----------
+    first, second
+        Names of the rows.
+    difference, low, high
+        Of the first's mean over all cells to the second's, with its paired 95 % interval.
+    p, p_holm
+        One-sided p-value of "not better", and the same after Holm's correction.
     """
 
     first: str

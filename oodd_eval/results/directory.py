@@ -337,9 +337,14 @@ def read_records(
     file
         Lines of JSON, compressed or not.
     notes
-        Where given, a last line that was cut short is left out, which is told there.
+        With a list, a last line that was cut short is left out, and a note on it is added.
     matches
         Predicate of the lines to read.
+
+    Returns
+    -------
+    list of Record
+        In the order of the file.
 
     Raises
     ------

@@ -45,7 +45,15 @@ Terms = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A value with its 95 % interval over n trajectories; NaN where undefined."""
+    """A metric of one cell.
+
+    Attributes
+    ----------
+    value, low, high
+        The value with its 95 % interval, in the unit of records; NaN where undefined.
+    n
+        Number of trajectories that count.
+    """
 
     value: Number
     low: Number = NAN
