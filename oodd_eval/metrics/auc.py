@@ -27,9 +27,14 @@ FAR_START: Final = 20  # first row that ``far`` counts: horizons and warm-ups en
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """A ratio of sums: numerators and denominators of n test trajectories, 0 / 0 if undefined.
+    """A ratio of sums over n test trajectories, or a median of theirs.
 
-    Where it is a `median`, denominators are 1, and the value is the median of the numerators.
+    Parameters
+    ----------
+    numerator, denominator
+        Float64 arrays of shape (n,), both 0 for a trajectory in which the metric is undefined.
+    median
+        Whether the value is the median of the numerators; then denominators are 1 or 0.
 
     Examples
     --------
@@ -122,7 +127,15 @@ def smoothed(x: Floats, weight: float = SMOOTHING) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class AlarmRule:
-    """Standardization, drift and threshold that turn scores into the paper's alarms."""
+    """The rule that turns scores into the paper's alarms.
+
+    Parameters
+    ----------
+    standardization
+        Mean and standard deviation of calibration scores.
+    drift, threshold
+        Those of `oodd_eval.metrics.cusum.cusum`, in the unit of standardized scores.
+    """
 
     standardization: Standardization
     drift: float = DRIFT

@@ -73,10 +73,18 @@ class PairTest:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Ranked rows of one table: ranks by row, tie groups of primary rows, and the tests.
+    """Ranked rows of one table.
 
-    A rank is 1 + the number of primary rows that are significantly better. Tests are of all ordered
-    pairs with a primary row.
+    Attributes
+    ----------
+    ranks
+        By row, best first: 1 + the number of primary rows that are significantly better.
+    groups
+        Tie groups of primary rows.
+    comparisons
+        Tests of all ordered pairs with a primary row.
+    resamples
+        Number of bootstrap resamples.
     """
 
     ranks: dict[str, int]
