@@ -24,7 +24,7 @@ from pathlib import Path
 from oodd_eval.leaderboard.build import build, suite_parts
 from oodd_eval.leaderboard.entry import ENTRY, read_entries
 from oodd_eval.results.directory import RECORDS
-from oodd_eval.results.tables.board import SEEDS
+from oodd_eval.results.standings import SEEDS
 
 COMMITTED = Path("leaderboard")
 ROWS = 32  # of an entry
@@ -110,7 +110,7 @@ def main():
         for name, leaderboard in {"committed": COMMITTED, "large": Path(large)}.items():
             wall, cpu, memory, parts = apart(timed, leaderboard)
             text = ", ".join(f"{part} {seconds:.1f}" for part, seconds in parts.items())
-            print(f"{name:10} {wall:6.1f} s wall {cpu:6.1f} s CPU {memory:6.0f} MB: {text}")
+            print(f"{name:10} {wall:6.1f} s wall {cpu:6.1f} s CPU {memory:6.0f} MB: {text}", flush=True)
     limit = LIMITS.get(options.rows)
     print(f"limits: {f'{limit:g} s wall' if limit else 'no time'}, {MEMORY:g} MB")
     return int(memory > MEMORY or (limit is not None and wall > limit))

@@ -11,9 +11,9 @@ import argparse
 
 from tabulate import tabulate
 
+from oodd_eval.results.board import grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.paired import compare
-from oodd_eval.results.tables.board import grouped
 
 
 def main():

@@ -21,8 +21,8 @@ from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.standings import ranked
 from oodd_eval.results.tables import layout
-from oodd_eval.results.tables.board import ranked
 
 NAN = float("nan")
 SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION

@@ -5,9 +5,6 @@ import json
 import math
 import re
 import shlex
-import shutil
-import subprocess
-import tempfile
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -20,23 +17,24 @@ from hypothesis import strategies as st
 from oodd_eval import load_split
 from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
-from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression
-from oodd_eval.results.record import Metric, same_terms
-from oodd_eval.results.regression import (
+from oodd_eval.results.board import Conditions
+from oodd_eval.results.compare import (
     MEANINGS,
-    Conditions,
     NothingInCommonError,
-    RecordSet,
     Tolerance,
+    change,
     compare,
     parse_tolerance,
-    read_record_set,
-    rendering,
+    section,
     worse_side,
-    write_reference,
 )
+from oodd_eval.results.record import Metric, same_terms
+from oodd_eval.results.reference import RecordSet, read_record_set, write_reference
+from oodd_eval.results.render.junit import junit
+from oodd_eval.results.render.text import markdown_section
 
 NAN = math.nan
 ROOT = Path(__file__).parents[1]
@@ -69,6 +67,10 @@ def only(*arguments, **settings):
     return found
 
 
+def markdown(comparison):
+    return markdown_section(section(comparison))
+
+
 def flat(text):
     """Lines with single blanks."""
     return [" ".join(line.split()) for line in text.splitlines()]
@@ -99,27 +101,17 @@ def test_tolerances_are_read(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["auc", "auc:", "auc:-", "auc:--1", "auc:1e-3", "auc:nan", "auc:1%%", ":1", "auc=1"]
-)
-def test_other_forms_are_refused_with_an_example(text):
-    with pytest.raises(UsageError, match=r"expected METRIC:\[\+-\]NUMBER\[%\] such as 'auc:-0.01'"):
-        parse_tolerance(text)
-
-
-def test_an_unknown_metric_is_named_with_the_nearest():
-    with pytest.raises(UnknownNameError, match="unknown metric 'auc_mached': did you mean 'auc_m"):
-        parse_tolerance("auc_mached:1")
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("auc:+0.01", "of auc, higher is better, .* write 'auc:-0.01'"),
-        ("delay:-10%", "of delay, lower is better, .* write 'delay:+10%'"),
+        *((t, "expected METRIC") for t in
+          ("auc", "auc:", "auc:-", "auc:--1", "auc:1e-3", "auc:nan", "auc:1%%", ":1", "auc=1")),
+        ("auc_mached:1", "did you mean 'auc_m"),
+        ("auc:+0.01", "higher is better, .* write 'auc:-0.01'"),
+        ("delay:-10%", r"lower is better, .* write 'delay:\+10%'"),
     ],
-)
-def test_a_sign_on_the_better_side_is_explained(text, message):
-    with pytest.raises(UsageError, match=message.replace("+", r"\+")):
+)  # fmt: skip
+def test_other_forms_unknown_metrics_and_signs_on_the_better_side_are_refused(text, message):
+    with pytest.raises(UsageError, match=message):
         parse_tolerance(text)
 
 
@@ -179,19 +171,20 @@ def test_improvements_fail_when_both_sides_count_and_small_ones_do_not(tolerance
 
 def test_a_missing_or_failing_cell_of_the_reference_fails():
     reference = [record("iid"), record("drift"), record("gravity")]
-    found = against([record("iid"), record("drift", status="timeout")], reference, AUC)
+    now = [
+        record("iid", auc=0.1),
+        record("iid"),
+        record("drift", status="timeout"),
+        record("components"),
+    ]
+    found = against(now, reference, AUC, two_sided=True)
+    # Of several records of a cell the last counts; a cell in the results alone is new.
     assert [(d.verdict, d.fails) for d in found.differences] == [
-        ("same", False), ("failed", True), ("missing", True),
+        ("same", False), ("failed", True), ("missing", True), ("new", False),
     ]  # fmt: skip
+    with pytest.raises(UsageError, match="'missed_at_1pct' is not in records"):
+        against(now, reference, parse_tolerance("missed_at_1pct:0.1"))
     assert found.differences[1].reason == "timeout: broke"
-
-
-def test_a_cell_only_in_the_results_is_new_and_does_not_fail():
-    found = against([record("iid"), record("drift")], [record("iid")], AUC, two_sided=True)
-    assert [(d.place, d.verdict) for d in found.differences] == [
-        ("hopper/iid", "same"), ("hopper/drift", "new"),
-    ]  # fmt: skip
-    assert not found.failures
 
 
 def test_what_failed_in_the_reference_already_does_not_fail():
@@ -212,18 +205,6 @@ def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
     assert {d.tolerance.metric for d in found.failures} == {"auc", "far"}
 
 
-def test_a_metric_that_the_reference_lacks_is_an_error_and_not_a_pass():
-    with pytest.raises(
-        UsageError, match="metric 'missed_at_1pct' is not in records, expected one of auc, "
-    ):
-        against([record()], [record()], parse_tolerance("missed_at_1pct:0.1"))
-
-
-def test_of_several_records_of_a_cell_the_last_counts():
-    found = only([record(auc=0.1), record(auc=0.9)], [record(auc=0.9)], AUC)
-    assert found.verdict == "same"
-
-
 # Means
 
 
@@ -232,62 +213,44 @@ def test_means_by_group_and_over_all():
     reference = [record(a, auc=0.9) for a in names]
     now = [record("iid", auc=0.87), record("drift", auc=0.92), record("gravity", auc=0.83)]
     found = against(now, reference, AUC, by="group").differences
-    assert [(d.place, round((d.now - d.reference), 6), d.verdict) for d in found] == [
+    assert [(d.scope, round((d.now - d.reference), 6), d.verdict) for d in found] == [
         ("hopper/sensor", -0.005, "within"), ("hopper/dynamics", -0.07, "worse"),
     ]  # fmt: skip
     whole = only(now, reference, AUC, by="mean")
-    assert (whole.place, whole.now, whole.verdict) == ("mean", pytest.approx(2.62 / 3), "worse")
+    assert (whole.scope, whole.now, whole.verdict) == ("mean", pytest.approx(2.62 / 3), "worse")
 
 
 def test_a_mean_says_which_share_of_its_cells_is_lost_or_turned():
     reference = [record("iid"), record("drift")]
     lost = only([record("iid")], reference, AUC, by="mean")
-    assert (lost.verdict, lost.reason, lost.fails) == (
-        "missing", "1 of 2 cells: not there now", True,
-    )  # fmt: skip
+    assert (lost.verdict, lost.reason[:12], lost.fails) == ("missing", "1 of 2 cells", True)
     turned = only([record("iid", auc=NAN), record("drift")], reference, AUC, by="mean")
-    assert (turned.verdict, turned.reason) == (
-        "undefined",
-        "no value in the results in 1 of 2 cells",
-    )
-
-
-def test_means_are_over_the_cells_of_the_reference():
-    now = [record("iid", auc=0.5), record("drift", auc=0.0)]
-    found = against(now, [record("iid", auc=0.5)], AUC, by="mean").differences
-    assert (found[0].now, found[0].verdict) == (0.5, "same")
+    assert (turned.verdict, turned.reason[-15:]) == ("undefined", "in 1 of 2 cells")
 
 
 # What cannot be compared
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("changes", "message"),
     [
-        ({"split_digest": "cd" * 32}, "mini abababababab, protocol 1; .* mini cdcdcdcdcdcd"),
+        ({"split_digest": "cd" * 32}, "digest abababababab, .* digest cdcdcdcdcdcd"),
         ({"protocol": 2}, "protocol 1; .* protocol 2"),
-        ({"limit": 5}, "protocol 1; .* limited to 5"),
+        ({"limit": 5}, "protocol 1; .* limit 5"),
+        ({"detector": "npn"}, r"hopper/iid::rf\S+\) is in records \(which .*:npn"),
     ],
 )
-def test_other_digests_protocols_and_limits_have_nothing_in_common(change, message):
+def test_other_digests_protocols_limits_and_cells_have_nothing_in_common(changes, message):
     with pytest.raises(NothingInCommonError, match=message):
-        against([dataclasses.replace(record(), **change)], [record()], AUC)
-
-
-def test_other_cells_have_nothing_in_common():
-    with pytest.raises(
-        NothingInCommonError, match=r"hopper/iid::rf\S+\) is in records \(which .*:npn"
-    ):
-        against([record(detector="npn")], [record()], AUC)
+        against([dataclasses.replace(record(), **changes)], [record()], AUC)
 
 
 def test_of_several_splits_the_common_one_is_compared_and_the_others_are_named():
     other = dataclasses.replace(record("drift"), split_digest="cd" * 32)
-    found = against([record(), other], [record()], AUC)
-    assert [d.verdict for d in found.differences] == ["same"]
-    assert found.notes == [
-        "Not compared: split mini cdcdcdcdcdcd, protocol 1, which is only in records."
-    ]
+    comparison = against([record(), other], [record()], AUC)
+    assert [d.verdict for d in comparison.differences] == ["same"]
+    (note,) = comparison.notes
+    assert "digest cdcdcdcdcdcd" in note
 
 
 # Reference files
@@ -319,42 +282,16 @@ def test_a_reference_has_a_record_per_line_in_the_benchmarks_order_and_no_more(t
     assert first["provenance"] == {"python": "3.11"}
 
 
-@given(st.floats(allow_infinity=False) | st.just(NAN))
-def test_results_are_the_same_as_their_own_reference(value):
-    with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory) / "reference.jsonl"
-        write_reference([record(auc=value)], path)
-        assert only([record(auc=value)], read_record_set(path).records, AUC).verdict == "same"
-
-
-def test_a_reference_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_reference([record()], tmp_path / "file" / "reference.jsonl")
-
-
 def changed(**changes):
     return json.dumps(json.loads(record().to_json()) | changes)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "no record"),
-        ("[1]", "no record"),
-        (changed(schema=2), "schema 2, expected 3"),
-        (changed(protocol=True), "protocol"),
-        (changed(split_digest=None), "split_digest"),
-        (changed(limit="5"), "limit"),
-        (changed(status="fine"), "status"),
-        (changed(metrics={"auc": {"value": "x"}}), r"metrics\.auc\.value"),
-        (changed(more=1), "more"),
-        ("\xff", "cannot be read"),
-    ],
+    "text", ["{", changed(schema=2), changed(limit="5"), changed(more=1), "\xff"]
 )
-def test_what_is_no_reference_is_refused_by_name(tmp_path, text, message):
+def test_what_is_no_reference_is_refused_by_name(tmp_path, text):
     (tmp_path / "r.jsonl").write_text(text, encoding="latin-1")
-    with pytest.raises(ResultsError, match=rf"r.jsonl.*{message}"):
+    with pytest.raises(ResultsError, match=r"r\.jsonl"):
         read_record_set(tmp_path / "r.jsonl")
 
 
@@ -377,7 +314,8 @@ def test_detectors_and_environments_that_were_not_run_are_summed_up_in_one_line(
     lost = [d for d in found.differences if d.verdict == "missing"]
     # They fail as before, but only what is missing from within is listed.
     assert len(lost) == len(found.failures) == len(reference) - len(now) + 1
-    assert [str(d) for d in rendering.worth_showing(found)] == [str(now[0].cell)]
+    ((row,),) = (table.rows for table in section(found).tables)
+    assert row[0] == f"{now[0].environment}/{now[0].anomaly}"
     (note,) = found.notes
     assert f"{len(reference) - len(now)} cells" in note
     assert all(name in note for name in {"npn", "riqn"} - set(detectors))
@@ -436,28 +374,15 @@ def test_a_regression_is_exit_code_1_and_a_table(run):
     assert "\x1b" not in out
 
 
-def test_improvements_are_exit_code_1_only_when_both_sides_count(run):
-    better = ("same", "--against", "worse", "--fail", "auc:-0.15", "-k", "iid")
-    assert run(*better)[0] == 0
-    assert run(*better, "--two-sided")[0] == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("none", "--against", "same"), "no results or reference at 'none'"),
         (("same", "--against", "none.json"), "no results or reference at 'none.json'"),
-        (
-            ("same", "--against", "same", "--fail", "ac:1"),
-            "unknown metric 'ac': did you mean 'auc'",
-        ),
-        (("same", "--against", "same", "--fail", "auc:+1"), "higher is better"),
-        (("same", "--against", "same", "--fail", "auc:1", "--fail", "auc:2"), "two tolerances for"),
-        (
-            ("same",),
-            "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE",
-        ),
-        (("same", "--against", "same", "--by", "x"), "invalid choice: 'x'"),
+        (("same", "--against", "same", "--fail", "ac:1"), "did you mean 'auc'"),
+        (("same", "--against", "same", "--fail", "auc:1", "--fail", "auc:2"), "two tolerances"),
+        (("same",), "nothing to do"),
+        (("same", "--against", "same", "--by", "x"), "'x'"),
         (("same", "--against", "same", "--junit", "no/j.xml"), "'no/j.xml' cannot be written"),
     ],
 )
@@ -469,7 +394,8 @@ def test_what_cannot_be_done_is_exit_code_4(run, arguments, message):
 
 def test_nothing_in_common_is_exit_code_5_with_the_reason(run):
     code, _, err = run("same", "--against", "same", "-k", "walker2d")
-    assert (code, err) == (5, "oodd-eval: nothing in common: no cell is selected in same\n")
+    assert code == 5
+    assert "no cell is selected in same" in err
     assert run("same", "--write-reference", "r.json", "-k", "walker2d")[0] == 5
 
 
@@ -488,7 +414,7 @@ def test_a_reference_can_be_compared_with_and_then_replaced(run):
 
 def test_quiet_prints_the_summary_and_verbose_all_figures(run):
     assert run("worse", "--against", "same", "-q")[1].count("\n") == 1
-    assert run("same", "--against", "same", "-v", "--fail", "auc:0")[1].count(" same ") >= 3
+    assert run("same", "--against", "same", "-v", "--fail", "auc:0")[1].count("same") >= 3
 
 
 # JUnit XML and Markdown
@@ -516,7 +442,7 @@ def odd_comparison():
 
 
 def test_junit_has_the_layout_that_services_read():
-    root = parsed(rendering.junit(odd_comparison()))
+    root = parsed(junit(odd_comparison()))
     assert root.tag == "testsuites"
     for element in root.iter():
         attributes, children = SCHEMA[element.tag]
@@ -530,7 +456,7 @@ def test_junit_has_the_layout_that_services_read():
 
 
 def test_junit_has_a_test_case_per_cell_and_metric():
-    root = parsed(rendering.junit(against([record(auc=0.2)], [record()], AUC, DELAY)))
+    root = parsed(junit(against([record(auc=0.2)], [record()], AUC, DELAY)))
     bad, good = root.iter("testcase")
     assert (bad.get("classname"), bad.get("name")) == ("mini/hopper/iid::rf[h=1,seed=0]", "auc")
     assert bad[0].get("message") == (
@@ -543,45 +469,37 @@ def test_junit_has_a_test_case_per_cell_and_metric():
 def test_junit_is_well_formed_whatever_the_names(text):
     odd = dataclasses.replace(record(), detector=text, reason=text)
     failed = dataclasses.replace(odd, status="error", metrics={})
-    parsed(rendering.junit(against([failed], [odd], AUC)))
+    parsed(junit(against([failed], [odd], AUC)))
 
 
 def test_markdown_says_verdict_summary_tables_and_conditions():
-    text = rendering.markdown(against([record(auc=0.2), record("drift", auc=0.495)],
-                                      [record(), record("drift")], AUC))  # fmt: skip
+    now = [record(auc=0.2), record("drift", auc=0.495)]
+    text = markdown(against(now, [record(), record("drift")], AUC))
     lines = text.splitlines()
     assert lines[0] == "## Regression check failed: 1 of 2 figures"
-    assert lines[2] == "2 cells compared in auc: 1 within, 1 worse."
-    assert "| hopper/iid | auc | 0.5000 | 0.2000 | ↓ 0.3 | -0.01 | worse |" in flat(text)
-    assert "<details><summary>Differences within the tolerance</summary>" in lines
-    assert lines[-1] == "- split mini abababababab, protocol 1"
-
-
-def test_markdown_of_no_difference_is_two_sentences():
-    text = rendering.markdown(against([record()], [record()], AUC))
-    assert text.startswith("## Regression check passed\n\n1 cells compared in auc: 1 same.\n")
-    assert "|" not in text
-
-
-def test_names_in_markdown_are_no_markup():
-    text = rendering.markdown(odd_comparison())
-    assert "<b>" not in text
-    assert r"\<b\>" in text
+    assert "1 within, 1 worse" in lines[2]
+    shown, folded = text.split("<details>")
+    assert "| hopper/iid | auc | 0.5000 | 0.2000 | ↓ 0.3 | -0.01 | worse |" in flat(shown)
+    assert "| hopper/drift | auc | 0.5000 | 0.4950 | ↓ 0.005 | -0.01 | within |" in flat(folded)
+    assert lines[-1] == "- split mini, digest abababababab, protocol 1"
+    same = markdown(against([record()], [record()], AUC))
+    assert same.startswith("## Regression check passed\n")
+    assert "|" not in same
 
 
 def test_a_failing_cell_takes_one_row_of_the_table():
-    ((found, _),) = rendering.tables(rendering.worth_showing(odd_comparison()))
+    text = markdown(odd_comparison())
+    assert "<b>" not in text
+    assert r"\<b\>" in text
+    assert change(only([record(delay=12.5)], [record(delay=10.0)], DELAY)) == "↑ 2.5 (+25.0%)"
+    (found,) = section(odd_comparison()).tables
+    assert found.colours == ["red"] * 3
     assert [(row[0], row[1], row[-1]) for row in found.rows] == [
         ("hopper/iid", "auc", "worse"),
         ("hopper/drift", "all", "failed"),
         ("hopper/gravity", "all", "missing"),
     ]
     assert list(dict.fromkeys(len(row) for row in found.rows)) == [len(found.header)]
-
-
-def test_a_relative_tolerance_shows_the_change_in_percent():
-    found = only([record(delay=12.5)], [record(delay=10.0)], DELAY)
-    assert rendering.change(found) == "↑ 2.5 (+25.0%)"
 
 
 # What stands in documents, and this project's own check
@@ -624,22 +542,6 @@ def own_check():
     """Parse the commands of this project's own check of its reference scores."""
     lines = re.findall(r"step \.venv/bin/(oodd-eval .*)", CHECK)
     return [parse(line) for line in lines]
-
-
-def test_the_check_of_this_project_parses_and_is_two_sided():
-    runs = [o for o in own_check() if o.command == "run"]
-    comparisons = [o for o in own_check() if o.command == "compare"]
-    assert [o.detector for o in runs] == ["rf", "riqn,npn", "pe-a"]
-    assert len(comparisons) == 3
-    for options in comparisons:
-        assert options.two_sided
-        assert [parse_tolerance(t) for t in options.fail]
-
-
-def test_the_check_of_this_project_is_sound_shell():
-    bash = shutil.which("bash")
-    assert bash
-    subprocess.run([bash, "-n", ROOT / ".ci/run"], check=True)
 
 
 REFERENCES = {
@@ -687,6 +589,7 @@ def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
     cells = [str(r.cell) for name in REFERENCES for r in read_record_set(reference(name)).records]
     ran = set()
     for options in own_check():
+        assert options.command == "run" or options.two_sided
         if options.command == "run":
             names = ENVIRONMENTS if options.env == "all" else options.env.split(",")
             changed = "".join(f",{name}={value}" for name, value in options.param or ())

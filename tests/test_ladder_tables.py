@@ -13,12 +13,13 @@ from oodd_eval.data.ladder import Rung
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
 from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import ladder as of_records
+from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.ladder import FOUND, at_rung, curve, ladders, thresholds
+from oodd_eval.results.render import FORMATS
+from oodd_eval.results.report import Report
 from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import Board
-from oodd_eval.results.tables.rendering import report
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -196,8 +197,8 @@ def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
 
 
 def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
-    assert "strength" not in report(example())
-    text = report(RECORDS)
+    assert "strength" not in FORMATS["markdown"].render(Report(example()))
+    text = FORMATS["markdown"].render(Report(RECORDS))
     shown = io.StringIO()
     TerminalReporter(Console(file=shown, width=100)).tables(RECORDS)
     for title in ("Detection thresholds, lower is better", "Matched AUC (%) by strength",

@@ -14,9 +14,9 @@ from oodd_eval.data.fetch import fetch
 from oodd_eval.data.info import describe
 from oodd_eval.data.layout import MANIFEST, own_facts, write_environment, write_manifest
 from oodd_eval.errors import SplitError, UsageError
-from oodd_eval.results.regression import read_record_set, write_reference
+from oodd_eval.results.board import boards
+from oodd_eval.results.reference import read_record_set, write_reference
 from oodd_eval.results.tables import layout
-from oodd_eval.results.tables.board import boards
 
 OWN = {"slip": "dynamics", "fog": "sensor"}
 LIKE = {"slip": "gravity", "fog": "iid"}

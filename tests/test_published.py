@@ -14,7 +14,7 @@ from oodd_eval.data.files import compress, decompress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard import published
 from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry
-from oodd_eval.leaderboard.placing import neighbours, place, rankings
+from oodd_eval.leaderboard.placing import neighbours, placement, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.results.identity import Setting
@@ -168,15 +168,15 @@ def test_an_installation_without_a_board_says_so(monkeypatch, tmp_path):
 @pytest.mark.parametrize("name", ["first", "claim"])
 def test_an_entrys_own_records_have_the_places_of_the_board(name, board, shipped):
     (own,) = [e for e in entries() if e.meta.id == name]
-    placed = place(own.records, shipped, own.meta.primary)
+    placed = placement(own.records, shipped, own.meta.primary)
     assert places(placed.ranks) == places(board.ranks)
-    assert placed.published == placed.own == {r.setting for r in own.records}
+    assert placed.published == placed.rows == {r.setting for r in own.records}
     assert not placed.lacking
 
 
 def test_a_new_row_has_the_rank_that_the_board_would_give_it_when_it_was_run_again(shipped):
     mine = row("mine", 0.7)
-    placed = place(mine, shipped)
+    placed = placement(mine, shipped)
     (would,) = sections([*entries(), entry("mine", mine)])
     assert places(placed.ranks) == places(would.ranks)
     assert places(placed.ranks)["mine"][:2] == (3, 3)
@@ -186,13 +186,13 @@ def test_a_new_row_has_the_rank_that_the_board_would_give_it_when_it_was_run_aga
 
 def test_part_of_a_published_row_is_that_row(board, shipped):
     part = row("poor", 0.6, seeds=(1,), places=PLACES[:1])
-    placed = place([*part, *row("mine", 0.7)], shipped)
+    placed = placement([*part, *row("mine", 0.7)], shipped)
     assert placed.published == {Setting("poor")}
     assert placed.cells == placed.expected
 
 
 def test_a_row_of_a_published_name_with_other_numbers_takes_its_place(shipped):
-    placed = place(row("good", 0.65), shipped)
+    placed = placement(row("good", 0.65), shipped)
     assert placed.replaced == {Setting("good")}
     assert places(placed.ranks)["good"][:2] == (2, 2)
     assert places(placed.ranks)["fair[h=5]"][0] == 1
@@ -201,36 +201,36 @@ def test_a_row_of_a_published_name_with_other_numbers_takes_its_place(shipped):
 def test_an_entry_declares_its_primary_row_here_too(shipped):
     mine = [*row("mine", 0.7), *row("mine", 0.65, horizon=5)]
     for primary in ((), ("mine[h=5]",)):
-        placed = place(mine, shipped, primary)
+        placed = placement(mine, shipped, primary)
         own = {
-            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.own
+            s.entry.horizon for s in placed.ranks.standings if s.primary and s.entry in placed.rows
         }
         assert own == ({5} if primary else {1})
 
 
 def test_a_row_with_too_few_seeds_shows_the_rank_that_it_would_have(shipped):
-    placed = place(row("mine", 0.7, seeds=(0,)), shipped)
+    placed = placement(row("mine", 0.7, seeds=(0,)), shipped)
     rank, *_, primary, _ = places(placed.ranks)["mine"]
     assert (rank, primary) == (3, False)
     assert placed.lacking == {Setting("mine"): "2 of 3 detector seeds"}
 
 
 def test_rows_with_few_cells_are_compared_on_these_and_what_they_lack_is_named(shipped):
-    placed = place(row("mine", 0.7, places=PLACES[:3], seeds=(0, 1)), shipped)
+    placed = placement(row("mine", 0.7, places=PLACES[:3], seeds=(0, 1)), shipped)
     assert placed.cells == set(PLACES[:3])
     assert {r.position for r in placed.ranks.board.records} == set(PLACES[:3])
     assert placed.lacking == {
         Setting("mine"): "1 of 4 cells with seed 0 (hopper/gravity) and 1 of 4 cells with seed 1 "
         "(hopper/gravity) and 1 of 3 detector seeds"
     }
-    whole = place(row("mine", 0.7, places=PLACES[:2], seeds=(0,)), shipped)
+    whole = placement(row("mine", 0.7, places=PLACES[:2], seeds=(0,)), shipped)
     assert "2 of 4 cells (hopper)" in whole.lacking[Setting("mine")]
 
 
 def test_rows_without_a_common_cell_are_refused(shipped):
     apart = [*row("mine", 0.7, places=PLACES[:1]), *row("other", 0.7, places=PLACES[1:2])]
     with pytest.raises(UsageError, match="no cell of the board in common"):
-        place(apart, shipped)
+        placement(apart, shipped)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_records_of_another_version_are_refused(shipped, tmp_path, capsys):
 
 
 def test_neighbours_are_the_primary_rows_next_to_a_row(shipped):
-    placed = place(row("mine", 0.7), shipped)
+    placed = placement(row("mine", 0.7), shipped)
     table = neighbours(placed.ranks, Setting("mine"))
     assert [[*line[:3], line[4]] for line in table.rows] == [
         ["matched AUC", "fair[h=5]", "2", "worse"],
@@ -290,8 +290,8 @@ def test_rankings_mark_own_rows_and_have_an_order_of_their_own(shipped):
         )
         for r in row("slow", 0.9)
     ]  # fmt: skip
-    placed = place(slow, shipped)
-    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.own)
+    placed = placement(slow, shipped)
+    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.rows)
     assert {line[1]: line[0] for line in first.rows}["> slow"] == "1 a"
     assert [line[3] for line in first.rows if line[1] == "> slow"] == ["yours"]
     assert second.rows[-2][:2] == ["4", "> slow"]

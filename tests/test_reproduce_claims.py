@@ -194,8 +194,8 @@ def test_what_is_settled_says_so_in_any_world_and_is_not_counted(world):
     estimator = Estimator(records_of(world))
     made = rulings(estimator, None)
     for r in made:
-        assert (r.own.verdict == r.claim.settled) == bool(r.claim.settled)
-        assert not math.isnan(r.own.estimate.value) or r.claim in OF_RETURNS
+        assert (r.paper.verdict == r.claim.settled) == bool(r.claim.settled)
+        assert not math.isnan(r.paper.estimate.value) or r.claim in OF_RETURNS
     told = summary(made)
     assert f"of {len(CLAIMS) - 3} claims " in told
     assert "3 more are settled by definition or by construction and not counted." in told
@@ -258,7 +258,7 @@ def test_a_claim_about_every_environment_is_as_good_as_its_worst(auc, verdict):
 def test_every_claim_has_its_place_and_only_settings_that_are_run():
     run = set(settings_of(EXPERIMENTS))
     assert len(CLAIMS) == 57
-    assert all(c.place and c.number and c.text for c in CLAIMS)
+    assert all(c.section and c.number and c.text for c in CLAIMS)
     assert all(run.issuperset(side.settings) for c in CLAIMS for side in c.sides)
 
 
@@ -266,7 +266,7 @@ ADDED = """
 [[claim]]
 id = "own"
 text = "NPN is better than RF on Ant, iid"
-place = "nowhere"
+section = "nowhere"
 number = "NPN minus RF"
 metric = "auc"
 plus = { settings = ["npn"], anomalies = "iid" }
@@ -297,7 +297,7 @@ def test_the_claim_that_the_docs_show_can_be_added(tmp_path):
     ("old", "new", "part"),
     [
         ('text = "NPN', 'txt = "NPN', "'own'.*txt"),
-        ('place = "nowhere"\n', "", "'own'.*place"),
+        ('section = "nowhere"\n', "", "'own'.*section"),
         ('metric = "auc"', 'metric = "acu"', "'own'.*unknown metric 'acu'"),
         ('"iid" }', '"idd" }', "'own'.*unknown scope 'idd'"),
         ('["ant"]', '["aunt"]', "'own'.*unknown environment 'aunt'"),
@@ -381,7 +381,7 @@ def test_a_failed_cell_decides_nothing_and_is_named():
         for d in ("riqn-ms", "npn") for e in ENVIRONMENTS for a in TABLE1
     ]  # fmt: skip
     [ruling] = [r for r in rulings(Estimator(records), None) if r.claim is claim]
-    assert ruling.own.verdict not in ("confirmed", "refuted")
+    assert ruling.paper.verdict not in ("confirmed", "refuted")
     assert "timeout" in claims_table([ruling]).rows[0]
 
 
@@ -391,7 +391,7 @@ def test_loss_of_return_is_paired_and_a_share_of_the_nominal():
         a.id: 0.9 if a.group == "sensor" else 0.7 for a in map(ANOMALIES.get, TABLE1)
     }
     found = {e: {k: [100 * s, 200 * s] for k, s in share.items()} for e in ENVIRONMENTS}
-    made = {r.claim: r.own for r in rulings(Estimator([]), found) if r.claim in OF_RETURNS}
+    made = {r.claim: r.paper for r in rulings(Estimator([]), found) if r.claim in OF_RETURNS}
     # Proportional in every trajectory: resampling cannot change it.
     for claim in OF_RETURNS:
         e = made[claim].estimate
@@ -405,7 +405,7 @@ def test_returns_that_collapse_or_rise_refute_the_claims_about_them():
             a.id: sensor if a.group == "sensor" else dynamics for a in map(ANOMALIES.get, TABLE1)
         }
         found = {e: {k: [100 * s, 200 * s] for k, s in share.items()} for e in ENVIRONMENTS}
-        made = {r.claim: r.own.verdict for r in rulings(Estimator([]), found)}
+        made = {r.claim: r.paper.verdict for r in rulings(Estimator([]), found)}
         return tuple(made[c] for c in OF_RETURNS)
 
     assert both(0.3, 0.1) == ("refuted", "confirmed")

@@ -290,11 +290,11 @@ def test_verdicts_that_differ_are_counted():
     made = rulings(Estimator(everywhere("riqn", [0.8, 0.6], environments=ENVIRONMENTS)), None)
     claims = {
         (r.claim.id, kind): {"verdict": judged.verdict}
-        for r in made for kind, judged in (("paper", r.own), ("fair", r.fair)) if judged
+        for r in made for kind, judged in (("paper", r.paper), ("fair", r.fair)) if judged
     }  # fmt: skip
     other = Other("mild", {}, claims, None)
     counts = re.match(r"0 of (\d+) by the paper's measures, 0 of (\d+) ", changed(made, other))
-    open_ = [r for r in made if not r.claim.settled and r.own.verdict != "not run"]
+    open_ = [r for r in made if not r.claim.settled and r.paper.verdict != "not run"]
     assert len(open_) == int(counts[1]) > 1
     for r, verdict in zip(open_[:2], ("turned", "not run"), strict=True):
         claims[r.claim.id, "paper"] = {"verdict": verdict}

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from oodd_eval import Detector, DetectorSpec, evaluate, load_results, load_split
+from oodd_eval import DetectorSpec, evaluate, load_results, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UnknownNameError, UsageError
 
 CELLS = {"environments": ["hopper", "cartpole"], "anomalies": "iid,gravity"}
@@ -50,13 +50,6 @@ def test_detectors_come_by_name_class_instance_function_and_spec(tiny_split):
     scores = [found.scores("hopper", "iid", row=name).scores for name in found.rows[1:]]
     for factor, own in zip((2, 1, 3, 4), scores, strict=True):
         np.testing.assert_allclose(own, factor * scores[1])
-
-
-def test_an_instance_is_not_fitted_itself(tiny_split):
-    detector = Size()
-    evaluate(detector, tiny_split, environments="hopper", anomalies="iid")
-    assert isinstance(detector, Detector)
-    assert not hasattr(detector, "mean")
 
 
 @pytest.mark.parametrize(
@@ -112,7 +105,7 @@ def test_results_are_a_sequence_of_records(results):
     assert results.ok
     html = results._repr_html_()
     assert "matched AUC" in html
-    assert len(html) < 5000
+    assert len(html) < 20_000
 
 
 def test_means_are_those_of_the_tables(results):
@@ -206,13 +199,9 @@ def test_a_comparison_says_which_row_is_better_and_turns_with_its_sides(results)
     assert one.cells == 4
     assert one.verdict == other.verdict or one.p > 0.05
     assert str(one).startswith("matched AUC: mewma ")
-
-
-def test_lower_is_better_where_the_metric_says_so(results):
-    found = results.compare("mewma", "size", "delay_censored")
-    assert found.difference == pytest.approx(found.values[0] - found.values[1])
-    if found.p <= 0.05:
-        assert found.verdict.startswith("mewma" if found.difference < 0 else "size")
+    lower = results.compare("mewma", "size", "delay_censored")
+    assert lower.difference == pytest.approx(lower.values[0] - lower.values[1])
+    assert lower.p > 0.05 or lower.verdict.startswith("mewma" if lower.difference < 0 else "size")
 
 
 def test_a_row_against_its_copy_cannot_be_told_apart(tiny_split):

@@ -1,6 +1,7 @@
-"""Numbers of the page on what was found are those of the committed board and reproduction."""
+"""Numbers of the page on what was found are those of what is committed under leaderboard/."""
 
 import csv
+import functools
 import re
 from collections import Counter
 from pathlib import Path
@@ -11,359 +12,255 @@ import pytest
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.leaderboard.entry import read_entries, read_grants
+from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.tables.board import boards
 
-ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "results.md").read_text()
+BOARD = Path(__file__).parents[1] / "leaderboard"
+PAGE = (BOARD.parent / "docs" / "results.md").read_text()
+TEXT = " ".join(PAGE.split())
+ROBOTS = [name for name, info in ENVIRONMENTS.items() if not info.discrete]
+CLASSIC = [name for name in ENVIRONMENTS if name not in ROBOTS]
+
+
+def lines(path):
+    with (BOARD / path).open() as file:
+        return list(csv.DictReader(file))
+
+
+@functools.cache
+def ranking(split):
+    (file,) = (BOARD / "tables").glob(f"{split}-*-ranking.csv")
+    return {r["detector"]: r for r in lines(file) if r["primary"] == "true"}
+
+
+@functools.cache
+def board(name, seed=None):
+    """A suite's board, or that of the entries on mini."""
+    if name == "mini":
+        records = [r for e in read_entries(BOARD / "results") for r in e.records]
+        records = [r for r in records if r.split == "mini" and seed in (None, r.seed)]
+    else:
+        records = ResultsDirectory(BOARD / "suites" / name).records()
+    (one,) = boards(records)
+    return one
+
+
+def mean(name, row, metric, *, seed=None, environments=None, anomalies=None):
+    one = board(name, seed)
+    setting = row if isinstance(row, Setting) else Setting(row)
+    environments = environments or one.environments
+    return 100 * one.mean(setting, environments, anomalies or one.anomalies, metric).value
+
+
+# Tables: what a row of a section's table has to hold
+
+
 COLUMNS = ("auc_matched", "auc_unpaired", "auc_smoothed", "found_within_20_at_5pct",
            "missed_at_5pct", "false_episodes_at_5pct")  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def entries():
-    return read_entries(ROOT / "leaderboard" / "results")
+def of_board(split):
+    return lambda name: [100 * float(ranking(split)[name][column]) for column in COLUMNS]
 
 
-def section(title):
-    return PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+@functools.cache
+def grants():
+    return {k: v for g in read_grants(BOARD / "results").values() for k, v in g.means.items()}
 
 
-def ranking(split="mini"):
-    (file,) = (ROOT / "leaderboard" / "tables").glob(f"{split}-*-ranking.csv")
-    with file.open() as lines:
-        rows = [r for r in csv.DictReader(lines) if r["primary"] == "true"]
-    return {r["detector"]: r for r in rows}
+def of_grants(name):
+    units = {"auc_matched": 100, "false_episodes_at_5pct": 100, "delay_censored_at_5pct": 1}
+    return [unit * value for m, unit in units.items() for value in grants()[name][m]]
 
 
-@pytest.mark.parametrize(
-    ("split", "title"), [("mini", "What finds how much"), ("standard", "On longer episodes")]
-)
-def test_the_table_is_the_boards(split, title):
-    number = r" \| ".join([r"([\d.]+)"] * len(COLUMNS))
-    rows = re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", section(title), re.MULTILINE)
-    board = ranking(split)
-    assert {"riqn", "npn", "rf", "mewma", "mahalanobis", "range"} <= {r[0] for r in rows}
-    for name, *found in rows:
-        expected = [100 * float(board[name][column]) for column in COLUMNS]
-        assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
-    shown = [float(r[1]) for r in rows]
-    assert shown == sorted(shown, reverse=True)
+def under_noise(name):
+    metrics = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
+    splits = (("mini", 0), ("noisy-1", None), ("noisy-5", None))
+    return [mean(split, name, m, seed=seed) for m in metrics for split, seed in splits]
 
 
-def test_the_table_of_fresh_seeds_is_that_of_the_grants():
-    means = {}
-    for grant in read_grants(ROOT / "leaderboard" / "results").values():
-        assert grant.trust == "re-run"
-        means |= grant.means
-    number = r" \| ".join([r"([\d.]+)"] * 6)
-    text = section("Run again on fresh seeds")
-    rows = re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", text, re.MULTILINE)
-    assert {"pe-a", "riqn", "npn", "rf", "persistence"} <= {r[0] for r in rows}
-    metrics = {"auc_matched": 100, "false_episodes_at_5pct": 100, "delay_censored_at_5pct": 1}
-    for name, *found in rows:
-        expected = [unit * value for m, unit in metrics.items() for value in means[name][m]]
-        assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
-    changes = [abs(one - other) for one, other in (m["auc_matched"] for m in means.values())]
-    assert max(changes) < 0.03
-    for name in ("pe", "pe-a", "riqn", "npn"):
-        assert abs(np.diff(means[name]["auc_matched"])) < 0.01
-    false = {name: m["false_episodes_at_5pct"][1] for name, m in means.items()}
-    assert np.mean([*false.values()]) == pytest.approx(0.03, abs=0.005)
-    assert np.mean([v for n, v in false.items() if n.startswith("pe")]) == pytest.approx(
-        0.05, abs=0.005
-    )
+def at_horizons(name):
+    metrics = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
+    return [mean("horizons", Setting(name, h), m) for m in metrics for h in (1, 10, 20)]
 
 
-def test_the_table_by_environment_is_the_boards(entries):
-    records = [r for e in entries for r in e.records if r.split == "mini"]
-
-    def mean(detector, group, metric):
-        wanted = (detector, environment, group)
-        own = [r for r in records if (str(r.setting), r.environment, r.group) == wanted]
-        return 100 * np.mean([r.value(metric) for r in own])
-
-    pair = r"([\d.]+), ([\d.]+)"
-    rows = re.findall(
-        rf"^\| (\w+) \| {pair} \| {pair} \| (\d+) \| (\d+) \| (\d+) \|$", PAGE, re.MULTILINE
-    )
-    assert [r[0] for r in rows] == list(ENVIRONMENTS)
-    for environment, *found in rows:
-        expected = [
-            mean(d, g, "auc_matched") for g in ("sensor", "dynamics") for d in ("pe", "pe-a")
-        ]
-        assert [float(n) for n in found[:4]] == pytest.approx(expected, abs=0.051), environment
-        missed = [mean(d, "dynamics", "missed_at_5pct") for d in ("mewma-a", "pe", "pe-a")]
-        assert [float(n) for n in found[4:]] == pytest.approx(missed, abs=0.51), environment
+def by_environment(name):
+    auc, missed = "auc_matched", "missed_at_5pct"
+    groups = board("mini").in_group("sensor"), board("mini").in_group("dynamics")
+    over = {"environments": [name]}
+    return [
+        *(mean("mini", d, auc, anomalies=g, **over) for g in groups for d in ("pe", "pe-a")),
+        *(round(mean("mini", d, missed, anomalies=groups[1], **over))
+          for d in ("mewma-a", "pe", "pe-a")),
+    ]  # fmt: skip
 
 
-def test_protocols_beside_each_other():
-    archive = (ROOT / "docs" / "archive" / "protocol-1.md").read_text()
-    rows = re.findall(
-        r"^\| `([a-z-]+)`, protocol 1 → 2 \| ([\d.]+) → ([\d.]+) \|$", PAGE, re.MULTILINE
-    )
-    assert len(rows) >= 5
+def of_protocols(name):
+    archive = (BOARD.parent / "docs" / "archive" / "protocol-1.md").read_text()
     mini = archive.split("## Board of mini")[1].split("## Board of reduced")[0]
-    board = ranking()
-    for name, before, after in rows:
-        (old,) = re.findall(rf"\| {name}(?: \(trivial\))? \| Δ=1(?:, 3 seeds)? \| ([\d.]+) ", mini)
-        assert (before, float(after)) == (
-            old, pytest.approx(100 * float(board[name]["auc_matched"]), abs=0.051)
-        ), name  # fmt: skip
+    (old,) = re.findall(rf"\| {name}(?: \(trivial\))? \| Δ=1(?:, 3 seeds)? \| ([\d.]+) ", mini)
+    return [float(old), 100 * float(ranking("mini")[name]["auc_matched"])]
 
 
-def claims():
-    with (ROOT / "leaderboard/reproduction/mini/claims.csv").open() as lines:
-        return list(csv.DictReader(lines))
+def of_reproductions(table1, paper):
+    def means(split):
+        rows = lines(f"reproduction/{split}/tables/table-5.csv")
+        rows = [r for r in rows if (r["environment"], r["metric"]) == ("mean", "auc")]
+        return {(r["series"], r["anomalies"]): r for r in rows}
 
+    def row(name):
+        ours, same = means(table1), means(paper)
+        keys = [(name, group) for group in ("sensor", "dynamics")]
+        values = (v for k in keys for v in (same[k]["paper"], ours[k]["value"], same[k]["value"]))
+        return [100 * float(v) for v in values]
 
-def test_verdicts_are_those_of_the_reproduction():
-    verdicts = {(r["text"], r["kind"]): r["verdict"] for r in claims()}
-    rows = re.findall(r"^\| ([^|]+) \| ([\w ]+) \| ([^|]+) \|$", PAGE, re.MULTILINE)
-    found = [(text, paper, fair) for text, paper, fair in rows if (text, "paper") in verdicts]
-    assert len(found) >= 12
-    for text, paper, fair in found:
-        assert (paper, fair) == (
-            verdicts[text, "paper"],
-            verdicts.get((text, "fair"), "\N{EN DASH}"),
-        ), text
-
-
-def test_verdicts_are_counted_rightly():
-    counted = Counter(r["verdict"] for r in claims() if r["kind"] == "paper")
-    text = " ".join(PAGE.split())
-    assert f"Of {sum(counted.values())} claims" in text
-    for verdict, many in counted.items():
-        assert re.search(rf"\b{many}( are)? {verdict}", text), verdict
+    return row
 
 
 @pytest.mark.parametrize(
-    ("heading", "table1", "paper"),
+    ("title", "least", "pattern", "expected"),
     [
-        ("At the paper's losses", "mini", "mini-paper"),
-        ("At the paper's losses, on whole episodes", "standard", "reduced-paper"),
+        ("## What finds how much", 15, r"`[a-z-]+`", of_board("mini")),
+        ("## What finds how much", 7, r"[a-z0-9]+", by_environment),
+        ("## On longer episodes", 15, r"`[a-z-]+`", of_board("standard")),
+        ("## At longer horizons", 14, r"`[a-z-]+`", at_horizons),
+        ("## Run again on fresh seeds", 13, r"`[a-z-]+`", of_grants),
+        ("## With noise in every sensor", 17, r"`[a-z-]+`", under_noise),
+        ("## What changed", 6, r"`[a-z-]+`, protocol 1 → 2", of_protocols),
+        ("### At the paper's losses\n", 5, r"[A-Z+]+", of_reproductions("mini", "mini-paper")),
+        ("### At the paper's losses, on", 5, r"[A-Z+]+",
+         of_reproductions("standard", "reduced-paper")),
     ],
-)
-def test_the_table_at_the_papers_losses_is_that_of_both_reproductions(heading, table1, paper):
-    def means(split):
-        file = ROOT / "leaderboard" / "reproduction" / split / "tables" / "table-5.csv"
-        with file.open() as lines:
-            own = [r for r in csv.DictReader(lines) if r["environment"] == "mean"]
-        return {(r["series"], r["anomalies"]): r for r in own if r["metric"] == "auc"}
-
-    ours, same = means(table1), means(paper)
-    section = re.split(r"\n##+ ", PAGE.split(f"### {heading}\n")[1])[0]
-    rows = re.findall(r"^\| ([A-Z+]+) \| ([\d. |]+) \|$", section, re.MULTILINE)
-    assert [r[0] for r in rows] == ["RIQN", "RIQN+MS", "NPN", "RF", "AVG"]
-    for name, found in rows:
-        keys = [(name, group) for group in ("sensor", "dynamics")]
-        expected = [v for k in keys for v in (same[k]["paper"], ours[k]["value"], same[k]["value"])]
-        assert [float(n) for n in found.split(" | ")] == pytest.approx(
-            [100 * float(v) for v in expected], abs=0.051
-        )
-
-
-def verdicts(reproduction):
-    """Verdicts by the paper's measures of a committed reproduction, by claim."""
-    with (ROOT / "leaderboard" / "reproduction" / reproduction / "claims.csv").open() as lines:
-        return {r["claim"]: r["verdict"] for r in csv.DictReader(lines) if r["kind"] == "paper"}
-
-
-def test_claims_on_standard_are_counted_rightly():
-    settled = {"by definition", "by construction"}
-    found = {c: v for c, v in verdicts("standard").items() if v not in settled}
-    run = {claim: verdict for claim, verdict in found.items() if verdict != "not run"}
-    mini = verdicts("mini")
-    differ = [claim for claim, verdict in run.items() if verdict != mini[claim]]
-    text = " ".join(PAGE.split())
-    assert f"[{len(run)} of {len(found)}](../leaderboard/reproduction/standard/README.md)" in text
-    assert sorted(differ) == ["delay-riqn-npn", "delay-riqn-rf", "memory-1-7"]
-    assert "Three of them differ" in text
-
-
-def test_losses_on_whole_episodes_are_those_of_table_2():
-    file = ROOT / "leaderboard" / "reproduction" / "reduced-paper" / "tables" / "table-2.csv"
-    kept = {"ours": {}, "paper": {}}
-    with file.open() as lines:
-        for r in csv.DictReader(lines):
-            if r["environment"] in ENVIRONMENTS:
-                for who, column in (("ours", "value"), ("paper", "paper")):
-                    kept[who].setdefault(r["environment"], {})[r["kind"]] = float(r[column])
-    lost = {
-        who: {e: 100 * (1 - np.mean([own[k] for k in own if k != "nominal"]) / own["nominal"])
-              * np.sign(own["nominal"]) for e, own in both.items()}
-        for who, both in kept.items()
-    }  # fmt: skip
-    text = " ".join(PAGE.split())
-    found = re.search(
-        r"robots lose (\d+) \((\w+)\), (\d+) \((\w+)\), (\d+) \((\w+)\) and (\d+) % \((\w+)\) "
-        r"of their return; the paper's lost (\d+) to (\d+) %. The classic three lose (\d+) to "
-        r"(\d+) %, the paper's (\d+) to (\d+) %",
-        text,
-    ).groups()
-    robots = {e: info.title for e, info in ENVIRONMENTS.items() if not info.discrete}
-    assert dict(zip(found[1:8:2], map(int, found[:8:2]), strict=True)) == {
-        title: round(lost["ours"][e]) for e, title in robots.items()
-    }
-    ranges = [
-        sorted(round(x) for e, x in lost[who].items() if (e in robots) == of_robots)
-        for who, of_robots in (("paper", True), ("ours", False), ("paper", False))
-    ]
-    ends = [n for own in ranges for n in (own[0], own[-1])]
-    assert [int(n) for n in found[8:]] == ends
-    # To within the spread of 20 test seeds robots lose what the paper's lost.
-    assert max(abs(lost["ours"][e] - lost["paper"][e]) for e in robots) < 5
-
-
-def test_claims_on_whole_episodes_are_told_rightly():
-    place = ROOT / "leaderboard" / "reproduction"
-    found = {}
-    for split in ("reduced-paper", "mini-paper"):
-        with (place / split / "claims.csv").open() as lines:
-            for r in csv.DictReader(lines):
-                found[split, r["claim"], r["kind"]] = r
-    own = {key[1:]: r for key, r in found.items() if key[0] == "reduced-paper"}
-
-    def points(claim, kind, factor=100, split="reduced-paper"):
-        r = found[split, claim, kind]
-        return [f"{factor * float(r[end]):.1f}" for end in ("value", "low", "high")]
-
-    text = " ".join(PAGE.split())
-    auc, matched = (points("sensor-above-dynamics-models", kind) for kind in ("paper", "fair"))
-    few = points("sensor-above-dynamics-models", "paper", split="mini-paper")
-    assert "by {} [{}, {}] points, and by {} [{}, {}] of matched AUC".format(*auc, *matched) in text
-    assert f"sensor anomalies were easier by {few[0]} points" in text
-    above = [points("riqn-above-npn-1", kind, -100)[0] for kind in ("paper", "fair")]
-    assert "by {} points of AUC and {} of matched AUC".format(*above) in text
-    longer = points("delay-riqn-npn", "paper", -1)[0]
-    assert f"longer than NPN's by {longer} steps, as on `standard`; on" in text
-    with (place / "reduced-paper" / "tables" / "table-5.csv").open() as lines:
-        rows = [r for r in csv.DictReader(lines) if (r["series"], r["metric"]) == ("AVG", "auc")]
-    means = {(r["environment"], r["anomalies"]): float(r["value"]) for r in rows}
-    better = [e for e in ENVIRONMENTS if means[e, "dynamics"] > means[e, "sensor"]]
-    assert better == ["hopper", "walker2d"]
-    assert "In Hopper and Walker2D dynamics anomalies are found better" in text
-    assert f"RIQN by {points('riqn-above-riqn-ms-10', 'paper', -100)[0]} points" in text
-    assert f"N-RIQN by {points('memory-10-7', 'paper')[0]} points; at Δ = 1" in text
-    assert f"one by {points('ensemble-1', 'paper')[0]} points at Δ = 1" in text
-    assert round(float(own["delay-grows-10", "paper"]["value"])) == 3
-    settled = {"by definition", "by construction"}
-    counted = [r["verdict"] for (_, kind), r in own.items() if kind == "paper"]
-    counted = [verdict for verdict in counted if verdict not in settled]
-    missing = [c for (c, kind), r in own.items() if (r["verdict"], kind) == ("not run", "paper")]
-    assert all("-20" in claim for claim in missing)
-    assert f"{len(counted) - len(missing)} of {len(counted)} claims were [computed on it]" in text
-    assert f"Δ = 20, which {len(missing)} claims are about" in text
-    expected = {
-        "memory-1-7": "negligible", "samples-4": "negligible", "ensemble-10": "negligible",
-        "riqn-ms-above-npn-10": "refuted",
-        "sensor-above-dynamics-everywhere": "refuted", "riqn-above-npn-1": "refuted",
-        "npn-above-rf-1": "confirmed", "riqn-above-rf-1": "confirmed", "delay-riqn-npn": "refuted",
-    }  # fmt: skip
-    assert {c: own[c, "paper"]["verdict"] for c in expected} == expected
-    assert found["mini-paper", "delay-riqn-npn", "paper"]["verdict"] == "confirmed"
-
-
-SUITES = ROOT / "leaderboard" / "suites"
+)  # fmt: skip
+def test_tables_have_the_numbers_of_what_is_committed(title, least, pattern, expected):
+    section = re.split(r"\n##+ ", PAGE.split(title, 1)[1])[0]
+    rows = re.findall(rf"^\| ({pattern}) \| ([-\d., |→]+) \|$", section, re.MULTILINE)
+    assert len(rows) >= least
+    for label, numbers in rows:
+        name = re.match(r"`?([A-Za-z0-9+-]+)", label)[1]
+        values = [float(n) for n in re.findall(r"-?\d+(?:\.\d+)?", numbers)]
+        assert values == pytest.approx(expected(name), abs=0.051), name
 
 
 def test_the_ladder_is_that_of_the_suites_page():
-    page = (SUITES / "ladder/README.md").read_text(encoding="utf-8").replace("\\", "")
+    page = (BOARD / "suites/ladder/README.md").read_text(encoding="utf-8").replace("\\", "")
     table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
-    header, _, *rows = [[x.strip() for x in line.split("|")[1:-1]] for line in table.splitlines()]
-    names = header[5:]
-    found = re.findall(r"^\| `([a-z-]+)` \| (\S+ \[[^]]+\]) \| (.+) \|$", PAGE, re.MULTILINE)
-    assert [f"`{name}`" for name in names] == re.findall(r"`\w+`", PAGE.split("| threshold |")[1])[
-        : len(names)
-    ]
+    _, _, *rows = [[x.strip() for x in line.split("|")[1:-1]] for line in table.splitlines()]
     expected = [(row[0], row[1], " | ".join(row[5:])) for row in rows]
-    assert found == expected
+    assert expected == re.findall(
+        r"^\| `([a-z-]+)` \| (\S+ \[[^]]+\]) \| (.+) \|$", PAGE, re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5", "horizons"])
 def test_the_page_of_a_suite_is_printed_from_its_records(suite, capsys):
-    own = SUITES / suite
-    assert main(["show", str(own), "--stored", "--markdown"]) == 0
-    told = f"run `oodd-eval show leaderboard/suites/{suite} --stored --markdown`"
-    assert capsys.readouterr().out == (own / "README.md").read_text(encoding="utf-8"), told
+    directory = BOARD / "suites" / suite
+    assert main(["show", str(directory), "--stored", "--markdown"]) == 0
+    advice = f"run `oodd-eval show leaderboard/suites/{suite} --stored --markdown`"
+    assert capsys.readouterr().out == (directory / "README.md").read_text(encoding="utf-8"), advice
 
 
-def rows_of_nine(title):
-    """Return the rows of a section's table that have a detector and nine numbers."""
-    number = r" \| ".join([r"(-?[\d.]+)"] * 9)
-    return re.findall(rf"^\| `([a-z-]+)` \| {number} \|$", section(title), re.MULTILINE)
+# Claims of the paper
 
 
-UNDER_NOISE = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
+@functools.cache
+def claims(split):
+    return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}
 
 
-def test_the_table_under_noise_is_that_of_the_records(entries):
-    """Detector seed 0 on mini and on both noisy splits, metric by metric."""
-    chosen = [r for e in entries for r in e.records if r.split == "mini" and r.seed == 0]
-    (mini,) = boards(chosen)
-    noisy = (ResultsDirectory(SUITES / name).records() for name in ("noisy-1", "noisy-5"))
-    (one,), (five,) = map(boards, noisy)
-
-    def mean(board, row, metric):
-        return 100 * board.mean(row, board.environments, board.anomalies, metric).value
-
-    rows = rows_of_nine("With noise in every sensor")
-    assert {r[0] for r in rows} == {row.detector for row in five.entries}
-    for name, *found in rows:
-        row = Setting(name)
-        expected = [mean(board, row, m) for m in UNDER_NOISE for board in (mini, one, five)]
-        assert [float(n) for n in found] == pytest.approx(expected, abs=0.051), name
-    shown = [float(r[3]) for r in rows]
-    assert shown == sorted(shown, reverse=True)
+def counted(split):
+    """The verdicts by the paper's measures that data decide, by claim."""
+    settled = {"by definition", "by construction"}
+    rows = {c: r["verdict"] for (c, kind), r in claims(split).items() if kind == "paper"}
+    return {claim: verdict for claim, verdict in rows.items() if verdict not in settled}
 
 
-def test_longer_horizons_are_told_as_the_records_have_them():
-    """With detector seed 0 on reduced; at one step beside what the board of standard has."""
-    (board,) = boards(ResultsDirectory(SUITES / "horizons").records())
-    robots = [name for name, info in ENVIRONMENTS.items() if not info.discrete]
-    classic = [name for name in ENVIRONMENTS if name not in robots]
+def test_verdicts_are_those_of_the_reproduction():
+    verdicts = {(r["text"], kind): r["verdict"] for (_, kind), r in claims("mini").items()}
+    rows = re.findall(r"^\| ([^|]+) \| ([\w ]+) \| ([^|]+) \|$", PAGE, re.MULTILINE)
+    rows = [row for row in rows if (row[0], "paper") in verdicts]
+    assert len(rows) >= 12
+    for text, paper, fair in rows:
+        assert paper == verdicts[text, "paper"], text
+        assert fair == verdicts.get((text, "fair"), "\N{EN DASH}"), text
+    counts = Counter(v for (_, kind), v in verdicts.items() if kind == "paper")
+    assert f"Of {sum(counts.values())} claims" in TEXT
+    for verdict, many in counts.items():
+        assert re.search(rf"\b{many}( are)? {verdict}", TEXT), verdict
 
-    def mean(name, horizon, metric="auc_matched", environments=board.environments):
-        row = Setting(name, horizon)
-        return 100 * board.mean(row, environments, board.anomalies, metric).value
 
-    found = "found_within_20_at_5pct"
-    rows = rows_of_nine("At longer horizons")
-    names = {row.detector for row in board.entries}
-    assert {r[0] for r in rows} == names
-    for name, *numbers in rows:
-        metrics = ("auc_matched", found, "missed_at_5pct")
-        expected = [mean(name, h, m) for m in metrics for h in (1, 10, 20)]
-        assert [float(n) for n in numbers] == pytest.approx(expected, abs=0.051), name
-    shown = [float(r[1]) for r in rows]
-    assert shown == sorted(shown, reverse=True)
+def test_claims_that_were_run_on_other_splits_are_counted_rightly():
+    for split in ("standard", "reduced-paper"):
+        verdicts = counted(split)
+        run = [claim for claim, verdict in verdicts.items() if verdict != "not run"]
+        assert f"{len(run)} of {len(verdicts)}" in TEXT
+        assert f"reproduction/{split}/README.md" in PAGE
+    mini = counted("mini")
+    differ = [c for c, v in counted("standard").items() if v not in ("not run", mini[c])]
+    assert sorted(differ) == ["delay-riqn-npn", "delay-riqn-rf", "memory-1-7"]
 
-    def gain(name, horizon, environments=board.environments):
-        return mean(name, horizon, environments=environments) - mean(
-            name, 1, environments=environments
-        )
 
-    text = " ".join(section("At longer horizons").split())
-    assert all(mean(name, 20, found) < mean(name, 1, found) for name in names)
-    better = {name for name in names if gain(name, 20) > 0}
-    assert better == {"pe-step", "pe-step-a", "persistence"}
-    single = ("pe-step", "rf", "riqn-ms", "npn")
-    told = [f"{gain(name, 10, robots):.1f}" for name in single]
-    assert (
-        "gains {} points of matched AUC there, `rf` {}, `riqn-ms` {} and `npn` {}.".format(*told)
-        in text
-    )
-    told = [f"{-gain(name, 10, classic):.1f}" for name in single]
-    assert "they lose {}, {}, {} and {}.".format(*told) in text
-    assert all(gain(n, 10, robots) < 0 for n in ("pe", "pe-a", "mewma", "mewma-a", "rf-ewma"))
-    told = [f"{-gain(name, 20):.1f}" for name in ("n-riqn", "riqn", "riqn-ms")]
-    assert (
-        "falls by {} points from Δ = 1 to 20, `riqn` by {} and `riqn-ms` by {}.".format(*told)
-        in text
-    )
-    first = ranking("standard")
-    apart = {m: [100 * float(first[n][m]) - mean(n, 1, m) for n in names]
-             for m in ("auc_matched", found)}  # fmt: skip
-    assert round(max(map(abs, apart["auc_matched"])), 1) == 0.3
-    assert round(max(apart[found])) == 6
+# Sentences: a phrase of the page with the numbers that it has to have
+
+
+def points(claim, kind="paper", factor=100, split="reduced-paper", ends=("value",)):
+    return [f"{factor * float(claims(split)[claim, kind][end]):.1f}" for end in ends]
+
+
+def gains(horizon, environments, names, sign=1):
+    auc = "auc_matched"
+    for name in names:
+        one, other = (mean("horizons", Setting(name, h), auc, environments=environments)
+                      for h in (1, horizon))  # fmt: skip
+        yield f"{sign * (other - one):.1f}"
+
+
+STEPS = ("pe-step", "rf", "riqn-ms", "npn")
+ENDS = ("value", "low", "high")
+EASIER = "sensor-above-dynamics-models"
+
+
+@pytest.mark.parametrize(
+    ("phrase", "numbers"),
+    [
+        ("gains {} points of matched AUC there, `rf` {}, `riqn-ms` {} and `npn` {}.",
+         lambda: gains(10, ROBOTS, STEPS)),
+        ("they lose {}, {}, {} and {}.",
+         lambda: gains(10, CLASSIC, STEPS, -1)),
+        ("falls by {} points from Δ = 1 to 20, `riqn` by {} and `riqn-ms` by {}.",
+         lambda: gains(20, None, ("n-riqn", "riqn", "riqn-ms"), -1)),
+        ("by {} [{}, {}] points, and by {} [{}, {}] of matched AUC",
+         lambda: [*points(EASIER, ends=ENDS), *points(EASIER, "fair", ends=ENDS)]),
+        ("sensor anomalies were easier by {} points", lambda: points(EASIER, split="mini-paper")),
+        ("by {} points of AUC and {} of matched AUC",
+         lambda: [*points("riqn-above-npn-1", "paper", -100),
+                  *points("riqn-above-npn-1", "fair", -100)]),
+        ("longer than NPN's by {} steps, as on", lambda: points("delay-riqn-npn", factor=-1)),
+        ("RIQN by {} points", lambda: points("riqn-above-riqn-ms-10", factor=-100)),
+        ("N-RIQN by {} points; at Δ = 1", lambda: points("memory-10-7")),
+        ("one by {} points at Δ = 1", lambda: points("ensemble-1")),
+    ],
+)  # fmt: skip
+def test_sentences_have_the_numbers_of_what_is_committed(phrase, numbers):
+    assert phrase.format(*numbers()) in TEXT
+
+
+def test_losses_on_whole_episodes_are_those_of_table_2():
+    kept = {"value": {}, "paper": {}}
+    for r in lines("reproduction/reduced-paper/tables/table-2.csv"):
+        for column, by_environment in kept.items():
+            if r["environment"] in ENVIRONMENTS:
+                by_environment.setdefault(r["environment"], {})[r["kind"]] = float(r[column])
+
+    def lost(column, environment):
+        of = dict(kept[column][environment])
+        nominal = of.pop("nominal")
+        return round(100 * (1 - np.mean([*of.values()]) / nominal) * np.sign(nominal))
+
+    for environment in ROBOTS:
+        title = ENVIRONMENTS[environment].title
+        assert re.search(rf"\b{lost('value', environment)} %? ?\({title}\)", TEXT), title
+    for column, names in (("paper", ROBOTS), ("value", CLASSIC), ("paper", CLASSIC)):
+        losses = [lost(column, name) for name in names]
+        assert f"{min(losses)} to {max(losses)} %" in TEXT

@@ -14,7 +14,7 @@ from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.results.curve_file import read_curves
-from oodd_eval.results.tables.layout import show_value
+from oodd_eval.results.tables import show_value
 
 pytestmark = [
     pytest.mark.browser,

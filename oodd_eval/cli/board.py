@@ -4,24 +4,26 @@ Both read the board that is installed with the package, so that neither needs a 
 """
 
 import argparse
-import textwrap
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from oodd_eval.cli import NAMES, Add, Parser, say_notes
-from oodd_eval.cli.terminal import TerminalReporter, make_console
+from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, read_entry
-from oodd_eval.leaderboard.placing import Placement, neighbours, place, rankings
+from oodd_eval.leaderboard.placing import Placement, neighbours, placement, rankings
 from oodd_eval.leaderboard.published import PublishedBoard, board_of, read_published
 from oodd_eval.names import check_known, select
+from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import ladder, layout, rendering
-from oodd_eval.results.tables.board import RankedBoard, boards, grouped
-from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.render.data import ranking_csv
+from oodd_eval.results.render.terminal import print_sections
+from oodd_eval.results.render.text import markdown_section
+from oodd_eval.results.report import Section
+from oodd_eval.results.tables import ladder, layout
 
 
 def define(action: Callable[[str, str], Parser]) -> None:
@@ -56,15 +58,17 @@ def show(options: argparse.Namespace) -> int:
     output = _Output(options)
     for board in chosen:
         ranks = board.ranks()
-        output.heading(f"Leaderboard, {board}")
-        output.ranking(ranks, board.trust)
-        if not output.quiet:
-            output.notes([*layout.ranking_notes(ranks), *_of_entries(board)])
+        notes = [*layout.ranking_notes(ranks), *_of_entries(board)]
+        tables = rankings(ranks, board.trust)
+        output.print(
+            Section(f"Leaderboard, {board}", tables=tables, notes=[] if output.quiet else notes),
+            ranking_csv(ranks, board.trust) if output.csv else "",
+        )
     if options.split or output.csv or output.quiet:
         return 0
     for name, suite in published.suites.items():
-        output.heading(f"Suite {name}, digest {suite.digest[:12]}")
-        output.table(ladder.overview(suite, thresholds(suite.records)))
+        table = ladder.overview(suite, thresholds(suite.records))
+        output.print(Section(f"Suite {name}, digest {suite.digest[:12]}", tables=[table]))
     return 0
 
 
@@ -74,19 +78,21 @@ def place_run(options: argparse.Namespace) -> int:
     published = read_published()
     output = _Output(options)
     runs = boards(records)
-    found = [board_of(run.records, published.boards) for run in runs]
-    for run, board in zip(runs, found, strict=True):
-        placed = place(run.records, board, primary)
-        new = placed.own - placed.published
+    compared_with = [board_of(run.records, published.boards) for run in runs]
+    for run, board in zip(runs, compared_with, strict=True):
+        placed = placement(run.records, board, primary)
+        new = placed.rows - placed.published
         trust = board.trust | dict.fromkeys(new, "yours")
-        output.heading(f"Your rows on the leaderboard, {board}")
+        tables, notes = [], _sentences(placed, board.entries)
         if not output.quiet:
-            output.ranking(placed.ranks, trust, placed.own)
-            output.notes(layout.ranking_notes(placed.ranks))
-            for row in sorted(new or placed.own, key=str):
-                if table := neighbours(placed.ranks, row):
-                    output.table(table)
-        output.notes(_told(placed, board.entries))
+            tables = rankings(placed.ranks, trust, placed.rows)
+            nearby = (neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str))
+            tables += [table for table in nearby if table]
+            notes = [*layout.ranking_notes(placed.ranks), *notes]
+        output.print(
+            Section(f"Your rows on the leaderboard, {board}", tables=tables, notes=notes),
+            ranking_csv(placed.ranks, trust) if output.csv and not output.quiet else "",
+        )
     return 0
 
 
@@ -106,16 +112,16 @@ def _read(directory: Path, detectors: str) -> tuple[list[Record], Sequence[str]]
 
 def _of_entries(board: PublishedBoard) -> list[str]:
     """Return which rows each entry has."""
-    rows = grouped(board.entries, board.entries.__getitem__)
-    return [f"Entry {name}: {', '.join(map(str, own))}." for name, own in sorted(rows.items())]
+    entries = grouped(board.entries, board.entries.__getitem__)
+    return [f"Entry {name}: {', '.join(map(str, rows))}." for name, rows in sorted(entries.items())]
 
 
-def _told(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
-    """Return a sentence on the place of each row, and what is to be known of it."""
+def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
+    """Return a sentence on the rank of each row, and what is to be known of it."""
     lines = []
-    for one in (s for s in placed.ranks.standings if s.entry in placed.own):
-        row, (first, second) = one.entry, map(_rank, (one.rank, one.alarm_rank))
-        text = f"{row}: {first} by separability, {second} by guaranteed alarms."
+    for standing in (s for s in placed.ranks.standings if s.entry in placed.rows):
+        row, ranks = standing.entry, map(_rank, (standing.rank, standing.alarm_rank))
+        text = "{}: {} by separability, {} by guaranteed alarms.".format(row, *ranks)
         if row in placed.published:
             text += f" It has the numbers of that row of entry {entries[row]}, and its place."
         elif row in placed.replaced:
@@ -129,7 +135,7 @@ def _told(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
             f"{len(placed.expected)}, and so not the board's. With few episodes hardly any "
             "difference is significant. Run the other cells into the same directory."
         )
-    if placed.own - placed.published:
+    if placed.rows - placed.published:
         lines.append(
             "New rows are ranked as if a maintainer had run them again. Until then an entry stands "
             "below the rows that were."
@@ -142,38 +148,17 @@ def _rank(rank: int | None) -> str:
 
 
 class _Output:
-    """Prints tables and notes as the options ask: for a terminal, as Markdown, or as CSV."""
+    """Prints sections as the options ask: for a terminal, as Markdown, or as CSV."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.markdown, self.csv, self.quiet = options.markdown, options.csv, options.verbosity < 0
-        self.console = make_console()
-        self.reporter = TerminalReporter(self.console)
+        self._console = make_console()
 
-    def heading(self, text: str) -> None:
-        if not self.csv:
-            self.console.print(f"## {rendering.escape(text)}\n" if self.markdown else f"{text}\n")
-
-    def ranking(
-        self, ranks: RankedBoard, trust: Mapping[Setting, str], own: Collection[Setting] = ()
-    ) -> None:
+    def print(self, section: Section, csv: str = "") -> None:
         if self.csv:
-            print(rendering.ranking_csv(ranks, trust), end="")
-            return
-        for table in rankings(ranks, trust, own):
-            self.table(table)
-
-    def table(self, table: Table) -> None:
-        if self.markdown:
-            print(rendering.markdown(table))
-        elif not self.csv:
-            self.reporter.table(table)
-
-    def notes(self, lines: Sequence[str]) -> None:
-        if self.csv:
-            return
-        for line in lines:
-            if self.markdown:
-                print(f"- {rendering.escape(line)}")
-            else:
-                print(textwrap.fill(line, self.console.width))
-        print()
+            print(csv, end="")
+        elif self.markdown:
+            print(markdown_section(section))
+        else:
+            self._console.print(f"{section.title}\n")
+            print_sections([section], self._console)

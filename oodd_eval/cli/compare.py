@@ -2,14 +2,22 @@
 
 import argparse
 from pathlib import Path
+from typing import Final
 
 from oodd_eval.cli import EXPRESSION, Parser, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES, RANKING
 from oodd_eval.names import expression, select
-from oodd_eval.results import paired, regression
-from oodd_eval.results.regression import RecordSet, read_record_set, rendering, write_reference
+from oodd_eval.results import compare as regression
+from oodd_eval.results import paired
+from oodd_eval.results.reference import RecordSet, read_record_set, write_reference
+from oodd_eval.results.render.junit import junit
+from oodd_eval.results.render.terminal import print_prose, print_table
+from oodd_eval.results.render.text import markdown_section
+
+LOG_WIDTH: Final = 160
+"""Columns that a log has at least."""
 
 
 def define(parser: Parser) -> None:
@@ -50,13 +58,13 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(
             "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE"
         )
-    wanted = expression(options.expression)
-    now = read_record_set(options.results).selected(wanted)
+    passes = expression(options.expression)
+    now = read_record_set(options.results).selected(passes)
     if options.rows:
         return _rows(now, options)
     code = 0
     if options.against:
-        code = _compare(now, read_record_set(options.against).selected(wanted), options)
+        code = _compare(now, read_record_set(options.against).selected(passes), options)
     # Last, so that a file can be compared with and then replaced.
     if options.write_reference:
         if not now.records:
@@ -70,43 +78,55 @@ def run(options: argparse.Namespace) -> int:
 
 def _rows(now: RecordSet, options: argparse.Namespace) -> int:
     if len(options.rows) != 2 or options.against or options.write_reference:
-        given = " ".join(options.rows)
-        raise UsageError(f"rows {given!r}, expected two, without --against or --write-reference")
+        rows = " ".join(options.rows)
+        raise UsageError(f"rows {rows!r}, expected two, without --against or --write-reference")
     if not now.boards:
         return say(f"no record of {options.results} is selected", 5)
     first, second = options.rows
-    found = []
+    lines = []
     unknown: UnknownNameError | None = None
     for conditions, cells in now.boards.items():
         try:
             compared = paired.compare(list(cells.values()), first, second, options.metric)
-            found.append(f"{conditions}\n{compared}")
+            lines.append(f"{conditions}\n{compared}")
         except UnknownNameError as error:
             unknown = unknown or error
-    if unknown and not found:
+    if unknown and not lines:
         raise unknown
     # A directory may also hold boards, runs with --limit say, without these rows.
-    print("\n".join(found))
+    print("\n".join(lines))
     return 0
 
 
 def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) -> int:
     known = dict.fromkeys((*NAMES, *reference.metrics()))
     tolerances = regression.parse_tolerances(options.fail, known)
-    judged_by = {"by": options.by, "two_sided": options.two_sided}
+    rules = {"by": options.by, "two_sided": options.two_sided}
     try:
-        found = regression.compare(now, reference, tolerances, **judged_by)
+        comparison = regression.compare(now, reference, tolerances, **rules)
     except regression.NothingInCommonError as error:
         return say(str(error), 5)
-    for path, render in ((options.junit, rendering.junit), (options.markdown, rendering.markdown)):
-        try:
-            if path:
-                Path(path).write_text(render(found), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{path!r} cannot be written: {error.strerror}") from None
+    if options.junit:
+        _write(options.junit, junit(comparison))
+    if options.markdown:
+        _write(options.markdown, markdown_section(regression.section(comparison)))
     console = make_console()
-    if options.verbosity < 0:
-        console.print(rendering.summary(found))
-    else:
-        rendering.show(found, console, everything=options.verbosity > 0)
-    return int(bool(found.failures))
+    if options.verbosity >= 0:
+        section = regression.section(comparison, everything=options.verbosity > 0)
+        # Nobody knows how wide a log is; a row that is broken is hard to read anywhere.
+        width = console.width if console.is_terminal else max(console.width, LOG_WIDTH)
+        for table in section.tables:
+            print_table(table, console, width)
+        for note in comparison.notes:
+            print_prose(note, console, "yellow")
+    console.print(regression.summary(comparison))
+    if comparison.failures and options.verbosity >= 0:
+        print_prose(regression.verdict(comparison), console, "bold red")
+    return int(bool(comparison.failures))
+
+
+def _write(path: str, text: str) -> None:
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path!r} cannot be written: {error.strerror}") from None

@@ -10,7 +10,7 @@ from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unf
 
 from oodd_eval.cli import Parser, add_resources, say_notes, value
 from oodd_eval.cli.data import record_split
-from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
+from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
@@ -18,6 +18,7 @@ from oodd_eval.names import check_known, seconds, select
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
+from oodd_eval.results.render.terminal import print_table
 from oodd_eval.scoring.executors import RunSettings, available_cores
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.runner import RunOutcome
@@ -88,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.verbosity >= 0 or options.plan:
         data = f"split {header.split}, digest {header.split_digest[:12]}"
         console.print(f"reproduction, tier {header.tier.name}: {data}")
-        TerminalReporter(console).table(stages(wanted, left, rows, fitted, jobs))
+        print_table(stages(wanted, left, rows, fitted, jobs), console)
     if options.plan:
         return 0
     results.prepare()
@@ -141,4 +142,4 @@ def _render(options: argparse.Namespace, header: Reproduction, records: list[Rec
         publish(directory, header, records, returns, figures=False, other=other)
     if options.verbosity >= 0:
         console.print(f"tables, figures and claims in {directory / 'README.md'}")
-    return int(not all(r.ok for r in header.own(records)))
+    return int(not all(r.ok for r in header.select(records)))

@@ -17,7 +17,8 @@ from oodd_eval.names import expression, whole_numbers
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import REPORT, ResultsDirectory
-from oodd_eval.results.tables import rendering
+from oodd_eval.results.render import FORMATS
+from oodd_eval.results.report import Report
 from oodd_eval.scoring.executors import LOCAL, RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run as carry_out
@@ -110,9 +111,9 @@ def run(options: argparse.Namespace) -> int:
     done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
     cli.say_notes(results.notes)
     if done.records:
-        report = rendering.report(results.records(), intervals=options.intervals)
+        report = Report(results.records(), intervals=options.intervals)
         path = results.path / REPORT
-        write_text(path, report)
+        write_text(path, FORMATS["markdown"].render(report))
         if options.verbosity >= 0:
             console.print(f"results in {results.path}, tables in {path}")
     if done.interrupted:

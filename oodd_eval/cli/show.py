@@ -1,7 +1,6 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
 import argparse
-import json
 
 from oodd_eval.cli import EXPRESSION, Parser, say, say_notes
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
@@ -9,14 +8,12 @@ from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import load_split
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
-from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
-from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import boards
-from oodd_eval.results.tables.rendering import csv_rows, report
+from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render.terminal import print_sections
+from oodd_eval.results.report import Report
 
 
 def define(parser: Parser) -> None:
@@ -37,9 +34,8 @@ def define(parser: Parser) -> None:
         help="metric of that table (default: auc_matched; see oodd-eval list metrics)")
     add("--wide", action="store_true",
         help="print all metrics, nulls and guaranteed alarms at 10, 5 and 1 %% among them")
-    add("--markdown", action="store_true", help="print Markdown, everything in it")
-    add("--csv", action="store_true", help="print a line per cell with all metrics")
-    add("--json", action="store_true", help="print the same as a JSON array")
+    for name, layout in FORMATS.items():
+        add(f"--{name}", action="store_true", help=f"print {layout.summary}")
     add("--env", default="all", metavar="NAMES", help="only these environments (default: all)")
     add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
     # fmt: on
@@ -52,41 +48,30 @@ def run(options: argparse.Namespace) -> int:
     records = results.records()
     known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
     chosen = select("environment", options.env, known)
-    wanted = expression(options.expression)
-    records = [r for r in records if r.environment in chosen and wanted(str(r.cell))]
+    passes = expression(options.expression)
+    records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
     if not options.stored:
         records = _recomputed(records, results, options.split)
     say_notes(results.notes)
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))
-    if options.csv or options.json:
-        # Neither has a NaN: null in JSON, nothing in CSV.
-        rows = [
-            {name: None if v != v else v for name, v in row.items()}  # noqa: PLR0124
-            for row in Results(records).to_rows()
-        ]
-        print(json.dumps(rows, indent=1) + "\n" if options.json else csv_rows(rows), end="")
+    if options.detector:
+        check_known("detector of these results", {r.detector for r in records}, options.detector)
+    layout = next((FORMATS[name] for name in FORMATS if getattr(options, name)), None)
+    report = Report(
+        records,
+        intervals=options.intervals,
+        detail="full" if layout else "wide" if options.wide else "brief",
+        detector=options.detector or "",
+        metric=options.metric,
+    )
+    if layout:
+        print(layout.render(report), end="")
         return code
-    if options.markdown:
-        print(report(records, intervals=options.intervals), end="")
-        return code
-    reporter = TerminalReporter(make_console(), intervals=options.intervals)
-    name, intervals = options.detector, options.intervals
-    if name:
-        check_known("detector of these results", {r.detector for r in records}, name)
-    for board in boards(records) if name else ():
-        for entry in (e for e in board.entries if e.detector == name):
-            reporter.table(layout.by_anomaly(board, entry, options.metric, intervals=intervals))
-            own = thresholds([r for r in board.records if r.setting == entry])
-            if own.get(entry):
-                reporter.table(ladder.by_place(board, entry, own, intervals=intervals))
-    if not name:
-        reporter.tables(records)
-        for board in boards(records) if options.wide else ():
-            reporter.table(layout.all_metrics(board, intervals=intervals))
-            for table in layout.all_alarms(board, intervals=intervals):
-                reporter.table(table)
+    reporter = TerminalReporter(make_console())
+    print_sections(report.sections, reporter.console)
+    if not options.detector:
         reporter.failures(records)
     reporter.console.print(summary(records))
     return code
@@ -98,6 +83,6 @@ def _recomputed(records: list[Record], results: ResultsDirectory, at: str | None
     for name, digest in dict.fromkeys((r.split, r.split_digest) for r in records):
         # A split that is not the published one carries its digest behind its name.
         split = load_split(at or name.partition("@")[0])
-        own = [r for r in records if r.split_digest == digest]
-        fresh |= {r.identity: r for r in rescore(own, results, split)}
+        of_split = [r for r in records if r.split_digest == digest]
+        fresh |= {r.identity: r for r in rescore(of_split, results, split)}
     return [fresh[r.identity] for r in records]

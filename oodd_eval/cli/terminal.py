@@ -6,25 +6,23 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import product
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
-from tabulate import tabulate
 
 from oodd_eval._version import __version__
 from oodd_eval.cli import say
-from oodd_eval.data.facts import GROUPS, PROTOCOL
+from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.own import OwnSpec, register
 from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins, discover, printable
+from oodd_eval.results.board import boards
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import boards
-from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.render.terminal import print_prose, print_sections
+from oodd_eval.results.report import Report
 from oodd_eval.scoring.plan import Plan, Unit
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
@@ -154,41 +152,20 @@ class TerminalReporter:
 
     def tables(self, records: Sequence[Record]) -> None:
         """Print the tables of every board among some records."""
-        for board in boards(records):
-            self.table(layout.separability(board, intervals=self.intervals))
-            for make in (layout.guaranteed, layout.attribution):
-                if table := make(board, intervals=self.intervals):
-                    self.table(table)
-            for table in ladder.tables(board, intervals=self.intervals):
-                self.table(table)
-            groups = [group for group in GROUPS if board.in_group(group)]
-            for h, group in product(board.horizons, groups):
-                self.table(layout.anomaly_groups(board, h, [group], intervals=self.intervals))
-            for sentence in layout.findings(board):
-                self._prose(sentence, "yellow")
-            for line in layout.notes(board):
-                self._prose(line, "dim")
-            self._print("")
+        report = Report(records, intervals=self.intervals, detail="brief")
+        print_sections(report.sections, self.console)
 
     def failures(self, records: Sequence[Record]) -> None:
         """Print why fits failed."""
         for record in (record for board in boards(records) for record in board.failures()):
             name = f"{record.environment}/{record.cell.label}"
-            self._prose(f"{record.status.upper()} {name}: {record.reason}", "red")
+            print_prose(f"{record.status.upper()} {name}: {record.reason}", self.console, "red")
             if self.verbosity <= 0 or not self._log or not record.scores:
                 continue
             if (path := self._log(record.scores)).is_file():
                 self._print(f"  {path}:")
                 for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
                     self._print(f"    {printable(line)}")
-
-    def table(self, table: Table) -> None:
-        """Print one table within the console's width: as it is, turned, or in parts."""
-        self._print(table.title, "bold")
-        for part in _fitting(table, self.console.width):
-            self._print(_set(part) + "\n")
-        if table.note:
-            self._prose(table.note + "\n", "dim")
 
     def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
         parts = [f"{last.status:<12} {name}"]
@@ -203,10 +180,6 @@ class TerminalReporter:
                 parts.append(f"{spent:.1f} s")
         self._print("  ".join(parts), _COLOURS.get(last.status, "red"))
 
-    def _prose(self, text: str, style: str) -> None:
-        """Print a sentence, wrapped between words."""
-        self.console.print(Text(text, style), soft_wrap=False)
-
     def _print(self, text: str, style: str = "") -> None:
         self.console.print(Text(text, style))
 
@@ -215,28 +188,3 @@ def summary(records: Sequence[Record]) -> str:
     """Return how many cells came to which status, such as ``48 ok, 8 timeout``."""
     counts = Counter(r.status for r in records)
     return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts[s]) or "no cells"
-
-
-def _set(table: Table) -> str:
-    alignment = table.alignment if table.rows else None
-    return str(tabulate(table.rows, table.header, colalign=alignment, disable_numparse=True))
-
-
-def _fitting(table: Table, width: int) -> list[Table]:
-    """Return the table, the table turned, or parts of its columns, whichever first fits."""
-    for whole in (table, table.transposed()):
-        if _width(whole) <= width:
-            return [whole]
-    labels = list(range(table.labels))
-    parts = [labels]
-    for column in range(table.labels, len(table.header)):
-        wider = [*parts[-1], column]
-        if parts[-1] == labels or _width(table.columns(wider)) <= width:
-            parts[-1] = wider
-        else:
-            parts.append([*labels, column])
-    return [table.columns(part) for part in parts]
-
-
-def _width(table: Table) -> int:
-    return max(map(len, _set(table).splitlines()), default=0)

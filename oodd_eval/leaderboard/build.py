@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from oodd_eval._version import repository
-from oodd_eval.data.facts import GROUPS, SPLITS
+from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
@@ -26,13 +26,14 @@ from oodd_eval.leaderboard.sections import (
     suite_sections,
 )
 from oodd_eval.leaderboard.site.data import Json, power_of
+from oodd_eval.results.board import Board
 from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import layout, rendering
-from oodd_eval.results.tables.board import Board, primary_settings
-from oodd_eval.results.tables.layout import Table
-from oodd_eval.results.tables.rendering import escape
-from oodd_eval.results.tables.rendering import markdown as table
+from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
+from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
+from oodd_eval.results.report import Section
+from oodd_eval.results.standings import primary_settings
+from oodd_eval.results.tables import Table, layout
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -41,7 +42,6 @@ STALE: Final = "no part of the leaderboard any more"
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 
-MANY: Final = 6  # findings beyond which they are folded away
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
@@ -59,28 +59,30 @@ class SuiteParts(NamedTuple):
 
 
 @without_collector()
-def suite_parts(place: Path) -> SuiteParts:
+def suite_parts(directory: Path) -> SuiteParts:
     """Return what a leaderboard's directory has of further test suites, ready to be shown."""
-    own = suite_sections(place)
-    return SuiteParts([*map(_suite, own)], power_of(own), suite_cells(own), suite_lines(own))
+    suites = suite_sections(directory)
+    page = [*map(_suite, suites)]
+    return SuiteParts(page, power_of(suites), suite_cells(suites), suite_lines(suites))
 
 
 def suite_cells(suites: Sequence[SuiteSection]) -> str:
     """Return the lines that further test suites have in the table of all cells."""
-    lines: list[tuple[dict[str, str], Record]] = []
+    lines = []
     for suite in suites:
         first = primary_settings(suite.board.records)
         for r in suite.board.records:
-            trivial = str(suite.board.is_trivial(r.setting)).lower()
-            about = {
-                "board": suite.name,
-                "entry": "",
-                "trust": "",
-                "primary": str(r.setting in first).lower(),
-                "trivial": trivial,
-            }
+            trivial = suite.board.is_trivial(r.setting)
+            about = _origin(suite.name, "", "", primary=r.setting in first, trivial=trivial)
             lines.append((about, r))
-    return rendering.cells_csv(lines, header=False)
+    return cells_csv(lines, header=False)
+
+
+def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool) -> dict[str, str]:
+    """Return the columns that stand before a cell's own in the table of all cells."""
+    flags = {"primary": primary, "trivial": trivial}
+    texts = {name: str(flag).lower() for name, flag in flags.items()}
+    return {"board": board, "entry": entry, "trust": trust, **texts}
 
 
 @without_collector()
@@ -98,21 +100,21 @@ def build(
     ResultsError: the entries contradict one another.
     """
     on_part("ranking")
-    found = sections(entries)
+    by_board = sections(entries)
     on_part("suites")
     further = suites()
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
-    files: dict[str, str | bytes] = {PAGE: page(found, further.page, site=address)}
+    files: dict[str, str | bytes] = {PAGE: page(by_board, further.page, site=address)}
     on_part("tables")
-    for section in found:
-        files[section.file("ranking")] = rendering.ranking_csv(section.ranks, section.trust)
-        files[section.file("comparisons")] = rendering.comparisons_csv(section.ranks)
+    for section in by_board:
+        files[section.file("ranking")] = ranking_csv(section.ranks, section.trust)
+        files[section.file("comparisons")] = comparisons_csv(section.ranks)
     on_part("published board")
-    files[PUBLISHED] = published_bytes(found, further.published)
-    files[CELLS] = cells(found, further.cells)
+    files[PUBLISHED] = published_bytes(by_board, further.published)
+    files[CELLS] = cells(by_board, further.cells)
     on_part("site")
-    parts = site.files(found, further.power, project=repository())
+    parts = site.files(by_board, further.power, project=repository())
     files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
@@ -129,17 +131,11 @@ def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
     lines: list[tuple[dict[str, str], Record]] = []
     for section in sections:
         for row in section.ranks.standings:
-            entry, flags = section.sources[row.entry], (row.primary, row.trivial)
-            primary, trivial = (str(flag).lower() for flag in flags)
-            about = {
-                "board": "leaderboard",
-                "entry": entry.meta.id,
-                "trust": entry.trust,
-                "primary": primary,
-                "trivial": trivial,
-            }
+            entry = section.sources[row.entry]
+            flags = {"primary": row.primary, "trivial": row.trivial}
+            about = _origin("leaderboard", entry.meta.id, entry.trust, **flags)
             lines += [(about, r) for r in row.records]
-    return compress((rendering.cells_csv(lines) + suites).encode())
+    return compress((cells_csv(lines) + suites).encode())
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -219,7 +215,7 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    rendered = [
+    tables = [
         layout.separability(board),
         *layout.alarms(ranks),
         layout.attribution(board, intervals=True, standings=ranks.standings),
@@ -230,30 +226,34 @@ def _section(section: LeaderboardSection) -> str:
         layout.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
         layout.failures(board),
     ]
+    body = Section(
+        _title(board),
+        findings=layout.findings(board),
+        tables=[table for table in tables if table],
+        notes=layout.notes(board),
+    )
     parts = [
-        f"## {escape(_title(board))}\n",
+        f"## {escape(body.title)}\n",
         f"{about_split(board)}\n",
         f"{size} As CSV: {files}.\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
-        table(layout.ranking(ranks, section.trust)),
+        markdown_table(layout.ranking(ranks, section.trust)),
         TEXTS["legend"],
-        *(f"- {escape(line)}" for line in layout.ranking_notes(ranks)),
+        *markdown_list(layout.ranking_notes(ranks)),
         "",
-        *_findings(board),
-        *(table(one) for one in rendered if one),
-        *(f"- {escape(line)}" for line in layout.notes(board)),
+        markdown_body(body),
     ]
-    return "\n".join(parts) + "\n"
+    return "\n".join(parts)
 
 
 def _suite(section: SuiteSection) -> str:
     """Return what rows find on a further test suite, with a link to all tables."""
-    place = f"{SUITES}/{section.name}/{PAGE}"
+    address = f"{SUITES}/{section.name}/{PAGE}"
     several = len({row.horizon for row in section.board.entries}) > 1
     texts = TEXTS["suites"]["graded" if section.graded else "horizons" if several else "nominal"]
     title = f"## {texts['title']}: {escape(_title(section.board))}\n"
-    text = texts["text"].format(split=escape(section.board.split), place=place)
-    return "\n".join([title, text, *map(table, section.tables[:1])])
+    text = texts["text"].format(split=escape(section.board.split), place=address)
+    return "\n".join([title, text, *map(markdown_table, section.tables[:1])])
 
 
 def about_split(board: Board) -> str:
@@ -271,27 +271,13 @@ def about_split(board: Board) -> str:
     return str(TEXTS["published"].format(**asdict(split), **tier, episodes=episodes))
 
 
-def _findings(board: Board) -> list[str]:
-    """Return what simple rows beat, in bold; folded away where it is much."""
-    found = [escape(sentence) for sentence in layout.findings(board)]
-    if len(found) <= MANY:
-        return [f"**{sentence}**\n" for sentence in found]
-    summary = f"{len(found)} times a simple row has a higher mean than a learned one"
-    listed = [f"- {sentence}" for sentence in found]
-    return [f"<details><summary><b>{summary}</b></summary>\n", *listed, "\n</details>\n"]
-
-
 def _as_in_the_paper(board: Board) -> list[Table]:
     """Return the layout of the paper's Table 5 for each horizon and group of anomalies.
 
     It has a column per row of the board, so that it is kept to rows with default parameters.
     """
     records = [r for r in board.records if not r.overrides]
-    if not records:
-        return []
-    own = Board(records)
-    groups = [group for group in GROUPS if own.in_group(group)]
-    return [layout.anomaly_groups(own, h, [group]) for h in own.horizons for group in groups]
+    return layout.anomaly_groups(Board(records)) if records else []
 
 
 def _entry(entry: SubmittedEntry) -> str:
@@ -299,8 +285,8 @@ def _entry(entry: SubmittedEntry) -> str:
     meta = entry.meta
     grant = entry.grant
     granted = f", by {grant.by} on {grant.day}: {grant.how}" if grant else ""
-    shown = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
-    plugins = [shown.format(**plugin) for plugin in meta.plugins]
+    text = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
+    plugins = [text.format(**plugin) for plugin in meta.plugins]
     packages = sorted(meta.environment.get("packages", {}).items())
     python = f"Python {meta.environment.get('python', '')}"
     lines = [
@@ -318,5 +304,5 @@ def _entry(entry: SubmittedEntry) -> str:
     if meta.url:
         plain = re.fullmatch(r"https?://[^\s<>|\\`]+", meta.url)
         listed.append(f"- Page: <{meta.url}>" if plain else f"- Page: {escape(meta.url)}")
-    made = ["", "To run it again:", "", *(f"    {command}" for command in entry.commands)]
-    return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, *made, ""])
+    listed += ["", "To run it again:", "", *(f"    {command}" for command in entry.commands)]
+    return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, ""])

@@ -3,39 +3,40 @@
 The ranks are made by the code that ranks the board itself.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.published import ALARMS, PublishedBoard, slim
 from oodd_eval.metrics.catalogue import ALARM_RANKING, FOUND_WITHIN, RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
+from oodd_eval.results.board import expected_cells, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record, same_terms
-from oodd_eval.results.tables.board import (
+from oodd_eval.results.standings import (
     SEEDS,
     RankedBoard,
     Standing,
-    grouped,
     has_few_seeds,
     primary_settings,
     ranked,
 )
-from oodd_eval.results.tables.layout import Table, show_value
+from oodd_eval.results.tables import Mean, Table, texts
 
-OWN: Final = "> "  # stands before the rows of one's own
+MARK: Final = "> "
+"""Stands before the rows of one's own."""
 
 
 class Placement(NamedTuple):
     """A run among the rows of a published board.
 
-    `own` are its rows, of which the board has those in `published` with the same numbers, and
+    `rows` are its rows, of which the board has those in `published` with the same numbers, and
     others of the same name in `replaced`. `cells` are compared: all that the board `expected`, or
     fewer where no new row of the run has them all. `lacking` says by row what a ranked one needs.
     """
 
     ranks: RankedBoard
-    own: set[Setting]
+    rows: set[Setting]
     published: set[Setting]
     replaced: set[Setting]
     cells: set[tuple[str, str]]
@@ -43,7 +44,7 @@ class Placement(NamedTuple):
     lacking: dict[Setting, str]
 
 
-def place(
+def placement(
     records: Sequence[Record], board: PublishedBoard, primary: Collection[str] = ()
 ) -> Placement:
     """Place the rows of a run among those of a board, as if they had been run again.
@@ -53,12 +54,12 @@ def place(
     for its detectors. `UsageError`: the rows of the run have no cell in common.
     """
     by_row = grouped(map(slim, records), lambda r: r.setting)
-    theirs = grouped(board.records, lambda r: r.setting)
-    same = {row for row, own in by_row.items() if row in theirs and _within(own, theirs[row])}
-    new = {row: own for row, own in by_row.items() if row not in same}
-    replaced = new.keys() & theirs.keys()
-    expected = {r.position for r in board.records}
-    has = [{r.position for r in own if r.ok} & expected for own in new.values()]
+    on_board = grouped(board.records, lambda r: r.setting)
+    same = {r for r, records in by_row.items() if r in on_board and _within(records, on_board[r])}
+    new = {row: records for row, records in by_row.items() if row not in same}
+    replaced = new.keys() & on_board.keys()
+    expected = expected_cells(board.records)
+    has = [{r.position for r in records if r.ok} & expected for records in new.values()]
     cells = set.intersection(*has) if has and expected not in has else expected
     if not cells:
         raise UsageError(
@@ -67,101 +68,93 @@ def place(
         )
     first = board.primary - replaced
     taken = {row.detector for row in first}
-    free = [r for own in new.values() for r in own if r.setting.detector not in taken]
+    free = [r for rows in new.values() for r in rows if r.setting.detector not in taken]
     chosen = {row.detector: row for row in primary_settings(free)}
     chosen |= {row.detector: row for row in new if str(row) in primary and row.detector in chosen}
     # With too few seeds a primary row has no rank. A variant has the one that it would have.
     first = first | {row for row in chosen.values() if not has_few_seeds(new[row])}
-    used = [r for own in (theirs | new).values() for r in own if r.position in cells]
-    found = {row: _lacking(own, expected) for row, own in new.items()}
+    used = [r for rows in (on_board | new).values() for r in rows if r.position in cells]
+    lacking = {row: _lacking(rows, expected) for row, rows in new.items()}
     return Placement(
-        ranks=ranked(used, first, board.rerun and board.rerun | new.keys()),
-        own=set(by_row),
+        ranks=ranked(used, first, board.rerun and board.rerun | new.keys(), expected=cells),
+        rows=set(by_row),
         published=same,
         replaced=set(replaced),
         cells=cells,
         expected=expected,
-        lacking={row: text for row, text in found.items() if text},
+        lacking={row: text for row, text in lacking.items() if text},
     )
 
 
-def _within(own: Sequence[Record], others: Sequence[Record]) -> bool:
+def _within(records: Sequence[Record], others: Sequence[Record]) -> bool:
     """Tell whether all numbers of a row are among those of another."""
     known = {(r.position, r.seed, r.status): r.per_trajectory for r in others}
-    keys = [(r.position, r.seed, r.status) for r in own]
+    keys = [(r.position, r.seed, r.status) for r in records]
     return all(
         key in known and same_terms(known[key], r.per_trajectory)
-        for key, r in zip(keys, own, strict=True)
+        for key, r in zip(keys, records, strict=True)
     )
 
 
 def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
     """Return what a row has to have besides for a rank on the board; empty if nothing."""
-    found = grouped(records, lambda r: r.seed)
+    seeds = grouped(records, lambda r: r.seed)
     sizes = grouped(expected, lambda cell: cell[0])
     parts = []
-    for seed, own in sorted(found.items()):
-        missing = grouped(
-            sorted(expected - {r.position for r in own if r.ok}), lambda cell: cell[0]
-        )
+    for seed, of_seed in sorted(seeds.items()):
+        missing = grouped(sorted(expected - {r.position for r in of_seed if r.ok}), lambda c: c[0])
         named = [
             e if len(cells) == len(sizes[e]) else ", ".join(map("/".join, cells))
             for e, cells in missing.items()
         ]
         if named:
             count = sum(map(len, missing.values()))
-            of = f" with seed {seed}" if len(found) > 1 else ""
+            of = f" with seed {seed}" if len(seeds) > 1 else ""
             parts.append(f"{count} of {len(expected)} cells{of} ({', '.join(named)})")
     if has_few_seeds(records):
-        parts.append(f"{SEEDS - len(found)} of {SEEDS} detector seeds")
+        parts.append(f"{SEEDS - len(seeds)} of {SEEDS} detector seeds")
     return " and ".join(parts)
 
 
 def rankings(
-    ranks: RankedBoard, trust: Mapping[Setting, str], own: Collection[Setting] = ()
+    ranks: RankedBoard, trust: Mapping[Setting, str], marked: Collection[Setting] = ()
 ) -> list[Table]:
-    """Return the ranking by separability and that by guaranteed alarms, `own` rows marked.
+    """Return the ranking by separability and that by guaranteed alarms, some rows `marked`.
 
     Trust is by row; a row without is of no entry. Letters of tie groups stand behind a rank.
     """
-    board = ranks.board
-    over = board.environments, board.anomalies
+    over = ranks.board.environments, ranks.board.anomalies
 
-    def texts(one: Standing, names: Sequence[str]) -> list[str]:
-        values = [board.mean(one.entry, *over, n, intervals=n == names[0]) for n in names]
-        return [show_value(v, n) for v, n in zip(values, names, strict=True)]
+    def rows(
+        standings: Iterable[Standing], ranking: Ranking, *metrics: str
+    ) -> list[tuple[Setting, list[str]]]:
+        columns = [Mean(name, name, *over, name == metrics[0]) for name in metrics]
+        lines = []
+        for row in standings:
+            label = str(row.entry)
+            rank = f"{row.printed(ranking.ranks.get(label))} {ranking.letters(label)}".rstrip()
+            name = f"{MARK * (row.entry in marked)}{label}{row.marks}"
+            lines.append((row.entry, [rank, name, *texts(ranks.board, row.entry, columns)]))
+        return lines
 
-    def labels(one: Standing, rank: int | None, ranking: Ranking) -> list[str]:
-        place = UNDEFINED if rank is None else f"({rank})" if one.below else str(rank)
-        marks = " (trivial)" * one.trivial + " (variant)" * (not one.primary)
-        ties = ranking.letters(str(one.entry))
-        return [f"{place} {ties}".rstrip(), f"{OWN * (one.entry in own)}{one.entry}{marks}"]
-
-    first = [
-        [
-            *labels(one, one.rank, ranks.ranking),
-            *texts(one, [RANKING]),
-            trust.get(one.entry, UNDEFINED),
-        ]
-        for one in ranks.standings
-    ]
-    names = [ALARM_RANKING, *ALARMS]
+    by_separability = rows(ranks.standings, ranks.ranking, RANKING)
     order = {row: i for i, row in enumerate(ranks.alarms.ranks)}
-    by_alarms = sorted(ranks.standings, key=lambda one: order.get(str(one.entry), len(order)))
-    by_alarms = [*(s for s in by_alarms if not s.below), *(s for s in by_alarms if s.below)]
-    second = [[*labels(one, one.alarm_rank, ranks.alarms), *texts(one, names)] for one in by_alarms]
+    standings = sorted(
+        ranks.standings, key=lambda row: (row.below, order.get(str(row.entry), len(order)))
+    )
+    by_alarms = rows(standings, ranks.alarms, ALARM_RANKING, *ALARMS)
     level = metric_info(ALARM_RANKING).level
     return [
         Table(
             "Ranking by separability: matched AUC (%), higher is better",
             ["rank", "row", "matched AUC", "trust"],
-            first,
+            [[*line, trust.get(entry, UNDEFINED)] for entry, line in by_separability],
             labels=2,
         ),
         Table(
             f"Ranking by guaranteed alarms at {level}: censored delay (steps), lower is better",
             ["rank", "row", "delay", f"found in {FOUND_WITHIN[0]}", "missed", "false"],
-            second,
+            [line for _, line in by_alarms],
             labels=2,
             note="The delay counts a miss as the rest of its episode. The shares (%) are of "
             "episodes found within so many steps, of those missed, and of nominal episodes with "
@@ -177,22 +170,22 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
     """
     lines = []
     near = {str(s.entry) for s in ranks.standings if s.primary and not s.below}
-    for name, ranking, metric in (
+    for ranked_by, ranking, metric in (
         ("matched AUC", ranks.ranking, RANKING),
         ("delay", ranks.alarms, ALARM_RANKING),
     ):
-        own = (c for c in ranking.comparisons if c.first == str(row) and c.second in near)
-        tests = {c.second: c for c in own}
+        pairs = (c for c in ranking.comparisons if c.first == str(row) and c.second in near)
+        tests = {c.second: c for c in pairs}
         worse = {c.first for c in ranking.comparisons if c.second == str(row) and c.better}
         order = list(ranking.ranks)
         here = order.index(str(row)) if str(row) in order else len(order)
-        above = [other for other in order[:here] if other in tests][-1:]
-        below = [other for other in order[here:] if other in tests][:1]
-        for other in (*above, *below):
-            better = "better" if tests[other].better else "tie"
-            verdict = "worse" if other in worse else better
-            difference = _difference(tests[other], metric)
-            lines.append([name, other, str(ranking.ranks[other]), difference, verdict])
+        above = [name for name in order[:here] if name in tests][-1:]
+        below = [name for name in order[here:] if name in tests][:1]
+        for neighbour in (*above, *below):
+            better = "better" if tests[neighbour].better else "tie"
+            verdict = "worse" if neighbour in worse else better
+            difference = _difference(tests[neighbour], metric)
+            lines.append([ranked_by, neighbour, str(ranking.ranks[neighbour]), difference, verdict])
     header = ["metric", "against", "rank", "difference", "verdict"]
     note = "Paired differences over the same test episodes, this row minus the other."
     title = f"{row} and the rows next to it"

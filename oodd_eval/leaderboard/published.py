@@ -14,11 +14,12 @@ from oodd_eval.data.files import compress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.metrics.catalogue import ALARM_RANKING, FOUND_WITHIN, HEADLINE, RANKING
+from oodd_eval.results.board import Board, Conditions, boards, grouped
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.ladder import FOUND
 from oodd_eval.results.record import NAN, Metric, Record
-from oodd_eval.results.tables.board import Board, RankedBoard, boards, grouped, ranked
+from oodd_eval.results.standings import RankedBoard, ranked
 
 PUBLISHED: Final = "published.jsonl.gz"
 
@@ -51,9 +52,14 @@ class PublishedBoard:
         """The rows that were run again, which alone are ranked where there are any."""
         return {row for row, trust in self.trust.items() if trust == "re-run"}
 
+    @property
+    def conditions(self) -> Conditions:
+        """The conditions that all records have."""
+        return Conditions.of(self.records[0])
+
     def __str__(self) -> str:
         """Return what tells boards apart, such as ``mini, digest 7041bd7c9c2b, protocol 2``."""
-        return _conditions(self.records[0])
+        return str(self.conditions)
 
 
 class Published(NamedTuple):
@@ -67,7 +73,7 @@ class Published(NamedTuple):
         """The boards of further suites with several strengths, by name; reading them takes long."""
         records = read_records(self.file, matches=lambda line: _OF_SUITE in line)
         by_suite = grouped(records, lambda r: str(r.provenance["suite"]))
-        return {name: Board(own) for name, own in by_suite.items()}
+        return {name: Board(records) for name, records in by_suite.items()}
 
 
 def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
@@ -107,26 +113,28 @@ def published_file() -> Path:
     `ResultsError`: there is none.
     """
     here = Path(__file__)
-    found = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
-    for place in found:
-        if place.is_file():
-            return place
+    candidates = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
+    for path in candidates:
+        if path.is_file():
+            return path
     raise ResultsError(
-        f"this installation has no published board: expected {str(found[0])!r}; install oodd-eval "
-        "from its wheel, or run leaderboard build in its checkout"
+        f"this installation has no published board: expected {str(candidates[0])!r}; install "
+        "oodd-eval from its wheel, or run leaderboard build in its checkout"
     )
 
 
 def read_published(file: Path | None = None) -> Published:
     """Read the boards of the file, by default the one of this installation."""
     file = file or published_file()
-    found = []
+    published = []
     for board in boards(read_records(file, matches=lambda line: _OF_SUITE not in line)):
         origin = {r.setting: r.provenance for r in board.records}
-        entries, trust = ({row: own[k] for row, own in origin.items()} for k in ("entry", "trust"))
-        primary = {row for row, own in origin.items() if own["primary"]}
-        found.append(PublishedBoard(board.records, entries, trust, primary))
-    return Published(found, file)
+        entries, trust = (
+            {row: about[k] for row, about in origin.items()} for k in ("entry", "trust")
+        )
+        primary = {row for row, about in origin.items() if about["primary"]}
+        published.append(PublishedBoard(board.records, entries, trust, primary))
+    return Published(published, file)
 
 
 def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:
@@ -134,20 +142,20 @@ def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> Publ
 
     `UsageError`: there is none with their split digest, protocol and limit.
     """
-    first, known = records[0], list(among)
-    for board in known:
-        if _key(board.records[0]) == _key(first):
-            return board
-    listed = "; ".join(map(str, known)) or "none"
-    if any(b.records[0].split_digest == first.split_digest for b in known):
+    by_conditions = {board.conditions: board for board in among}
+    conditions = Conditions.of(records[0])
+    if conditions in by_conditions:
+        return by_conditions[conditions]
+    listed = "; ".join(map(str, by_conditions)) or "none"
+    if any(known.split_digest == conditions.split_digest for known in by_conditions):
         advice = "run again with this version, without --limit, into another directory"
     else:
-        name = first.split.partition("@")[0]
+        name = conditions.split.partition("@")[0]
         advice = "run on a published split, such as --split mini"
-        if any(b.records[0].split == name for b in known):
+        if any(known.split == name for known in by_conditions):
             advice += f"; a split {name} that was built otherwise is another one"
     raise UsageError(
-        f"these results cannot be compared with the board: they are of {_conditions(first)}, and "
+        f"these results cannot be compared with the board: they are of {conditions}, and "
         f"published is {listed}; {advice}"
     )
 
@@ -169,13 +177,3 @@ def slim(record: Record, metrics: Iterable[str] = RANKED_BY, **provenance: objec
         peak_rss_mb=NAN,
         steps_scored=None,
     )
-
-
-def _key(record: Record) -> tuple[str, int, int | None]:
-    return record.split_digest, record.protocol, record.limit
-
-
-def _conditions(record: Record) -> str:
-    limit = "" if record.limit is None else f", limit {record.limit}"
-    digest = f"digest {record.split_digest[:12]}"
-    return f"split {record.split}, {digest}, protocol {record.protocol}{limit}"

@@ -8,12 +8,12 @@ from typing import Final
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import SubmittedEntry, Trust, row_of
+from oodd_eval.results.board import Board, boards, expected_cells, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import ladder, layout
-from oodd_eval.results.tables.board import Board, RankedBoard, boards, primary_settings, ranked
-from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
+from oodd_eval.results.tables import Table, ladder, layout
 
 TABLES: Final = "tables"  # directory of the CSV files
 SUITES: Final = "suites"  # directory of results on further test suites, one directory a split
@@ -48,7 +48,7 @@ class LeaderboardSection:
         return f"{TABLES}/{self.name}-{kind}.csv"
 
     @property
-    def sort_key(self) -> tuple[int, str, int, int, str]:
+    def order(self) -> tuple[int, str, int, int, str]:
         """Order of the boards, see `sections`."""
         board = self.ranks.board
         name = board.split.partition("@")[0]
@@ -71,15 +71,15 @@ class SuiteSection:
     graded: bool
 
 
-def suite_sections(place: Path) -> list[SuiteSection]:
+def suite_sections(directory: Path) -> list[SuiteSection]:
     """Return what a leaderboard's directory has of results on further test suites."""
-    found = []
-    for own in sorted((place / SUITES).glob("*")):
-        for board in boards(ResultsDirectory(own).records()) if own.is_dir() else ():
+    suites = []
+    for path in filter(Path.is_dir, sorted((directory / SUITES).glob("*"))):
+        for board in boards(ResultsDirectory(path).records()):
             graded = ladder.tables(board)
             tables = graded or [layout.separability(board)]
-            found.append(SuiteSection(own.name, board, tables, graded=bool(graded)))
-    return found
+            suites.append(SuiteSection(path.name, board, tables, graded=bool(graded)))
+    return suites
 
 
 def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
@@ -92,21 +92,21 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     records: list[Record] = []
     for entry in sorted(entries, key=lambda entry: entry.meta.id):
         for record in entry.records:
-            if (other := owners.setdefault(row_of(record), entry)) is not entry:
+            if (owner := owners.setdefault(row_of(record), entry)) is not entry:
                 raise ResultsError(
-                    f"entries {other.meta.id!r} and {entry.meta.id!r} both hold row "
+                    f"entries {owner.meta.id!r} and {entry.meta.id!r} both hold row "
                     f"{str(record.setting)!r} of split digest {record.split_digest[:12]}, expected "
                     "one: remove the entry that is replaced, or give the detector another name"
                 )
             records.append(record)
-    found = []
+    by_board = []
     for board in boards(records):
         sources = {r.setting: owners[row_of(r)] for r in board.records}
         rerun = {row for row, entry in sources.items() if entry.trust == "re-run"}
         ranks = ranked(board.records, _primary(board.records, sources, rerun), rerun)
-        own = {entry.meta.id: entry for entry in sources.values()}
-        found.append(LeaderboardSection(ranks, [own[name] for name in sorted(own)], sources))
-    return sorted(found, key=lambda section: section.sort_key)
+        by_id = {entry.meta.id: entry for entry in sources.values()}
+        by_board.append(LeaderboardSection(ranks, [by_id[i] for i in sorted(by_id)], sources))
+    return sorted(by_board, key=lambda section: section.order)
 
 
 def _primary(
@@ -117,27 +117,27 @@ def _primary(
     A declared row takes the place of another. So the entry has to be the only one with rows of the
     detector, or it would push somebody else's row out of the ranking, and its row has to be whole.
     """
-    found = {row.detector: row for row in primary_settings(records, rerun)}
-    cells: dict[Setting, set[tuple[str, str]]] = {}
-    for r in records:
-        cells.setdefault(r.setting, set()).add(r.position)
+    primary = {row.detector: row for row in primary_settings(records, rerun)}
+    expected = expected_cells(records)
+    by_row = grouped(records, lambda r: r.setting)
+    cells = {row: expected & {r.position for r in rows} for row, rows in by_row.items()}
     declared: dict[str, Setting] = {}
     for row, entry in sources.items():
         if str(row) not in entry.meta.primary:
             continue
         name = f"entry {entry.meta.id!r} declares {str(row)!r} as the primary row of {row.detector}"
-        for other in (sources[r] for r in sources if r.detector == row.detector):
-            if other is not entry:
+        for owner in (sources[r] for r in sources if r.detector == row.detector):
+            if owner is not entry:
                 raise ResultsError(
-                    f"{name}, but entry {other.meta.id!r} has rows of it, too: only an entry with "
+                    f"{name}, but entry {owner.meta.id!r} has rows of it, too: only an entry with "
                     "all rows of a detector may choose, so leave the statement out"
                 )
         if (before := declared.setdefault(row.detector, row)) != row:
             raise ResultsError(f"{name}, and {str(before)!r}, too: expected one row a detector")
-        if lacking := cells[usual := found[row.detector]] - cells[row]:
+        if lacking := cells[usual := primary[row.detector]] - cells[row]:
             raise ResultsError(
                 f"{name}, which lacks {len(lacking)} cells that {str(usual)!r} has: expected a row "
                 "with all of them, so run the rest or leave the statement out"
             )
-        found[row.detector] = row
-    return set(found.values())
+        primary[row.detector] = row
+    return set(primary.values())

@@ -29,7 +29,7 @@ from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import primary_settings
+from oodd_eval.results.standings import primary_settings
 
 LARGE: Final = 10 * 10**6  # bytes of a large entry: a repository keeps every version of it
 

@@ -10,14 +10,13 @@ from html import escape
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
-from tabulate import tabulate
-
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
 from oodd_eval.names import check_known, select
 from oodd_eval.results import paired, plots
+from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.episode import ScoredEpisode
 from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
@@ -25,8 +24,8 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.ladder import FOUND, Point, curve, threshold_rows
 from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import layout
-from oodd_eval.results.tables.board import boards
+from oodd_eval.results.render import FORMATS
+from oodd_eval.results.report import Report, flat
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,22 +82,9 @@ class Results(Sequence[Record]):
 
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""
-        parts = [f"<p>{escape(repr(self))}</p>"]
-        for board in boards(self.records):
-            for table in (layout.separability(board), layout.guaranteed(board)):
-                if table:
-                    shown = tabulate(
-                        table.rows,
-                        table.header,
-                        "html",
-                        colalign=table.alignment,
-                        disable_numparse=True,
-                    )
-                    parts.append(f"<p><b>{escape(table.title)}</b></p>{shown}")
-            parts += [
-                f"<p>{escape(f'{r.status}: {r.cell}: {r.reason}')}</p>" for r in board.failures()
-            ]
-        return "\n".join(parts)
+        failures = (f"{r.status}: {r.cell}: {r.reason}" for b in boards(self) for r in b.failures())
+        tables = FORMATS["html"].render(Report(self.records, detail="brief"))
+        return "".join(f"<p>{escape(text)}</p>\n" for text in (repr(self), *failures)) + tables
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -119,6 +105,16 @@ class Results(Sequence[Record]):
             See ``oodd-eval list metrics``.
         row
             Name of the row.
+
+        Returns
+        -------
+        float
+            In the metric's unit, shares from 0 to 1; NaN where it is undefined or a cell failed.
+
+        Raises
+        ------
+        UnknownNameError, UsageError
+            For an unknown metric or row, or without a name where there are several rows.
         """
         metric_info(metric)
         setting = self._row(row)
@@ -148,39 +144,32 @@ class Results(Sequence[Record]):
         return paired.compare(self.records, first, second, metric)
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Return a flat mapping for each cell: what it is, its metrics, and what it cost."""
-        names = (
-            "split",
-            "environment",
-            "anomaly",
-            "strength",
-            "group",
-            "detector",
-            "horizon",
-            "seed",
-            "status",
-            "reason",
-            "brief",
-        )
-        costs = ("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb")
-        metrics = dict.fromkeys(name for r in self.records for name in r.metrics)
-        return [
-            {
-                **{n: getattr(r, n) for n in names},
-                "row": str(r.setting),
-                **{n: r.value(n) for n in metrics},
-                **{n: getattr(r, n) for n in costs},
-            }
-            for r in self.records
-        ]
+        """Return a flat mapping for each cell: its identity, its metrics, and its cost.
+
+        Returns
+        -------
+        list of dict
+            All with the same keys, NaN where a cell lacks a metric.
+        """
+        return flat(self.records)
 
     def to_frame(self) -> Any:
-        """Return `to_rows` as a ``pandas.DataFrame``; `MissingExtraError` without pandas."""
+        """Return `to_rows` as a data frame.
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
+        """
         try:
             pandas = import_module("pandas")
         except ImportError:
-            wanted = "to_frame needs pandas: pip install pandas, or use to_rows"
-            raise MissingExtraError(wanted) from None
+            advice = "to_frame needs pandas: pip install pandas, or use to_rows"
+            raise MissingExtraError(advice) from None
         return pandas.DataFrame(self.to_rows())
 
     def scores(
@@ -211,29 +200,33 @@ class Results(Sequence[Record]):
             When the cell failed, or its scores were not kept.
         """
         setting = self._row(row)
-        own = [r for r in self.records if r.setting == setting]
-        check_known("environment of these results", {r.environment for r in own}, environment)
-        own = [r for r in own if r.environment == environment]
-        what = f"anomaly of these results in {environment}"
-        check_known(what, {r.condition for r in own}, anomaly)
-        own = sorted((r for r in own if r.condition == anomaly), key=lambda r: r.seed)
-        record = next((r for r in own if seed in (None, r.seed)), None)
-        if record is None:
-            raise UsageError(f"no detector seed {seed}: expected one of {[r.seed for r in own]}")
+        records = [r for r in self.records if r.setting == setting]
+        check_known("environment of these results", {r.environment for r in records}, environment)
+        records = [r for r in records if r.environment == environment]
+        kind = f"anomaly of these results in {environment}"
+        check_known(kind, {r.condition for r in records}, anomaly)
+        by_seed = {r.seed: r for r in records if r.condition == anomaly}
+        seed = min(by_seed) if seed is None else seed
+        if seed not in by_seed:
+            raise UsageError(f"no detector seed {seed}: expected one of {sorted(by_seed)}")
+        record = by_seed[seed]
         if not record.ok:
             raise ResultsError(f"{record.cell} has no scores, it failed: {record.reason}")
-        (found,) = self._episodes([record])
-        if not 0 <= i < len(found):
+        (episodes,) = self._episodes([record])
+        if not 0 <= i < len(episodes):
             cell = f"{environment}/{anomaly}"
-            raise UsageError(f"{cell} has no episode {i}: expected 0 to {len(found) - 1}")
-        return found[i]
+            raise UsageError(f"{cell} has no episode {i}: expected 0 to {len(episodes) - 1}")
+        return episodes[i]
 
     def thresholds(self) -> list[dict[str, Any]]:
         """Return a flat mapping for each row, environment and anomaly with several strengths.
 
-        Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's unit:
-        0 where it is below the ``weakest`` strength, infinity where it is above the ``strongest``.
-        ``kept99`` is the strength that costs 1 % of the return.
+        Returns
+        -------
+        list of dict
+            Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
+            unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return.
         """
         return threshold_rows(self.records)
 
@@ -246,6 +239,10 @@ class Results(Sequence[Record]):
         ----------
         environment, anomaly, i, row, seed
             As those of `scores`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
 
         Raises
         ------
@@ -261,12 +258,21 @@ class Results(Sequence[Record]):
         ----------
         rows
             Names of rows; by default all.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ResultsError
+            When no row has an alarm at 5 %; others as those of `plot_trajectory`.
         """
         chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})
         curves = {}
         for setting in chosen:
-            own = [r for r in self.records if r.setting == setting and r.ok]
-            curves[str(setting)] = [e for episodes in self._episodes(own) for e in episodes]
+            records = [r for r in self.records if r.setting == setting and r.ok]
+            curves[str(setting)] = [e for episodes in self._episodes(records) for e in episodes]
         return plots.power(curves)
 
     def plot_ladder(
@@ -285,17 +291,19 @@ class Results(Sequence[Record]):
             What is averaged over: comma lists and globs, as on the command line. Strengths are in
             units of the strength that costs 1 % of the return, as each anomaly has its own unit.
 
+        Returns
+        -------
+        matplotlib.figure.Figure
+
         Raises
         ------
         ResultsError
             When there are no results at several strengths; others as those of `plot_trajectory`.
         """
         info = metric_info(metric)
-        places = (
-            select("environment", environments, dict.fromkeys(r.environment for r in self)),
-            select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self)),
-        )
-        chosen = [r for r in self if r.environment in places[0] and r.anomaly in places[1]]
+        over = select("environment", environments, dict.fromkeys(r.environment for r in self))
+        kinds = select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self))
+        chosen = [r for r in self if r.environment in over and r.anomaly in kinds]
         settings = [self._row(name) for name in rows] or list({r.setting: 0 for r in chosen})
         curves: list[dict[str, list[Point]]] = [
             {str(s): curve([r for r in chosen if r.setting == s], name) for s in settings}
@@ -321,7 +329,7 @@ class Results(Sequence[Record]):
                 must_be_of(split, record)
                 data: EnvironmentData = opened(split)(record.environment)
                 file = stored_scores([record], self._directory, data)
-                known = data.anomalous(record.condition)
+                anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
                 pairs = zip(file.parts[f"test/{record.condition}"], file.parts[TWINS], strict=True)
@@ -331,11 +339,11 @@ class Results(Sequence[Record]):
                         i,
                         scores,
                         twin,
-                        known[i],
+                        anomalous[i],
                         data.twins[i],
                         sensors,
-                        int(known.onsets[i]),
-                        int(known.effects[i]),
+                        int(anomalous.onsets[i]),
+                        int(anomalous.effects[i]),
                         rule,
                     )
                     for i, (scores, twin) in enumerate(pairs)

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
-from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import RANKING, metric_info
-from oodd_eval.metrics.ranking import ALPHA, Row, rank
+from oodd_eval.metrics.ranking import ALPHA, rank
+from oodd_eval.results.board import Conditions
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import contribution, grouped
+from oodd_eval.results.standings import terms_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class PairedComparison:
     first: str
     second: str
     metric: str
-    values: tuple[float, float]
+    values: tuple[float, ...]
     difference: float
     low: float
     high: float
@@ -51,19 +52,18 @@ class PairedComparison:
             return f"{self.first} and {self.second} cannot be told apart"
         sign = -1 if metric_info(self.metric).better == "lower" else 1
         better = self.difference * sign > 0
-        one, other = (self.first, self.second) if better else (self.second, self.first)
-        return f"{one} is better than {other}"
+        order = (self.first, self.second) if better else (self.second, self.first)
+        return "{} is better than {}".format(*order)
 
     def __str__(self) -> str:
         """Return the figures and the verdict."""
         info = metric_info(self.metric)
-        one, two, d, low, high = map(
-            info.text, (*self.values, self.difference, self.low, self.high)
-        )
+        figures = *self.values, self.difference, self.low, self.high
+        first, second, difference, low, high = map(info.text, figures)
         unit = " %" if info.unit == "percent" else ""
         return (
-            f"{info.title}: {self.first} {one}, {self.second} {two}{unit}, difference {d} "
-            f"[{low}, {high}], p = {self.p:.2g}, {self.cells} cells: {self.verdict}"
+            f"{info.title}: {self.first} {first}, {self.second} {second}{unit}, difference "
+            f"{difference} [{low}, {high}], p = {self.p:.2g}, {self.cells} cells: {self.verdict}"
         )
 
 
@@ -75,15 +75,15 @@ def row_named(records: Sequence[Record], name: str) -> Setting:
     rows = {str(r.setting): r.setting for r in records}
     if name in rows:
         return rows[name]
-    own = [setting for setting in rows.values() if setting.detector == name]
-    if not own:
+    named = [setting for setting in rows.values() if setting.detector == name]
+    if not named:
         raise UnknownNameError("row of these results", name, rows)
-    if len(own) > 1:
-        shown = ", ".join(map(str, own))
+    if len(named) > 1:
+        choice = ", ".join(map(str, named))
         raise UsageError(
-            f"{name!r} names {len(own)} rows of these results, expected one of {shown}"
+            f"{name!r} names {len(named)} rows of these results, expected one of {choice}"
         )
-    return own[0]
+    return named[0]
 
 
 def compare(
@@ -106,57 +106,36 @@ def compare(
             f"rows cannot be compared by {metric!r}: expected a mean over trajectories with a "
             "better side, such as auc_matched"
         )
-    if len({(r.split_digest, r.protocol, r.limit) for r in records}) > 1:
+    if len({Conditions.of(r) for r in records}) > 1:
         raise ResultsError("records of several splits or limits cannot be compared: select some")
     settings = [row_named(records, name) for name in (first, second)]
     if settings[0] == settings[1]:
         raise UsageError(f"{first!r} and {second!r} are the same row")
-    sign = -1.0 if info.better == "lower" else 1.0
-    rows: dict[str, Row] = {}
-    for setting in settings:
-        seeds = grouped((r for r in records if r.setting == setting), lambda r: r.seed)
-        rows[str(setting)] = {
-            seed: {
-                r.position: _signed(contribution(r, metric), sign)
-                for r in own
-                if r.ok and metric in r.per_trajectory
-            }
-            for seed, own in seeds.items()
-        }
-    common = set.intersection(
-        *(
-            {place for place, c in cells.items() if not math.isnan(c.value)}
-            for row in rows.values()
-            for cells in row.values()
-        )
+    rows = {s: terms_of((r for r in records if r.setting == s), metric) for s in settings}
+    defined = (
+        {cell for cell, terms in cells.items() if not math.isnan(terms.value)}
+        for row in rows.values()
+        for cells in row.values()
     )
+    common = sorted(set.intersection(*defined))
     if not common:
         raise ResultsError(f"{first} and {second} have no cell in common with a value of {metric}")
     shared = {
-        name: {
-            seed: {place: cells[place] for place in sorted(common)} for seed, cells in row.items()
-        }
-        for name, row in rows.items()
+        str(setting): {seed: {cell: cells[cell] for cell in common} for seed, cells in row.items()}
+        for setting, row in rows.items()
     }
-    tests = rank(shared).comparisons
-    one = next(t for t in tests if (t.first, t.second) == (str(settings[0]), str(settings[1])))
-    low, high = sorted((sign * one.low, sign * one.high))
-    means = [
-        sum(sum(c.value for c in cells.values()) / len(common) for cells in row.values()) / len(row)
-        for row in shared.values()
-    ]
-    return PairedComparison(
-        one.first,
-        one.second,
-        metric,
-        (sign * means[0], sign * means[1]),
-        sign * one.difference,
-        low,
-        high,
-        min(t.p_holm for t in tests),
-        len(common),
+    one, other = shared
+    tests = {(test.first, test.second): test for test in rank(shared).comparisons}
+    test = tests[one, other]
+    means = (
+        nan_mean(nan_mean(c.value for c in row.values()) for row in shared[name].values())
+        for name in shared
     )
-
-
-def _signed(own: Contribution, sign: float) -> Contribution:
-    return Contribution(sign * own.numerator, own.denominator)
+    # Where lower is better, the terms have their sign turned.
+    sign = -1.0 if info.better == "lower" else 1.0
+    low, high = sorted((sign * test.low, sign * test.high))
+    values = tuple(sign * mean for mean in means)
+    p = min(t.p_holm for t in tests.values())
+    return PairedComparison(
+        one, other, metric, values, sign * test.difference, low, high, p, len(common)
+    )

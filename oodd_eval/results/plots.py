@@ -27,8 +27,8 @@ def _subplots(rows: int, height: float, columns: int = 1) -> tuple[Figure, Any]:
     try:
         from matplotlib import pyplot as plt  # noqa: PLC0415
     except ImportError:
-        wanted = "plots need matplotlib: pip install 'oodd-eval[plots]'"
-        raise MissingExtraError(wanted) from None
+        advice = "plots need matplotlib: pip install 'oodd-eval[plots]'"
+        raise MissingExtraError(advice) from None
     figure, axes = plt.subplots(
         rows, columns, sharex="col", sharey="row", figsize=(8, height), layout="constrained"
     )
@@ -39,15 +39,15 @@ def _subplots(rows: int, height: float, columns: int = 1) -> tuple[Figure, Any]:
 def trajectory(episode: ScoredEpisode) -> Figure:
     """Draw sensors over the statistic of the alarm, the nominal twin dashed."""
     figure, (upper, lower) = _subplots(2, 4.4)
-    own, twin = episode.trajectory.observations, episode.twin.observations
-    both = min(len(own), len(twin))
+    rows, twin = episode.trajectory.observations, episode.twin.observations
+    common = min(len(rows), len(twin))
     spread = np.maximum(twin.std(axis=0), 1e-6)
-    apart = np.abs(own[:both] - twin[:both]).mean(axis=0) / spread
+    apart = np.abs(rows[:common] - twin[:common]).mean(axis=0) / spread
     for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
         mean = twin[:, d].mean()
         upper.plot((twin[:, d] - mean) / spread[d], "--", color=colour, linewidth=0.8, alpha=0.5)
         upper.plot(
-            (own[:, d] - mean) / spread[d], color=colour, linewidth=0.8, label=episode.sensors[d]
+            (rows[:, d] - mean) / spread[d], color=colour, linewidth=0.8, label=episode.sensors[d]
         )
     upper.set_ylabel("sensor (std. of twin)")
     upper.axvline(episode.onset, color="0.5", linewidth=1)
@@ -55,26 +55,26 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     upper.set_title(str(episode.cell), fontsize="medium")
     rule = episode.rule
     for scores, style in ((episode.twin_scores, "--"), (episode.scores, "-")):
-        shown = scores if rule is None else rule.statistic(scores)
+        statistic = scores if rule is None else rule.statistic(scores)
         name = "nominal twin" if style == "--" else "anomalous"
-        finite = np.where(np.isfinite(shown), shown, np.nan)
+        finite = np.where(np.isfinite(statistic), statistic, np.nan)
         lower.plot(finite, style, color=COLOURS[0], alpha=0.5 if style == "--" else 1, label=name)
     lower.set_ylabel("score" if rule is None else "statistic")
     lower.set_xlabel("row")
     lower.axvline(episode.onset, color="0.5", linewidth=1, label="onset")
     if rule is not None and np.isfinite(rule.threshold):
         lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label="threshold at 5 %")
-        own_statistic = rule.statistic(episode.scores)
+        anomalous = rule.statistic(episode.scores)
         # The first rows beyond the threshold matter, not how far it goes.
         nominal = max(*rule.statistic(episode.twin_scores), rule.threshold)
-        top = max(1.2 * nominal, min(1.1 * own_statistic.max(), 4 * nominal))
+        top = max(1.2 * nominal, min(1.1 * anomalous.max(), 4 * nominal))
         if top > 0:
             least = np.nanmin([np.nanmin(line.get_ydata()) for line in lower.lines[:2]])
             lower.set_ylim(min(0.0, least) - 0.05 * top, top)
         if (alarm := episode.alarm) is not None:
             lower.plot(
                 alarm,
-                min(own_statistic[alarm], 0.95 * top),
+                min(anomalous[alarm], 0.95 * top),
                 "v",
                 color=COLOURS[1],
                 label=f"alarm at row {alarm}",

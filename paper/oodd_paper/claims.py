@@ -16,8 +16,8 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import NAMES, metric_info
 from oodd_eval.names import check_known
-from oodd_eval.results.tables.layout import Table
-from oodd_eval.results.tables.rendering import csv_rows
+from oodd_eval.results.render.data import csv_rows
+from oodd_eval.results.tables import Table
 from oodd_paper.estimates import Estimate, Estimator, Side, lost_return
 from oodd_paper.experiments import read_tables
 from oodd_paper.inputs import Other, Returns
@@ -63,7 +63,7 @@ class Claim:
 
     id: str
     text: str
-    place: str
+    section: str
     number: str
     metric: str
     sides: tuple[Side, ...]
@@ -121,15 +121,15 @@ class Ruling(NamedTuple):
     """A claim with its judgements: by the paper's measure and by the fair one, if there is one."""
 
     claim: Claim
-    own: Judgement
+    paper: Judgement
     fair: Judgement | None = None
 
 
 def rulings(estimator: Estimator, returns: Returns | None) -> list[Ruling]:
     """Judge every claim; None for returns that were not read."""
-    own = [judge(c, c.metric, estimator, returns) for c in CLAIMS]
-    fair = [judge(c, c.fair, estimator) if c.fair else None for c in CLAIMS]
-    return list(map(Ruling, CLAIMS, own, fair))
+    by_paper = [judge(c, c.metric, estimator, returns) for c in CLAIMS]
+    by_fair = [judge(c, c.fair, estimator) if c.fair else None for c in CLAIMS]
+    return list(map(Ruling, CLAIMS, by_paper, by_fair))
 
 
 def judge(
@@ -137,16 +137,18 @@ def judge(
 ) -> Judgement:
     """Put a claim to one measure."""
 
-    def verdict(found: Estimate) -> Verdict:
-        return claim.settled or claim.region.verdict(found) if found.environments else "not run"
+    def verdict(estimate: Estimate) -> Verdict:
+        return (
+            claim.settled or claim.region.verdict(estimate) if estimate.environments else "not run"
+        )
 
     def estimated(environments: Sequence[str]) -> Estimate:
         if metric == RETURN:
-            found = lost_return(returns or {}, claim.sides, environments)
+            estimate = lost_return(returns or {}, claim.sides, environments)
         else:
-            found = estimator.combine(claim.sides, metric, environments)
-        value, low, high = (x - claim.offset for x in found.ends)
-        return replace(found, value=value, low=low, high=high)
+            estimate = estimator.combine(claim.sides, metric, environments)
+        value, low, high = (x - claim.offset for x in estimate.ends)
+        return replace(estimate, value=value, low=low, high=high)
 
     if not claim.everywhere:
         mean = estimated(claim.environments)
@@ -166,7 +168,7 @@ def judge(
     return Judgement(metric, number, worst, by_environment)
 
 
-def summary(made: Sequence[Ruling]) -> str:
+def summary(claims_judged: Sequence[Ruling]) -> str:
     """Return how many claims came to which verdict by either measure; settled ones apart."""
 
     def counted(judged: Sequence[Judgement], claims: str) -> str:
@@ -174,23 +176,26 @@ def summary(made: Sequence[Ruling]) -> str:
         counts = ", ".join(f"{count[v]} {v}" for v in ORDER if count[v])
         return f"of {len(judged)}{claims} {counts}"
 
-    open_ = [r for r in made if not r.claim.settled]
-    own = counted([r.own for r in open_], " claims")
-    fair = counted([r.fair for r in open_ if r.fair], "")
-    text = f"By the paper's measures, {own}; by matched AUC and censored delay, {fair}."
-    if not (settled := len(made) - len(open_)):
+    open_ = [r for r in claims_judged if not r.claim.settled]
+    by_paper = counted([r.paper for r in open_], " claims")
+    by_fair = counted([r.fair for r in open_ if r.fair], "")
+    text = f"By the paper's measures, {by_paper}; by matched AUC and censored delay, {by_fair}."
+    if not (settled := len(claims_judged) - len(open_)):
         return text
     are = "is" if settled == 1 else "are"
     return f"{text} {settled} more {are} settled by definition or by construction and not counted."
 
 
-def changed(made: Sequence[Ruling], other: Other) -> str:
+def changed(claims_judged: Sequence[Ruling], other: Other) -> str:
     """Return in how many claims the verdict is another one than that of another reproduction."""
     counts = []
-    for kind, judged in (("paper", [r.own for r in made]), ("fair", [r.fair for r in made])):
+    for kind, judged in (
+        ("paper", [r.paper for r in claims_judged]),
+        ("fair", [r.fair for r in claims_judged]),
+    ):
         pairs = [
             (j.verdict, other.claims[r.claim.id, kind]["verdict"])
-            for r, j in zip(made, judged, strict=True)
+            for r, j in zip(claims_judged, judged, strict=True)
             if j and not r.claim.settled and (r.claim.id, kind) in other.claims
         ]
         both = [pair for pair in pairs if NOT_RUN not in pair]
@@ -198,7 +203,7 @@ def changed(made: Sequence[Ruling], other: Other) -> str:
     return f"{counts[0]} by the paper's measures, {counts[1]} by the others"
 
 
-def claims_table(made: Sequence[Ruling], other: Other | None = None) -> Table:
+def claims_table(claims_judged: Sequence[Ruling], other: Other | None = None) -> Table:
     """Return one row per claim, with the verdicts of another reproduction if there is one."""
     header = [
         "Claim",
@@ -211,26 +216,31 @@ def claims_table(made: Sequence[Ruling], other: Other | None = None) -> Table:
     ]
     header[3:3] = [f"On {other.name}"] if other else []
     rows = []
-    for r in made:
+    for r in claims_judged:
         c = r.claim
         text = f"{c.text} ({c.note})" if c.note else c.text
         true_if = c.region.describe(c.metric) + (f" ({c.source})" if c.source else "")
-        judged: tuple[str, ...] = _shown(r.own), _shown(r.fair) if r.fair else ""
+        judged: tuple[str, ...] = (
+            _judgement_text(r.paper),
+            _judgement_text(r.fair) if r.fair else "",
+        )
         if other:
-            found = [other.claims.get((c.id, kind), {}) for kind in ("paper", "fair")]
-            judged = *judged, "; ".join(line["verdict"] for line in found if line)
-        rows.append([text, *judged, c.number, true_if, str(r.own.estimate.seeds or ""), c.place])
+            verdicts = [other.claims.get((c.id, kind), {}) for kind in ("paper", "fair")]
+            judged = *judged, "; ".join(line["verdict"] for line in verdicts if line)
+        rows.append(
+            [text, *judged, c.number, true_if, str(r.paper.estimate.seeds or ""), c.section]
+        )
     return Table("Claims", header, rows, labels=len(header))
 
 
-def claims_csv(made: Sequence[Ruling]) -> str:
+def claims_csv(claims_judged: Sequence[Ruling]) -> str:
     """Return a line per claim and measure."""
     return csv_rows(
         [
             {
                 "claim": r.claim.id,
                 "text": r.claim.text,
-                "place": r.claim.place,
+                "place": r.claim.section,
                 "number": r.claim.number,
                 "metric": j.metric,
                 "kind": kind,
@@ -241,14 +251,14 @@ def claims_csv(made: Sequence[Ruling]) -> str:
                     f"{e}={verdict}" for e, verdict in j.by_environment.items()
                 ),
             }
-            for r in made
-            for kind, j in (("paper", r.own), ("fair", r.fair))
+            for r in claims_judged
+            for kind, j in (("paper", r.paper), ("fair", r.fair))
             if j
         ]
     )
 
 
-def _shown(judged: Judgement) -> str:
+def _judgement_text(judged: Judgement) -> str:
     e = judged.estimate
     if e.state or not e.environments:
         return e.state or NOT_RUN

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from oodd_eval.metrics import bootstrap
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import RESAMPLES, Samples, mean_samples
+from oodd_eval.results.board import contribution
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import contribution
-from oodd_eval.results.tables.rendering import number
+from oodd_eval.results.render.data import number
 from oodd_paper.experiments import MEAN, Experiment, Scope, Series, paper_number, scope
 from oodd_paper.inputs import KINDS, Returns
 
@@ -75,16 +75,16 @@ class Estimate:
 
 
 def _estimate(
-    found: Sequence[Samples], sizes: Sequence[int], expected: int, seeds: int = 0
+    samples: Sequence[Samples], sizes: Sequence[int], expected: int, seeds: int = 0
 ) -> Estimate:
     """Return the mean over those of the expected environments where there is a number.
 
     `sizes` are the numbers of test trajectories by environment.
     """
-    if not found:
+    if not samples:
         return Estimate(expected=expected)
-    mean = mean_samples(found)
-    defined = sum(not math.isnan(one[0]) for one in found) or len(found)
+    mean = mean_samples(samples)
+    defined = sum(not math.isnan(one[0]) for one in samples) or len(samples)
     ends = bootstrap.bounds(mean[1:], float(mean[0]), sizes)
     return Estimate(float(mean[0]), *ends, defined, expected, seeds)
 
@@ -92,7 +92,7 @@ def _estimate(
 def _defined(records: Iterable[Record], metric: str) -> int:
     """Return the least number of trajectories that a metric of some cells is defined for."""
     terms = (contribution(r, metric) for r in records if metric in r.per_trajectory)
-    return min((own.n for own in terms if own.n), default=0)
+    return min((term.n for term in terms if term.n), default=0)
 
 
 class Estimator:
@@ -108,8 +108,8 @@ class Estimator:
 
     def has(self, settings: Iterable[Setting]) -> bool:
         """Tell whether there is a record of any of these settings."""
-        wanted = set(settings)
-        return any(setting in wanted for setting, _ in self._cells)
+        required = set(settings)
+        return any(setting in required for setting, _ in self._cells)
 
     def combine(
         self,
@@ -122,7 +122,7 @@ class Estimator:
 
         Only detector seeds count that all sides have, and those of `same_seeds` that were run.
         """
-        found, counts, sizes = [], [], []
+        samples, counts, sizes = [], [], []
         for environment in environments:
             held = [
                 self._by_seed(setting, environment, side.anomalies)
@@ -136,10 +136,12 @@ class Estimator:
             for setting in same_seeds:
                 common &= self._by_seed(setting, environment, sides[0].anomalies).keys() or common
             if common:
-                found.append(self._sum(sides, metric, environment, sorted(common)))
+                samples.append(self._sum(sides, metric, environment, sorted(common)))
                 counts.append(len(common))
-                sizes.append(_defined((r for own in held for s in common for r in own[s]), metric))
-        return _estimate(found, sizes, len(environments), min(counts, default=0))
+                sizes.append(
+                    _defined((r for by_seed in held for s in common for r in by_seed[s]), metric)
+                )
+        return _estimate(samples, sizes, len(environments), min(counts, default=0))
 
     def _by_seed(
         self, setting: Setting, environment: str, anomalies: Sequence[str]
@@ -154,9 +156,9 @@ class Estimator:
     ) -> Samples:
         total = np.zeros(1 + RESAMPLES)
         for side, setting in ((one, setting) for one in sides for setting in one.settings):
-            own = [self._mean(setting, environment, side.anomalies, metric, s) for s in seeds]
-            value = mean_samples([one[:1] for one in own])
-            resampled = bootstrap.mean_over_seeds([one[1:] for one in own], key=environment)
+            means = [self._mean(setting, environment, side.anomalies, metric, s) for s in seeds]
+            value = mean_samples([one[:1] for one in means])
+            resampled = bootstrap.mean_over_seeds([one[1:] for one in means], key=environment)
             mean = np.concatenate([value, resampled])
             total = total + side.weight / len(side.settings) * mean
         return total
@@ -176,12 +178,12 @@ class Estimator:
         )
 
 
-def _samples(environment: str, own: Contribution | ArrayLike) -> Samples:
+def _samples(environment: str, values: Contribution | ArrayLike) -> Samples:
     """Return a value and its resamples: of a cell, or of the mean of a number per trajectory."""
-    if not isinstance(own, Contribution):
-        numbers = np.asarray(own, dtype=np.float64)
-        own = Contribution(numbers, np.ones_like(numbers))
-    return np.concatenate([[own.value], bootstrap.cell_samples(environment, own)])
+    if not isinstance(values, Contribution):
+        numbers = np.asarray(values, dtype=np.float64)
+        values = Contribution(numbers, np.ones_like(numbers))
+    return np.concatenate([[values.value], bootstrap.cell_samples(environment, values)])
 
 
 def mean_return(returns: Returns, environment: str, kind: str) -> Estimate:
@@ -192,18 +194,18 @@ def mean_return(returns: Returns, environment: str, kind: str) -> Estimate:
 
 def lost_return(returns: Returns, sides: Sequence[Side], environments: Sequence[str]) -> Estimate:
     """Return a sum of sides of the lost share of the return, (nominal - anomalous) / |nominal|."""
-    found, sizes = [], []
+    samples, sizes = [], []
     for environment in environments:
-        own = {k: np.asarray(v) for k, v in returns.get(environment, {}).items()}
-        if any(kind not in own for kind in KINDS):
+        by_kind = {k: np.asarray(v) for k, v in returns.get(environment, {}).items()}
+        if any(kind not in by_kind for kind in KINDS):
             continue
-        whole, total = abs(_samples(environment, own["nominal"])), np.zeros(1 + RESAMPLES)
+        whole, total = abs(_samples(environment, by_kind["nominal"])), np.zeros(1 + RESAMPLES)
         for side in sides:
-            lost = own["nominal"] - np.mean([own[a] for a in side.anomalies], axis=0)
+            lost = by_kind["nominal"] - np.mean([by_kind[a] for a in side.anomalies], axis=0)
             total = total + side.weight * _samples(environment, lost) / whole
-        found.append(total)
-        sizes.append(len(own["nominal"]))
-    return _estimate(found, sizes, len(environments))
+        samples.append(total)
+        sizes.append(len(by_kind["nominal"]))
+    return _estimate(samples, sizes, len(environments))
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +226,7 @@ Numbers = Mapping[tuple[str, str, str, str], TableNumber]
 
 def compute(experiment: Experiment, estimator: Estimator) -> Numbers:
     """Return every number of an experiment; what was not run is there, without a value."""
-    found = {}
+    numbers = {}
     same = experiment.settings if experiment.same_seeds else []
     metrics = (*experiment.metrics, *experiment.beyond)
     for row, series, over, metric in itertools.product(
@@ -235,5 +237,5 @@ def compute(experiment: Experiment, estimator: Estimator) -> Numbers:
         estimate = estimator.combine(sides, metric, environments, same)
         paper = np.mean([paper_number(experiment, series, e, over, metric) for e in environments])
         key = row, series.label, over.id, metric
-        found[key] = TableNumber(row, series, over, metric, estimate, float(paper))
-    return found
+        numbers[key] = TableNumber(row, series, over, metric, estimate, float(paper))
+    return numbers

@@ -62,7 +62,7 @@ class Experiment:
 
     id: str
     title: str
-    place: str
+    section: str
     series: tuple[Series, ...]
     scopes: tuple[Scope, ...]
     metrics: tuple[str, ...]
@@ -82,8 +82,10 @@ class Experiment:
     @property
     def row_titles(self) -> dict[str, str]:
         """Titles of the rows by environment, or `MEAN`."""
-        own = {} if self.rows == "mean" else {e: ENVIRONMENTS[e].title for e in self.environments}
-        return own if self.rows == "environments" else own | {MEAN: "Mean"}
+        titles = (
+            {} if self.rows == "mean" else {e: ENVIRONMENTS[e].title for e in self.environments}
+        )
+        return titles if self.rows == "environments" else titles | {MEAN: "Mean"}
 
     @classmethod
     def of(cls, *, series: Mapping[str, list[str]], scopes: list[str], **others: Any) -> Self:
@@ -131,16 +133,16 @@ def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...
         tables = tomllib.loads(file.read_text(encoding="utf-8")).get(kind, [])
     except (OSError, ValueError) as error:
         raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
-    made: dict[str, _T] = {}
+    objects: dict[str, _T] = {}
     for number, table in enumerate(tables, start=1):
         name = str(table.get("id") or table.get("name") or number)
         try:
-            if name in made:
+            if name in objects:
                 raise ResultsError("an earlier one has the same id")
-            made[name] = make(**table)
+            objects[name] = make(**table)
         except (OoddError, TypeError, ValueError, AttributeError) as error:
             raise ResultsError(f"{str(file)!r}: {kind} {name!r}: {error}") from None
-    return tuple(made.values())
+    return tuple(objects.values())
 
 
 # Deterministic detectors; all experiments but Table 2, in the order of the page.
@@ -169,10 +171,10 @@ def paper_number(
         models = [setting.detector for setting in series.settings]
         rows = [by_group.get(group, {}) for group in ([scope.id] if scope.id in GROUPS else GROUPS)]
         if len(models) == 1:
-            found = [row.get(models[0], NAN) for row in rows]
+            digits = [row.get(models[0], NAN) for row in rows]
         else:  # the table's average is over all of its models
-            found = [row["avg"] if {*models, "avg"} == row.keys() else NAN for row in rows]
-        return float(np.mean(found)) / (100 if metric == "auc" else 1)
+            digits = [row["avg"] if {*models, "avg"} == row.keys() else NAN for row in rows]
+        return float(np.mean(digits)) / (100 if metric == "auc" else 1)
     if (metric, scope.id, len(series.settings)) != ("auc", "all", 1):
         return NAN
     if experiment.id == "table-3":

@@ -43,7 +43,7 @@ class Reproduction:
     test: int
     units: int
 
-    def own(self, records: Iterable[Record]) -> list[Record]:
+    def select(self, records: Iterable[Record]) -> list[Record]:
         """Return the records that belong to it: its whole data, its settings, its seeds."""
         seeds = {setting: self.tier.seeds(setting) for setting in settings_of(EXPERIMENTS)}
         data = self.split_digest, self.protocol, None
@@ -119,12 +119,12 @@ def keep_inputs(directory: Path, reproduction: Reproduction, split: Split) -> No
     write_changed(directory / HEADER, header + "\n")
     if load_returns(directory, split.digest) is not None:
         return
-    found = {}
+    returns = {}
     for name in split.environments:
         with contextlib.closing(split.environment(name)) as data:
             sets = {"nominal": data.twins} | {c: data.anomalous(c) for c in data.anomalies}
-            found[name] = {split_condition(c)[0]: s.returns.tolist() for c, s in sets.items()}
-    write_changed(directory / RETURNS, dump_returns(found, split.digest))
+            returns[name] = {split_condition(c)[0]: s.returns.tolist() for c, s in sets.items()}
+    write_changed(directory / RETURNS, dump_returns(returns, split.digest))
 
 
 def write_changed(path: Path, content: str | bytes) -> None:
@@ -145,8 +145,8 @@ def load_returns(directory: Path, digest: str) -> Returns | None:
     path = directory / RETURNS
     try:
         whole = json.loads(path.read_text(encoding="utf-8"))
-        found: Returns = whole["returns"]
-        return found if whole["split_digest"] == digest else None
+        returns: Returns = whole["returns"]
+        return returns if whole["split_digest"] == digest else None
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -154,22 +154,22 @@ def load_returns(directory: Path, digest: str) -> Returns | None:
         raise ResultsError(f"{str(path)!r} cannot be read: {error!r}; {todo}") from None
 
 
-def load_records(reproduction: Reproduction, places: Iterable[Path]) -> list[Record]:
-    """Read a reproduction's records below some places, where no two have the same cell."""
+def load_records(reproduction: Reproduction, paths: Iterable[Path]) -> list[Record]:
+    """Read a reproduction's records below some directories; no two may hold the same cell."""
     origin: dict[Cell, Path] = {}
-    found: list[Record] = []
+    records: list[Record] = []
     directories: set[Path] = set()
-    for place in places:
+    for path in paths:
         # Large entries of the leaderboard keep their records compressed.
-        below = [file.parent for name in forms(RECORDS) for file in place.rglob(name)]
+        below = [file.parent for name in forms(RECORDS) for file in path.rglob(name)]
         if not below:
-            raise ResultsError(f"no results in {str(place)!r}, expected {RECORDS} in or below it")
-        directories.update([place] if place in below else below)
+            raise ResultsError(f"no results in {str(path)!r}, expected {RECORDS} in or below it")
+        directories.update([path] if path in below else below)
     for directory in sorted(directories):
-        for record in reproduction.own(ResultsDirectory(directory).records()):
+        for record in reproduction.select(ResultsDirectory(directory).records()):
             if (first := origin.setdefault(record.cell, directory)) != directory:
                 twice = f"{record.cell} is in {str(first)!r} and in {str(directory)!r}"
                 todo = "name those that belong to the reproduction with --records"
                 raise ResultsError(f"{twice}: {todo}")
-            found.append(record)
-    return found
+            records.append(record)
+    return records

@@ -23,9 +23,9 @@ from typing import Any, Final
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.layout import Table
-from oodd_eval.results.tables.rendering import csv_text, number
-from oodd_eval.results.tables.rendering import markdown as padded_table
+from oodd_eval.results.render.data import csv_text, number
+from oodd_eval.results.render.text import markdown_table as padded_table
+from oodd_eval.results.tables import Table
 from oodd_paper.claims import NOT_RUN, Ruling, changed, claims_csv, claims_table, rulings, summary
 from oodd_paper.estimates import Estimate, Estimator, Numbers, TableNumber, compute, mean_return
 from oodd_paper.experiments import EXPERIMENTS, TABLE_2, Experiment
@@ -55,14 +55,16 @@ def publish(
     Without `figures` none is drawn, and those that are there already are linked. Tables and claims
     have the numbers of the `other` reproduction beside their own.
     """
-    own = reproduction.own(records)
-    estimator = Estimator(own)
-    made = rulings(estimator, returns)
-    write_changed(directory / "claims.csv", claims_csv(made))
+    records_used = reproduction.select(records)
+    estimator = Estimator(records_used)
+    claims_judged = rulings(estimator, returns)
+    write_changed(directory / "claims.csv", claims_csv(claims_judged))
     sections = [_of_returns(reproduction, returns, other)]
     sections += [_of_experiment(reproduction, e, estimator, other) for e in EXPERIMENTS]
     lines = [line for one in sections for line in _write(directory, one, figures=figures)]
-    write_changed(directory / "README.md", front_page(reproduction, own, made, lines, other))
+    write_changed(
+        directory / "README.md", front_page(reproduction, records_used, claims_judged, lines, other)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class _Section:
     csv: Sequence[Sequence[str]] = ()
     tables: Sequence[str] = ()
     pictures: Mapping[str, Picture] = field(default_factory=dict)
-    shown: Sequence[str] = ()
+    page_lines: Sequence[str] = ()
 
 
 def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
@@ -94,7 +96,7 @@ def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
                 write_changed(svg.with_suffix(f".{suffix}"), content)
         if png.exists():
             links += [fill("figure", title=picture.title, name=name), ""]
-    return [f"## {one.title}", "", one.caption, "", *links, *one.shown, ""]
+    return [f"## {one.title}", "", one.caption, "", *links, *one.page_lines, ""]
 
 
 def _of_experiment(
@@ -113,19 +115,19 @@ def _of_experiment(
     # Wide tables stand on the page without their intervals.
     wide = experiment.across == "scopes" and experiment.rows != "mean"
     brief = layout(experiment, numbers, experiment.metrics, intervals=not wide, other=other)
-    shown = [*map(markdown_table, brief), fill("files", name=name)]
+    lines = [*map(markdown_table, brief), fill("files", name=name)]
     text, pictures = caption(r, experiment, numbers), pictures_of(experiment, numbers)
-    return _Section(name, title, text, numbers_csv(numbers), tables, pictures, shown)
+    return _Section(name, title, text, numbers_csv(numbers), tables, pictures, lines)
 
 
 def _of_returns(r: Reproduction, returns: Returns | None, other: Other | None) -> _Section:
     name, title = TABLE_2, "Table 2: returns of the policies, nominal and under each anomaly"
     if not returns:
         return _Section(name, title)
-    table, lines = returns_tables(returns, other)
+    table, csv_lines = returns_tables(returns, other)
     text, pictures = markdown_table(table), {name: returns_picture(returns)}
-    shown = [text, f"[{name}.csv](tables/{name}.csv)"]
-    return _Section(name, title, returns_caption(r), lines, [text], pictures, shown)
+    page_lines = [text, f"[{name}.csv](tables/{name}.csv)"]
+    return _Section(name, title, returns_caption(r), csv_lines, [text], pictures, page_lines)
 
 
 def layout(
@@ -154,18 +156,18 @@ def layout(
         for row, first in experiment.row_titles.items():
             for i, (line, label) in enumerate(lines.items()):
                 keys = [(c, name, line) if side_by_side else (line, c, name) for c in columns]
-                own = [numbers[row, *key] for key in keys]
-                ours = [show(n.estimate, n.metric, intervals=intervals) for n in own]
+                row_numbers = [numbers[row, *key] for key in keys]
+                ours = [show(n.estimate, n.metric, intervals=intervals) for n in row_numbers]
                 rows.append(["" if i else first, label, "ours", *ours])
-                paper = [(n.paper, infos[n.metric]) for n in own]
+                paper = [(n.paper, infos[n.metric]) for n in row_numbers]
                 theirs = ["" if math.isnan(value) else info.text(value) for value, info in paper]
                 if any(theirs):
                     rows.append(["", "", "paper", *theirs])
                 if other:
-                    found = [_of_other(other, experiment, n) for n in own]
+                    others = [_of_other(other, experiment, n) for n in row_numbers]
                     texts = [
                         show(e, n.metric, intervals=intervals)
-                        for e, n in zip(found, own, strict=True)
+                        for e, n in zip(others, row_numbers, strict=True)
                     ]
                     rows.append(["", "", other.name, *texts])
         tables.append(Table(title, header, rows, labels=3))
@@ -216,11 +218,11 @@ def numbers_csv(numbers: Numbers) -> list[list[str]]:
         first, e = n.series.settings[0], n.estimate
         detectors = "+".join(setting.detector for setting in n.series.settings)
         parameters = json.dumps(first.overrides) if first.overrides else ""
-        told = [n.environment, n.series.label, detectors, str(first.horizon), parameters]
+        labels = [n.environment, n.series.label, detectors, str(first.horizon), parameters]
         state = e.state or ("" if e.environments else NOT_RUN)
         lines.append(
             [
-                *told,
+                *labels,
                 n.scope.id,
                 n.metric,
                 *map(number, e.ends),
@@ -262,7 +264,7 @@ def _printed(e: Estimate) -> str:
 def front_page(
     reproduction: Reproduction,
     records: Sequence[Record],
-    made: Sequence[Ruling],
+    claims_judged: Sequence[Ruling],
     sections: Sequence[str],
     other: Other | None = None,
 ) -> str:
@@ -294,10 +296,10 @@ def front_page(
         split="" if reproduction.split == tier.split else reproduction.split,
         made="".join(f"- Made with {one}.\n" for one in software),
         updates=" or ".join(map(str, updates)),
-        summary=summary(made),
-        claims=markdown_table(claims_table(made, other)).split("\n", 2)[2],
+        summary=summary(claims_judged),
+        claims=markdown_table(claims_table(claims_judged, other)).split("\n", 2)[2],
         other=other.name if other else "",
-        changed=changed(made, other) if other else "",
+        changed=changed(claims_judged, other) if other else "",
         sections="\n".join(sections),
     )
 
@@ -310,7 +312,7 @@ def caption(reproduction: Reproduction, experiment: Experiment, numbers: Numbers
             used.setdefault(n.series.label, set()).add(n.estimate.seeds)
     return fill(
         "caption",
-        place=experiment.place,
+        place=experiment.section,
         data=_data(reproduction),
         seeds=_seeds(used),
         note=experiment.note,
@@ -324,13 +326,13 @@ def returns_caption(r: Reproduction) -> str:
 
 def _data(r: Reproduction) -> str:
     """Describe the data, and what it lacks beside split standard."""
-    whole, own = SPLITS["standard"], SPLITS.get(r.split)
+    whole, definition = SPLITS["standard"], SPLITS.get(r.split)
     all_of = {
         "training trajectories": (r.train, whole.train),
         "calibration trajectories": (r.calibration, whole.calibration),
         "test seeds": (r.test, whole.test),
     }
-    part_of = own is not None and own.seed_base == whole.seed_base
+    part_of = definition is not None and definition.seed_base == whole.seed_base
     fewer = [
         (f"{few} of " if part_of else "") + f"{most} {part}"
         for part, (few, most) in all_of.items()
@@ -338,8 +340,8 @@ def _data(r: Reproduction) -> str:
     ]
     listed = " and ".join(filter(None, [", ".join(fewer[:-1]), *fewer[-1:]]))
     lacks = [f"split standard has {listed}"] if fewer else []
-    if own and own.episode_cap:
-        lacks.append(f"episodes end after {own.episode_cap} steps here")
+    if definition and definition.episode_cap:
+        lacks.append(f"episodes end after {definition.episode_cap} steps here")
     return fill(
         "data",
         split=r.split,

@@ -106,12 +106,12 @@ def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) ->
             scale, chance, unit = 100.0, 50.0, f"{info.title} (%)"
         dots = []
         for label in (label for before, label in labels if before == horizon):
-            own = [
+            in_series = [
                 numbers[p["rows"], labels[p["horizons"], label], p["scopes"], metric]
                 for p in places
             ]
-            run = [Estimate() if n.estimate.partial else n.estimate for n in own]
-            dots.append(_dots(label, run, scale, [scale * n.paper for n in own]))
+            run = [Estimate() if n.estimate.partial else n.estimate for n in in_series]
+            dots.append(_dots(label, run, scale, [scale * n.paper for n in in_series]))
         over = scopes[scope].title.lower()
         title = experiment.picture.panel.format(
             metric=info.title, row=titles[row], horizon=horizon, scope=scope, anomalies=over
@@ -135,10 +135,10 @@ def returns_picture(returns: Returns) -> Picture:
     for environment in (e for e in ENVIRONMENTS if e in returns):
         paper = paper_tables()["table2_policy_return"][environment]
         nominal, first = mean_return(returns, environment, "nominal").value, float(paper["nominal"])
-        found = [mean_return(returns, environment, kind) for kind in KINDS[1:]]
+        estimates = [mean_return(returns, environment, kind) for kind in KINDS[1:]]
         theirs = [100 * (float(paper[kind]) - first) / abs(first) for kind in KINDS[1:]]
         label = "ours, with intervals of the mean under the anomaly"
-        ours = _dots(label, found, 100 / abs(nominal), theirs, zero=nominal)
+        ours = _dots(label, estimates, 100 / abs(nominal), theirs, zero=nominal)
         panels.append(Panel(ENVIRONMENTS[environment].title, "change in %", names, (ours,), 0.0))
     title = "Change of the policies' return under each anomaly, % of the nominal return"
     return Picture(title, tuple(panels), Grid(width=9.2, height=2.0, share="none"))

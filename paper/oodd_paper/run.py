@@ -18,7 +18,7 @@ from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.parameters import parameters_of
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.layout import Table
+from oodd_eval.results.tables import Table
 from oodd_eval.scoring.plan import Unit, make_unit
 from oodd_paper.experiments import CONTROLS, Experiment, Tier, settings_of
 
@@ -51,19 +51,19 @@ def lay_out(
     device: str | None = None,
 ) -> list[Unit]:
     """Return every unit that some experiments need, cheap and informative ones first."""
-    found, names = [], list(split.environments)
+    units, names = [], list(split.environments)
     for setting in settings_of(experiments):
-        offer, given = plugins.offer(setting.detector), setting.overrides
+        offer, parameters = plugins.offer(setting.detector), setting.overrides
         if device is not None and "device" in parameters_of(offer.spec.parameters):
-            given["device"] = device
-        found += [
+            parameters["device"] = device
+        units += [
             make_unit(
-                offer, given, split, name, split.conditions(name), setting.horizon, seed, None
+                offer, parameters, split, name, split.conditions(name), setting.horizon, seed, None
             )
             for name in names
             for seed in tier.seeds(setting)
         ]
-    return sorted(found, key=lambda unit: (stage_of(unit), names.index(unit.environment)))
+    return sorted(units, key=lambda unit: (stage_of(unit), names.index(unit.environment)))
 
 
 def stage_of(unit: Unit) -> int:
@@ -86,12 +86,12 @@ def unfinished(units: Iterable[Unit], records: Iterable[Record]) -> list[Unit]:
 
 def scored_rows(split: Split) -> dict[str, int]:
     """Return by environment how many observations a unit scores, from the manifest alone."""
-    found = dict.fromkeys(split.environments, 0)
-    for environment in found:
+    rows = dict.fromkeys(split.environments, 0)
+    for environment in rows:
         for name, group in split.manifest["environments"][environment]["groups"].items():
             if name in {"calibration", TWINS} or name.startswith("test/"):
-                found[environment] += int(group["trajectories"]) + int(group["transitions"])
-    return found
+                rows[environment] += int(group["trajectories"]) + int(group["transitions"])
+    return rows
 
 
 def estimated_cost(setting: Setting, environment: str, rows: int) -> tuple[float, float]:
@@ -116,16 +116,16 @@ def remaining_seconds(
 
 
 def stages(
-    wanted: Sequence[Unit],
+    planned: Sequence[Unit],
     left: Sequence[Unit],
     rows: Mapping[str, int],
     fitted: Collection[str],
     jobs: int,
 ) -> Table:
-    """Return what remains of the wanted units, stage by stage, and how long it takes."""
+    """Return what remains of the planned units, stage by stage, and how long it takes."""
     lines, seen = [], set(fitted)
     for stage, title in [*enumerate(STAGES), (None, "all")]:
-        units = [u for u in wanted if stage in (None, stage_of(u))]
+        units = [u for u in planned if stage in (None, stage_of(u))]
         to_do = [u for u in left if stage in (None, stage_of(u))]
         seconds = remaining_seconds(to_do, rows, fitted if stage is None else seen) / jobs
         seen |= {u.fit_key for u in to_do}

@@ -24,10 +24,11 @@ from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
+from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.tables.board import Board, Standing, grouped
+from oodd_eval.results.standings import Standing
 
 _COMPARED: Final = (
     "false_episodes",

@@ -40,11 +40,11 @@ from oodd_eval.metrics.catalogue import (
 )
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
+from oodd_eval.results.board import contribution
 from oodd_eval.results.directory import EXPLAINED, ORDER_BITS, RECORDS, ResultsDirectory
 from oodd_eval.results.evaluate import metric_of, rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
-from oodd_eval.results.tables.board import contribution
 
 Records = Mapping[str, Record]  # records by their line: ``records.jsonl:3 (<cell>)``
 TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders

@@ -32,9 +32,9 @@ from oodd_eval.metrics.auc import Floats
 from oodd_eval.metrics.binomial import t_quantile
 from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval, nan_mean
 from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables.board import contribution, grouped
 
 ORDER: Final = "rerun.json"
 SPLIT_DIRECTORY: Final = "split"  # directory of the split, in that of the re-run

@@ -7,10 +7,10 @@ from typing import Final
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
+from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.ladder import FOUND, Place, Thresholds, at_rung, rung_names, thresholds, unit
-from oodd_eval.results.tables.board import Board
-from oodd_eval.results.tables.layout import Table, show_value
+from oodd_eval.results.tables import Table, show_value
 
 REFERENCE: Final = Setting("riqn")
 """The row whose thresholds others are divided by, where a board has it."""

@@ -3,32 +3,30 @@
 A tolerance is written ``METRIC:[+-]NUMBER[%]``. The sign says which way is worse: ``auc:-0.01``
 fails where the AUC fell by more than 0.01, ``delay:+10%`` where the delay rose by more than 10 % of
 the reference. Without a sign the metric's own worse side is meant; both for one that has none.
-
-A reference is a file of records, such as ``records.jsonl``, without what no comparison needs:
-intervals, values of single trajectories and costs. So it is small, and a change of it can be read.
 """
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.files import packed, write_bytes
-from oodd_eval.data.parts import CONDITIONS
+from oodd_eval.data.facts import join_condition
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import NAMES, metric_info
-from oodd_eval.names import Predicate, check_known
-from oodd_eval.results.directory import ResultsDirectory, read_records
+from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
+from oodd_eval.names import check_known
+from oodd_eval.results.board import Conditions, grouped
 from oodd_eval.results.identity import Cell
-from oodd_eval.results.record import NAN, Metric, Record
+from oodd_eval.results.record import NAN, Record
+from oodd_eval.results.reference import RecordSet
+from oodd_eval.results.report import Section
+from oodd_eval.results.tables import Table
 
 By = Literal["cell", "group", "mean"]
 Side = Literal["+", "-", "±"]
-_Place = tuple[str, str, str]  # split, place and detector of a difference
+_Unit = tuple[str, str, str]  # split, scope and detector of a difference
 
 Verdict = Literal[
     "same", "within", "better", "worse", "undefined", "failed", "missing", "recovered", "new"
@@ -52,51 +50,6 @@ RESOLUTION: Final = 1e-6  # smaller differences are none: processors order sums 
 
 class NothingInCommonError(ResultsError):
     """Two sets of records of which no two can be compared."""
-
-
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """Conditions under which records can be compared; of the split, the digest decides."""
-
-    split: str = field(compare=False)
-    split_digest: str
-    protocol: int
-    limit: int | None
-
-    def __str__(self) -> str:
-        limited = f", limited to {self.limit}" if self.limit is not None else ""
-        return f"split {self.split} {self.split_digest[:12]}, protocol {self.protocol}{limited}"
-
-
-@dataclass(frozen=True, slots=True)
-class RecordSet:
-    """Records by conditions and cell, and the name of the place that they are from."""
-
-    where: str
-    boards: dict[Conditions, dict[Cell, Record]]
-
-    @classmethod
-    def of(cls, records: Iterable[Record], where: str = "records") -> "RecordSet":
-        """Arrange records for comparison; of several of one cell, the last one counts."""
-        boards: dict[Conditions, dict[Cell, Record]] = {}
-        for r in records:
-            conditions = Conditions(r.split, r.split_digest, r.protocol, r.limit)
-            boards.setdefault(conditions, {})[r.cell] = r
-        return cls(where, boards)
-
-    @property
-    def records(self) -> list[Record]:
-        """All records."""
-        return [record for cells in self.boards.values() for record in cells.values()]
-
-    def selected(self, wanted: Predicate | None) -> "RecordSet":
-        """Return the records of those cells only whose text passes."""
-        chosen = (r for r in self.records if wanted is None or wanted(str(r.cell)))
-        return RecordSet.of(chosen, self.where)
-
-    def metrics(self) -> list[str]:
-        """Return the names of all metrics that occur, in their order."""
-        return list(dict.fromkeys(name for r in self.records for name in r.metrics))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,23 +110,23 @@ def parse_tolerance(text: str, known: Collection[str] = NAMES) -> Tolerance:
 
 def parse_tolerances(texts: Sequence[str], known: Collection[str] = NAMES) -> list[Tolerance]:
     """Read several tolerances as `parse_tolerance`; UsageError: two of one metric."""
-    found: dict[str, Tolerance] = {}
+    tolerances: dict[str, Tolerance] = {}
     for tolerance in (parse_tolerance(text, known) for text in texts):
-        if found.setdefault(tolerance.metric, tolerance) is not tolerance:
+        if tolerances.setdefault(tolerance.metric, tolerance) is not tolerance:
             raise UsageError(f"two tolerances for {tolerance.metric}, expected one")
-    return list(found.values())
+    return list(tolerances.values())
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
     """One figure now against the reference, NaN where undefined or where there is no such figure.
 
-    The place is such as ``"hopper/iid"``, of a mean ``"hopper/sensor"`` or ``"mean"``. `outside`
+    The scope is such as ``"hopper/iid"``, of a mean ``"hopper/sensor"`` or ``"mean"``. `outside`
     says that the figure is missing with its whole environment or detector.
     """
 
     split: str
-    place: str
+    scope: str
     detector: str
     tolerance: Tolerance
     reference: float
@@ -184,7 +137,7 @@ class Difference:
     outside: bool = False
 
     def __str__(self) -> str:
-        return f"{self.split}/{self.place}::{self.detector}"
+        return f"{self.split}/{self.scope}::{self.detector}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,69 +192,67 @@ def compare(
     new: list[Difference] = []
     notes = []
     for conditions in common:
-        cells, own = reference.boards[conditions], now.boards[conditions]
+        expected, present = reference.boards[conditions], now.boards[conditions]
         # Of these environments, or of these settings and seeds, nothing is there now.
-        here, rows = {c.environment for c in own}, {(c.setting, c.seed) for c in own}
-        there = {c for c in cells if c.environment in here and (c.setting, c.seed) in rows}
-        if outside := cells.keys() - there:
-            environments = sorted({cell.environment for cell in outside})
-            detectors = sorted({cell.setting.detector for cell in outside})
+        envs, rows = {c.environment for c in present}, {(c.setting, c.seed) for c in present}
+        inside = {c for c in expected if c.environment in envs and (c.setting, c.seed) in rows}
+        if outside := expected.keys() - inside:
             notes.append(
                 f"Missing in {now.where}: {len(outside)} cells of the reference (split "
-                f"{conditions.split}; environments {', '.join(environments)}; detectors "
-                f"{', '.join(detectors)}), whose environment or detector was not run at all. "
-                "Choose cells to compare with -k."
+                f"{conditions.split}; environments {_listed(c.environment for c in outside)}; "
+                f"detectors {_listed(c.setting.detector for c in outside)}), whose environment or "
+                "detector was not run at all. Choose cells to compare with -k."
             )
-        for place, ids in _units(cells, by).items():
-            pairs = [(cells[i], own.get(i)) for i in ids]
-            found = _compare_unit(place, pairs, used, two_sided=two_sided)
-            whole = outside.issuperset(ids)
-            differences += [replace(d, outside=whole) for d in found]
-        for cell in own.keys() - cells.keys():
-            new += [
-                Difference(*_parts(cell), t, NAN, own[cell].value(t.metric), "new") for t in used
-            ]
-    new.sort(key=lambda d: (d.split, d.detector, d.place))
-    for one, other in ((reference, now), (now, reference)):
-        alone = (c for c in one.boards if c not in other.boards)
-        notes += [f"Not compared: {c}, which is only in {one.where}." for c in alone]
+        for unit, cells in _units(expected, by).items():
+            pairs = [(expected[cell], present.get(cell)) for cell in cells]
+            compared = _compare_unit(unit, pairs, used, two_sided=two_sided)
+            differences += [replace(d, outside=outside >= {*cells}) for d in compared]
+        for cell in present.keys() - expected.keys():
+            values = [(t, present[cell].value(t.metric)) for t in used]
+            new += [Difference(*_parts(cell), t, NAN, value, "new") for t, value in values]
+    new.sort(key=lambda d: (d.split, d.detector, d.scope))
+    for records, others in ((reference, now), (now, reference)):
+        alone = (c for c in records.boards if c not in others.boards)
+        notes += [f"Not compared: {c}, which is only in {records.where}." for c in alone]
     return Comparison([*differences, *new], by, common, notes)
 
 
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(set(names)))
+
+
 def _require_common(now: RecordSet, reference: RecordSet, common: Sequence[Conditions]) -> None:
-    if empty := [one.where for one in (reference, now) if not one.boards]:
+    if empty := [records.where for records in (reference, now) if not records.boards]:
         why = f"no cell is selected in {empty[0]}"
     elif not common:
-        theirs, own = ("; ".join(map(str, one.boards)) for one in (reference, now))
-        why = (
-            "results of different splits, protocols or limits are not compared; "
-            f"{reference.where} has {theirs}; {now.where} has {own}"
-        )
+        has = (f"{r.where} has {'; '.join(map(str, r.boards))}" for r in (reference, now))
+        why = f"results of different splits, protocols or limits are not compared; {'; '.join(has)}"
     elif not any(reference.boards[c].keys() & now.boards[c].keys() for c in common):
-        theirs, own = (str(one.records[0].cell) for one in (reference, now))
-        why = f"no cell of {reference.where} (such as {theirs}) is in {now.where} (which has {own})"
+        expected, present = (str(records.records[0].cell) for records in (reference, now))
+        which = f"(such as {expected}) is in {now.where} (which has {present})"
+        why = f"no cell of {reference.where} {which}"
     else:
         return
     raise NothingInCommonError(f"nothing in common: {why}")
 
 
-def _parts(cell: Cell) -> _Place:
-    strength = f"@{cell.strength}" if cell.strength else ""
-    return cell.split, f"{cell.environment}/{cell.anomaly}{strength}", cell.label
+def _parts(cell: Cell) -> _Unit:
+    condition = join_condition(cell.anomaly, cell.strength)
+    return cell.split, f"{cell.environment}/{condition}", cell.label
 
 
-def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Place, list[Cell]]:
+def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Unit, list[Cell]]:
     """Sort cells into what is compared as one figure."""
-    units: dict[_Place, list[Cell]] = {}
+    units: dict[_Unit, list[Cell]] = {}
     for cell, record in cells.items():
-        split, place, detector = _parts(cell)
-        places = {"cell": place, "group": f"{cell.environment}/{record.group}", "mean": "mean"}
-        units.setdefault((split, places[by], detector), []).append(cell)
+        split, scope, detector = _parts(cell)
+        scopes = {"cell": scope, "group": f"{cell.environment}/{record.group}", "mean": "mean"}
+        units.setdefault((split, scopes[by], detector), []).append(cell)
     return units
 
 
 def _compare_unit(
-    place: _Place,
+    unit: _Unit,
     pairs: Sequence[tuple[Record, Record | None]],
     tolerances: Sequence[Tolerance],
     *,
@@ -320,21 +271,21 @@ def _compare_unit(
         why = ": ".join(filter(None, (failed[0].status, failed[0].reason)))
         verdict, reason, fails = "failed", of.format(len(failed)) + why, True
     elif both:
-        return [_compare_metric(place, both, t, two_sided=two_sided) for t in tolerances]
+        return [_compare_metric(unit, both, t, two_sided=two_sided) for t in tolerances]
     elif recovered:
         verdict, reason, fails = "recovered", f"was {recovered[0]}", two_sided
     else:
         reason, fails = f"fails in both: {present[0][1].status}", False
     means = {t: nan_mean(r.value(t.metric) for r, _ in pairs) for t in tolerances}
-    return [Difference(*place, t, means[t], NAN, verdict, fails, reason) for t in tolerances]
+    return [Difference(*unit, t, means[t], NAN, verdict, fails, reason) for t in tolerances]
 
 
 def _compare_metric(
-    place: _Place, both: Sequence[tuple[Record, Record]], tolerance: Tolerance, *, two_sided: bool
+    unit: _Unit, both: Sequence[tuple[Record, Record]], tolerance: Tolerance, *, two_sided: bool
 ) -> Difference:
     values = [(r.value(tolerance.metric), n.value(tolerance.metric)) for r, n in both]
     reference, now = nan_mean(r for r, _ in values), nan_mean(n for _, n in values)
-    figure = *place, tolerance, reference, now
+    figure = *unit, tolerance, reference, now
     if turned := [r for r, n in values if math.isnan(r) != math.isnan(n)]:
         where = "reference" if math.isnan(turned[0]) else "results"
         of = f" in {len(turned)} of {len(both)} cells" if len(both) > 1 else ""
@@ -348,51 +299,103 @@ def _compare_metric(
     return Difference(*figure, "worse" if worse else "better", worse or two_sided)
 
 
-def read_record_set(path: Path | str) -> RecordSet:
-    """Read the records of a results directory or of a file, such as a reference."""
-    path = Path(path)
-    if not path.exists():
-        raise ResultsError(
-            f"no results or reference at {str(path)!r}: expected a results directory, or a file of "
-            "records (*.jsonl) such as oodd-eval compare --write-reference writes"
-        )
-    records = ResultsDirectory(path).records() if path.is_dir() else read_records(path)
-    return RecordSet.of(records, str(path))
+_COLOURS: Final = {"better": "green", "recovered": "green", "within": "yellow"}
+
+_WHOLE: Final = ("failed", "missing", "recovered", "new")  # of cells, for every metric
 
 
-def write_reference(
-    records: Iterable[Record], path: Path | str, *, keep: Collection[str] = ()
-) -> None:
-    """Write a file of records to compare with later: values, without intervals and costs.
+def section(comparison: Comparison, *, everything: bool = False) -> Section:
+    """Return a comparison as part of a report, with its verdict as title.
 
-    Records stand in the order of the benchmark, whatever the order in which cells ran. Metrics to
-    `keep` are the only ones then, with their terms, from which intervals can be made again. A name
-    that ends in ``.gz`` gets a compressed file.
+    Its tables have the differences beyond the tolerance, or `everything`. Cells that are missing
+    with their whole environment or detector are in the notes.
     """
-    records = list(records)
-    environments = in_order((r.environment for r in records), ENVIRONMENTS)
-    conditions = in_order((r.condition for r in records), CONDITIONS)
+    listed = comparison.differences
+    if not everything:
+        listed = [d for d in listed if d.verdict not in ("same", "within", "new") and not d.outside]
+    within = [d for d in comparison.differences if d.verdict == "within"]
+    return Section(
+        verdict(comparison),
+        [summary(comparison)],
+        tables=_tables(listed, comparison.by),
+        fold="Differences within the tolerance",
+        folded=_tables(within, comparison.by),
+        notes=[*map(str, comparison.conditions), *comparison.notes],
+    )
 
-    def order(r: Record) -> tuple[str, str, int, int, str]:
-        place = environments.index(r.environment), conditions.index(r.condition)
-        return r.split, r.split_digest, *place, str(r.cell)
 
-    known, lines = ("oodd_eval", "python", "numpy"), []
-    for r in sorted(records, key=order):
-        chosen = {name: m for name, m in r.metrics.items() if name in keep or not keep}
-        metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
-        terms = {name: r.per_trajectory[name] for name in keep if r.ok}
-        kept = replace(
-            r,
-            metrics=metrics,
-            per_trajectory=terms,
-            scores="",
-            seconds_fit=NAN,
-            seconds_score=NAN,
-            steps_scored=None,
-            peak_rss_mb=NAN,
-            provenance={k: v for k, v in r.provenance.items() if k in known},
-        )
-        lines.append(kept.to_json() + "\n")
-    content = "".join(lines).encode()
-    write_bytes(Path(path), packed(Path(path), content))
+def _tables(differences: Iterable[Difference], by: By) -> list[Table]:
+    """Return a table for each split and detector; a whole cell takes one row."""
+    header = [by, "metric", "reference", "now", "difference", "tolerance", "verdict"]
+    tables = []
+    for (split, detector), group in by_suite(differences).items():
+        several = Counter((d.scope, d.verdict) for d in group)
+        rows: dict[tuple[str, str], list[str]] = {}
+        colours = []
+        for d in group:
+            metric = d.tolerance.metric
+            row = [metric, _figure(d.reference, metric), _figure(d.now, metric)]
+            row += [change(d), d.tolerance.text]
+            if d.verdict in _WHOLE and several[d.scope, d.verdict] > 1:
+                row = ["all", "", "", change(d), ""]
+            if (d.scope, row[0]) not in rows:
+                colours.append("red" if d.fails else _COLOURS.get(d.verdict, ""))
+                rows[d.scope, row[0]] = [d.scope, *row, d.verdict]
+        title = f"{detector} on {split}"
+        tables.append(Table(title, header, list(rows.values()), labels=2, colours=colours))
+    return tables
+
+
+def by_suite(differences: Iterable[Difference]) -> dict[tuple[str, str], list[Difference]]:
+    """Return differences by split and detector."""
+    return grouped(differences, lambda d: (d.split, d.detector))
+
+
+def change(d: Difference) -> str:
+    """Return the change as printed: an arrow, its size, and percent where those are tolerated."""
+    if d.verdict in ("failed", "missing", "undefined"):
+        return d.reason
+    by = d.now - d.reference
+    if math.isnan(by):
+        return d.reason or UNDEFINED
+    if d.verdict == "same":
+        return "="
+    relative = f" ({by / abs(d.reference):+.1%})" if d.tolerance.percent and d.reference else ""
+    return f"{'↑' if by > 0 else '↓'} {abs(by):.3g}{relative}"
+
+
+def summary(comparison: Comparison) -> str:
+    """Return one sentence: how much was compared, and what came of it."""
+    compared = [d for d in comparison.differences if d.verdict != "new"]
+    units = {"cell": "cells", "group": "group means", "mean": "means"}[comparison.by]
+    metrics = list(dict.fromkeys(d.tolerance.metric for d in compared))
+    counts = Counter(d.verdict for d in compared)
+    verdicts = ", ".join(f"{counts[v]} {v}" for v in MEANINGS if counts[v])
+    new = len({str(d) for d in comparison.differences if d.verdict == "new"})
+    more = f"; {new} new cells are not in the reference" if new else ""
+    name = metrics[0] if len(metrics) == 1 else f"{len(metrics)} metrics"
+    return f"{len(set(map(str, compared)))} {units} compared in {name}: {verdicts}{more}."
+
+
+def verdict(comparison: Comparison) -> str:
+    """Return in a few words whether the comparison fails."""
+    if not comparison.failures:
+        return "Regression check passed"
+    figures = sum(d.verdict != "new" for d in comparison.differences)
+    return f"Regression check failed: {len(comparison.failures)} of {figures} figures"
+
+
+def message(d: Difference) -> str:
+    """Return one line about a difference: figures, change, tolerance and verdict."""
+    ends = d.reference, d.now
+    reference, now = ("undefined" if math.isnan(v) else f"{v:.6g}" for v in ends)
+    figures = f"{d.tolerance.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
+    return f"{figures}, tolerance {d.tolerance.text}"
+
+
+def _figure(value: float, metric: str) -> str:
+    """Return a figure with as many digits as a tolerance may need."""
+    if math.isnan(value):
+        return UNDEFINED
+    steps = metric in NAMES and metric_info(metric).unit == "steps"
+    return f"{value:.2f}" if steps else f"{value:.4f}"

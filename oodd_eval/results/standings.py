@@ -1,0 +1,252 @@
+"""The rows of a board in order: ranks, tie groups, win rates and cost."""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.auc import Contribution
+from oodd_eval.metrics.bootstrap import nan_mean
+from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, UNDEFINED, metric_info
+from oodd_eval.metrics.ranking import Position, Ranking, Row, rank, win_rates
+from oodd_eval.results.board import Board, contribution, expected_cells, grouped
+from oodd_eval.results.identity import Setting
+from oodd_eval.results.record import NAN, Record
+
+SEEDS: Final = 3
+"""Detector seeds that a primary row with randomness needs for a rank."""
+
+
+class Cost(NamedTuple):
+    """Mean seconds of a row's fits, microseconds per scored step, and most memory in MB."""
+
+    fit: float = NAN
+    step: float = NAN
+    peak: float = NAN
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """One row of a board with its rank.
+
+    `rank` is None, and `state` says why, for a row that is not ranked; `alarm_rank` is its rank by
+    alarms, None where `alarm_state` says why. `primary` rows are one a detector; the others are
+    variants, whose rank is the one that they would have. So is that of a row `below` the ranking,
+    which was not run again where others were. `ties` are the letters of its tie groups,
+    `wins` is the mean of its win rates against the other ranked rows, and `inputs` is empty where
+    no record names the detector's inputs.
+    """
+
+    entry: Setting
+    records: list[Record]
+    trivial: bool
+    primary: bool
+    below: bool
+    rank: int | None
+    alarm_rank: int | None
+    ties: str
+    state: str
+    alarm_state: str
+    wins: float
+    inputs: str
+    cost: Cost
+
+    @property
+    def seeds(self) -> int:
+        """The number of detector seeds."""
+        return len({r.seed for r in self.records})
+
+    def printed(self, rank: int | None) -> str:
+        """Return a rank as printed: in brackets where it is the one that the row would have."""
+        return UNDEFINED if rank is None else f"({rank})" if self.below else str(rank)
+
+    @property
+    def marks(self) -> str:
+        """Whether the row is trivial, and whether it is a variant, as printed behind its name."""
+        return " (trivial)" * self.trivial + " (variant)" * (not self.primary)
+
+
+class RankedBoard(NamedTuple):
+    """A board with its rankings and win rates, by the labels of the ranked rows.
+
+    All have the order of the standings: ranked rows by rank and mean, then the others by name, and
+    last what stands below the ranking, likewise.
+    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric.
+    """
+
+    board: Board
+    standings: list[Standing]
+    ranking: Ranking
+    alarms: Ranking
+    rates: dict[tuple[str, str], float]
+
+
+def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ()) -> set[Setting]:
+    """Return one row of each detector: of those with most cells and seeds enough the simplest.
+
+    That is the row with the fewest other than default parameters, and then the least horizon. Cells
+    and seeds come first, so that part of a row does not stand for a detector that has a whole one,
+    and `rerun` rows before all, so that nobody's claim takes the place of what was confirmed. Only
+    `expected_cells` count.
+    """
+    by_row = grouped(records, lambda r: r.setting)
+    expected = expected_cells([r for rows in by_row.values() for r in rows])
+
+    def order(row: Setting) -> tuple[Any, ...]:
+        cells, few = expected & {r.position for r in by_row[row]}, has_few_seeds(by_row[row])
+        return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
+
+    chosen: dict[str, Setting] = {}
+    for row in sorted(by_row, key=order):
+        chosen.setdefault(row.detector, row)
+    return set(chosen.values())
+
+
+def ranked(
+    records: Sequence[Record],
+    primary: Collection[Setting] | None = None,
+    rerun: Collection[Setting] = (),
+    *,
+    expected: Collection[Position] = (),
+) -> RankedBoard:
+    """Rank the rows of one board that have a value in every cell, with all their detector seeds.
+
+    Parameters
+    ----------
+    records
+        Records of one split digest, protocol and limit.
+    primary
+        Rows that push others down, one a detector; by default `primary_settings`. They need three
+        detector seeds, unless the seed changes nothing.
+    rerun
+        Rows that were run again. Where there are any, others stand below these and push nobody
+        down.
+    expected
+        Environments and conditions that a ranked row needs; by default `expected_cells`. Records
+        of other cells change no rank.
+
+    Returns
+    -------
+    RankedBoard
+
+    Raises
+    ------
+    ResultsError
+        When ranked rows differ in their numbers of test trajectories, or two rows have one name.
+    """
+    ordered = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.position))
+    by_row = grouped(ordered, lambda r: r.setting)
+    labels = Counter(map(str, by_row))
+    if twice := [label for label, n in labels.items() if n > 1]:
+        raise ResultsError(
+            f"two rows of a board are both called {twice[0]!r}, expected names and settings that "
+            "tell rows apart: give one of the detectors another name"
+        )
+    first = primary_settings(records) if primary is None else set(primary)
+    cells = set(expected or expected_cells(records))
+    counted = {e: [r for r in rows if r.position in cells] for e, rows in by_row.items()}
+    below = set(by_row).difference(rerun) if rerun else set()
+
+    def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row], dict[Setting, str]]:
+        states = {e: _state(rows, cells, metric, e in first) for e, rows in counted.items()}
+        rows = {str(e): terms_of(counted[e], metric) for e, state in states.items() if not state}
+        return rank(rows, set(map(str, first - below))), rows, states
+
+    ranking, rows, states = ranking_by(RANKING)
+    alarms, _, alarm_states = ranking_by(ALARM_RANKING)
+    rates = win_rates(
+        {
+            label: {
+                c: nan_mean(seed[c].value for seed in rows[label].values()) for c in sorted(cells)
+            }
+            for label in ranking.ranks
+        }
+    )
+    unranked = set(map(str, below))
+    positions = {label: i for i, label in enumerate(ranking.ranks)}
+    order = sorted(
+        by_row, key=lambda e: (e in below, positions.get(str(e), len(positions)), _name(e))
+    )
+    board = Board([record for entry in order for record in by_row[entry]], cells)
+    standings = [
+        Standing(
+            entry=entry,
+            records=by_row[entry],
+            trivial=board.is_trivial(entry),
+            primary=entry in first,
+            below=entry in below,
+            rank=ranking.ranks.get(str(entry)),
+            alarm_rank=alarms.ranks.get(str(entry)),
+            ties=ranking.letters(str(entry)),
+            state=states[entry],
+            alarm_state=alarm_states[entry],
+            wins=nan_mean(
+                rate
+                for (row, against), rate in rates.items()
+                if row == str(entry) and against not in unranked
+            ),
+            inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
+            cost=cost_of(by_row[entry]),
+        )
+        for entry in order
+    ]
+    return RankedBoard(board, standings, ranking, alarms, rates)
+
+
+def terms_of(records: Iterable[Record], metric: str) -> Row:
+    """Return a row's terms of a metric by seed and cell; where lower is better, the sign is turned.
+
+    Failed cells, and those without the metric, are left out.
+    """
+    sign = -1.0 if metric_info(metric).better == "lower" else 1.0
+    row: dict[int, dict[Position, Contribution]] = {}
+    for r in records:
+        cells = row.setdefault(r.seed, {})
+        if r.ok and metric in r.per_trajectory:
+            terms = contribution(r, metric)
+            cells[r.position] = Contribution(sign * terms.numerator, terms.denominator)
+    return row
+
+
+def cost_of(records: Iterable[Record]) -> Cost:
+    """Return what the fits behind some records cost; records of one fit share its cost."""
+    fits = list({(r.environment, r.seed): r for r in records if r.ok}.values())
+    timed = [(r.seconds_score, r.steps_scored) for r in fits if not math.isnan(r.seconds_score)]
+    steps = [(seconds, n) for seconds, n in timed if n and n > 0]
+    seconds = math.fsum(s for s, _ in steps)
+    return Cost(
+        nan_mean(r.seconds_fit for r in fits),
+        1e6 * seconds / sum(n for _, n in steps) if steps else NAN,
+        max((r.peak_rss_mb for r in fits if not math.isnan(r.peak_rss_mb)), default=NAN),
+    )
+
+
+def _state(
+    records: Sequence[Record], cells: Collection[Position], metric: str, primary: bool
+) -> str:
+    """Return why a row is not ranked by a metric; empty if it is."""
+    seeds = len({r.seed for r in records}) or 1
+    expected = len(cells) * seeds
+    failed = Counter(r.status for r in records if not r.ok)
+    reasons = [f"{status} in {n} of {expected} cells" for status, n in failed.items()]
+    if len(records) < expected:
+        reasons.append(f"{expected - len(records)} of {expected} cells missing")
+    values = (c.value for cell in terms_of(records, metric).values() for c in cell.values())
+    defined = sum(not math.isnan(value) for value in values)
+    if undefined := sum(r.ok for r in records) - defined:
+        reasons.append(f"undefined in {undefined} of {expected} cells")
+    if primary and has_few_seeds(records):
+        reasons.append(f"{seeds} of {SEEDS} detector seeds")
+    return ", ".join(reasons)
+
+
+def has_few_seeds(records: Sequence[Record]) -> bool:
+    """Tell whether a row has fewer detector seeds than a primary row needs."""
+    seeds = {r.seed for r in records}
+    return len(seeds) < SEEDS and not all(r.deterministic for r in records)
+
+
+def _name(entry: Setting) -> tuple[str, int, str]:
+    return entry.detector, entry.horizon, entry.overrides_json
