@@ -110,7 +110,8 @@ def main():
         for name, leaderboard in {"committed": COMMITTED, "large": Path(large)}.items():
             wall, cpu, memory, parts = apart(timed, leaderboard)
             text = ", ".join(f"{part} {seconds:.1f}" for part, seconds in parts.items())
-            print(f"{name:10} {wall:6.1f} s wall {cpu:6.1f} s CPU {memory:6.0f} MB: {text}", flush=True)
+            sizes = f"{wall:6.1f} s wall {cpu:6.1f} s CPU {memory:6.0f} MB"
+            print(f"{name:10} {sizes}: {text}", flush=True)
     limit = LIMITS.get(options.rows)
     print(f"limits: {f'{limit:g} s wall' if limit else 'no time'}, {MEMORY:g} MB")
     return int(memory > MEMORY or (limit is not None and wall > limit))
