@@ -14,7 +14,7 @@ from functools import wraps
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data import bounded, layout, stored
-from oodd_eval.plugins import contract, explanations, specs
+from oodd_eval.plugins import contract, discovery, explanations
 from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring import keys
@@ -24,7 +24,7 @@ CHECKS = {
     layout: ["content_digest", "check_layout", "check_names"],
     stored: ["check_plain"],
     bounded: ["read_npz"],
-    specs: ["check_detector_spec"],
+    discovery: ["check_detector_spec"],
     keys: ["source_digest"],
     supervisor: ["_typed", "_number"],
     contract: ["check_scores", "check_prefix"],

@@ -1,6 +1,10 @@
-"""The tests that the pytest plug-in adds: one per cell, which share one run of the harness."""
+"""The tests that the pytest plug-in adds: one per cell, which share one run of the harness.
 
-from collections.abc import Callable
+`Conformance` tells the conformance checks, whose tests are collected as any others, the detector.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,7 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import select
+from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import Difference, compare, message, parse_tolerances
@@ -26,6 +31,22 @@ class Regression(Exception):  # noqa: N818  a finding, not an error of the progr
     """A cell that does not come up to its reference."""
 
 
+class Conformance:
+    """The plug-in object that names the detectors of the shipped conformance tests."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        plugins = discover()
+        with _usage_errors():
+            names = _detectors(config.getoption("oodd_detector"), plugins)
+        self._trials = {name: Trial(plugins.offer(name).spec) for name in names}
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Give the shipped tests every detector."""
+        if metafunc.module.__name__.startswith("oodd_eval.plugins.conformance."):
+            trials = self._trials
+            metafunc.parametrize("detector", trials.values(), ids=[*trials], scope="module")
+
+
 class Cells:
     """The plug-in object: it adds the tests and holds what they share."""
 
@@ -33,10 +54,8 @@ class Cells:
         self._option = config.getoption
         self._records: dict[str, Record] = {}
         self._differences: dict[str, list[Difference]] = {}
-        try:
+        with _usage_errors():
             self._prepare(config.getoption)
-        except OoddError as error:
-            raise pytest.UsageError(f"oodd-eval: {error}") from None
 
     def _prepare(self, option: Callable[[str], Any]) -> None:
         self.plugins = discover()
@@ -47,8 +66,8 @@ class Cells:
         metrics = reference.metrics() if reference else ()
         self.tolerances = parse_tolerances(option("oodd_fail"), [*NAMES, *metrics])
         self.plan = _plan(self.plugins, self.split, names, option("oodd_env"), reference)
-        self.cells = list(map(str, self.plan.cells))
-        self.reference = reference.selected(set(self.cells).__contains__) if reference else None
+        self.names = list(map(str, self.plan.cells))
+        self.reference = reference.selected(set(self.names).__contains__) if reference else None
         if self.reference and not self.reference.boards:
             what = f"{', '.join(names)} in {option('oodd_env') or 'these environments'}"
             where = self.reference.where
@@ -57,32 +76,32 @@ class Cells:
     def pytest_report_header(self) -> str:
         """Return a line on what is checked, and against what."""
         where = f"against {self.reference.where}" if self.reference else "without a reference"
-        return f"oodd-eval: {len(self.cells)} cells in {len(self.plan.units)} fits, {where}"
+        return f"oodd-eval: {len(self.names)} cells in {len(self.plan.units)} fits, {where}"
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, session: pytest.Session, items: list[Any]) -> None:
         """Add the tests before other plug-ins select among them."""
         parent = CellCollector.from_parent(session, name="oodd-eval", nodeid="oodd-eval")
-        parent.own = self
-        found = parent.collect()
+        parent.cells = self
+        tests = parent.collect()
         # pytest calls these hooks for tests in files; with them, reports count these tests, too.
-        for item in found:
+        for item in tests:
             session.ihook.pytest_itemcollected(item=item)
-        report = pytest.CollectReport(parent.nodeid, "passed", None, [*found])
+        report = pytest.CollectReport(parent.nodeid, "passed", None, [*tests])
         session.ihook.pytest_collectreport(report=report)
-        items += found
+        items += tests
 
     def check(self, cell: str, session: pytest.Session) -> None:
         """Raise `Regression` when a cell fails; the first call runs all selected ones."""
         if not self._records:
             self.run({item.name for item in session.items if isinstance(item, CellItem)})
-        record, found = self._records[cell], self._differences.get(cell, [])
+        record, differences = self._records[cell], self._differences.get(cell, [])
         if self.reference is None:
             if not record.ok:
                 raise Regression(f"{record.status}: {record.reason}")
-        elif any(d.verdict == "new" for d in found):
+        elif any(d.verdict == "new" for d in differences):
             pytest.skip(f"not in {self.reference.where}: nothing to compare with")
-        elif failures := [d for d in found if d.fails]:
+        elif failures := [d for d in differences if d.fails]:
             raise Regression(_explained(record, failures, self.reference.where))
 
     def run(self, chosen: set[str]) -> None:
@@ -102,14 +121,22 @@ class Cells:
             self._differences.setdefault(str(d), []).append(d)
 
 
+@contextmanager
+def _usage_errors() -> Iterator[None]:
+    try:
+        yield
+    except OoddError as error:
+        raise pytest.UsageError(f"oodd-eval: {error}") from None
+
+
 class CellCollector(pytest.Collector):
     """The parent of the tests, which stand in no file."""
 
-    own: Cells
+    cells: Cells
 
     def collect(self) -> list[pytest.Item]:
         """Return a test per cell."""
-        return [CellItem.from_parent(self, name=cell) for cell in self.own.cells]
+        return [CellItem.from_parent(self, name=cell) for cell in self.cells.names]
 
 
 class CellItem(pytest.Item):
@@ -119,7 +146,7 @@ class CellItem(pytest.Item):
 
     def runtest(self) -> None:
         """Raise `Regression` when the cell does not come up to its reference."""
-        self.parent.own.check(self.name, self.session)
+        self.parent.cells.check(self.name, self.session)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Return the message alone: the traceback would lead through this module only."""
@@ -142,21 +169,27 @@ def _detectors(patterns: str, plugins: Plugins) -> list[str]:
 
 def _of_split(reference: RecordSet, split: Split, names: list[str]) -> RecordSet:
     """Return a reference's cells of these detectors and of this split as it is here."""
-    wanted = Conditions(split.name, split.digest, PROTOCOL, None)
-    here = list(reference.boards.get(wanted, {}).values())
-    if not here:
-        found = "; ".join(map(str, reference.boards)) or "no cells"
-        raise UsageError(f"nothing in common: {reference.where} has {found}, expected {wanted}")
-    own = RecordSet.of((r for r in here if r.detector in names), reference.where)
-    if not own.boards:
-        others = ", ".join(sorted({r.detector for r in here}))
+    conditions = Conditions(split.name, split.digest, PROTOCOL, None)
+    records = list(reference.boards.get(conditions, {}).values())
+    if not records:
+        boards = "; ".join(map(str, reference.boards)) or "no cells"
+        raise UsageError(
+            f"nothing in common: {reference.where} has {boards}, expected {conditions}"
+        )
+    selected = RecordSet.of((r for r in records if r.detector in names), reference.where)
+    if not selected.boards:
+        others = ", ".join(sorted({r.detector for r in records}))
         has = f"{reference.where} has no cell of {', '.join(names)}, only of {others}"
         raise UsageError(f"{has}: write one with oodd-eval compare DIR --write-reference FILE")
-    return own
+    return selected
 
 
 def _plan(
-    plugins: Plugins, split: Split, names: list[str], envs: str | None, reference: RecordSet | None
+    plugins: Plugins,
+    split: Split,
+    detectors: list[str],
+    envs: str | None,
+    reference: RecordSet | None,
 ) -> Plan:
     """Plan what the reference has: its environments, horizons and seeds, at default parameters."""
     cells = [record.cell for record in reference.records] if reference else []
@@ -164,26 +197,26 @@ def _plan(
     if reference and not plain:
         has = f"{reference.where} has only cells with parameters of their own, such as {cells[0]}"
         raise UsageError(f"{has}; here detectors run with their defaults")
-    found = {cell.environment for cell in cells}
-    environments = [e for e in split.environments if not reference or e in found]
+    recorded = {cell.environment for cell in cells}
+    environments = [e for e in split.environments if not reference or e in recorded]
     if envs:
         environments = select("environment", envs, split.environments)
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
     plan = make_plan(
         plugins,
         split=split,
-        detectors=names,
+        detectors=detectors,
         environments=environments,
         horizons=sorted(horizons) or [1],
         seeds=sorted(seeds) or [0],
     )
     labels = {cell.label for cell in cells}
-    wanted = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
-    return plan.matching(wanted.__contains__)
+    names = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
+    return plan.matching(names.__contains__)
 
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
-    found = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
+    text = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
     options = {
         "detector": record.detector,
         "env": record.environment,
@@ -193,4 +226,4 @@ def _explained(record: Record, failures: list[Difference], where: str) -> str:
         "seed": record.seed,
     }
     command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
-    return f"{found}\nthe reference is {where}; to run this cell alone:\n{command}"
+    return f"{text}\nthe reference is {where}; to run this cell alone:\n{command}"

@@ -4,8 +4,10 @@
 
     pytest --oodd-detector mine --oodd-reference reference.jsonl
 
-adds one test per cell. Without ``--oodd-detector`` nothing happens: pytest loads this module in
-every environment in which oodd-eval is installed, so the harness is imported only when asked for.
+adds one test per cell; ``--pyargs oodd_eval.plugins.conformance`` in place of a reference runs the
+conformance checks of the detector. Without ``--oodd-detector`` nothing happens: pytest loads this
+module in every environment in which oodd-eval is installed, so the harness is imported only when
+asked for.
 """
 
 from typing import Final
@@ -39,9 +41,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the check if a detector is named."""
     if config.getoption("oodd_detector"):
-        from oodd_eval.pytest_cells import Cells  # noqa: PLC0415  see above
+        from oodd_eval.pytest_cells import Cells, Conformance  # noqa: PLC0415  see above
 
-        config.pluginmanager.register(Cells(config), "oodd-eval-cells")
+        conformance = any("oodd_eval.plugins.conformance" in name for name in config.args)
+        config.pluginmanager.register(Conformance(config) if conformance else Cells(config))
         return
     for name in _OTHERS:
         if config.getoption(f"oodd_{name}"):

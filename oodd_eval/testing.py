@@ -2,7 +2,7 @@
 
 ::
 
-    from oodd_eval.testing import pytest_generate_tests, test_contract
+    from oodd_eval.testing import *
 
     @pytest.fixture(scope="module")
     def detector():
@@ -15,25 +15,34 @@ own, so that a crash is reported too: ``oodd-eval check mine``.
 from collections.abc import Mapping
 from typing import Any
 
-from oodd_eval.errors import ContractError
+from oodd_eval.errors import ContractError, MissingExtraError
 from oodd_eval.names import check_known
-from oodd_eval.plugins.conformance import CHECKS, Check, Report, Result, carry_out, expected
-from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
+from oodd_eval.plugins.conformance import Report, Result
+
+try:
+    from oodd_eval.plugins.conformance.trial import Factory, Trial, shared_trial, trial
+except ModuleNotFoundError as missing:
+    raise MissingExtraError(
+        f"checks of detectors need pytest ({missing}): pip install 'oodd-eval[check]'"
+    ) from missing
+
+from oodd_eval.plugins.conformance.session import CHECKS, run_tests, supervise
+
+globals().update({check.__name__: check for check in CHECKS.values()})
 
 __all__ = [
-    "Check",
-    "CheckFailedError",
-    "CheckSkipped",
+    "CHECKS",
     "NonConformingError",
     "Report",
     "Result",
     "Trial",
     "check_detector",
-    "detector_checks",
-    "pytest_generate_tests",
     "run_checks",
-    "test_contract",
+    "shared_trial",
+    "supervise",
+    "trial",
 ]
+__all__ += [check.__name__ for check in CHECKS.values()]
 
 
 class NonConformingError(ContractError, AssertionError):
@@ -43,22 +52,6 @@ class NonConformingError(ContractError, AssertionError):
         lines = [result.line() for result in report.failed]
         super().__init__("\n".join([report.summary(), *lines]))
         self.report = report
-
-
-def detector_checks() -> list[Check]:
-    """Return all checks, for ``pytest.mark.parametrize``; each is called with a factory."""
-    return list(CHECKS.values())
-
-
-def test_contract(check: Check, detector: Factory | Trial) -> None:
-    """Carry out one check on what the fixture `detector` gives."""
-    check(detector)
-
-
-def pytest_generate_tests(metafunc: Any) -> None:
-    """Give `test_contract` every check; pytest calls this in the modules that import it."""
-    if metafunc.function is test_contract:
-        metafunc.parametrize("check", detector_checks(), ids=str)
 
 
 def run_checks(
@@ -74,10 +67,21 @@ def run_checks(
         Names of checks that are known to fail, with the reason; one that passes is not all right.
     arguments
         ``horizon`` (1), ``seed`` (0) and ``parameters`` that the factory is called with.
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    UnknownNameError
+        For an expected failure of no check.
     """
-    check_known("check", CHECKS, *(expected_failures or {}))
-    results = carry_out(Trial(factory, **arguments), CHECKS)
-    return Report([expected(result, expected_failures or {}) for result in results])
+    failures = dict(expected_failures or {})
+    check_known("check", CHECKS, *failures)
+    results: list[Result] = []
+    run_tests(Trial(factory, **arguments), results.append)
+    return Report([result.expected(failures) for result in results])
 
 
 def check_detector(
@@ -90,6 +94,10 @@ def check_detector(
     factory, expected_failures, arguments
         As in `run_checks`.
 
+    Returns
+    -------
+    Report
+
     Raises
     ------
     NonConformingError
@@ -98,8 +106,8 @@ def check_detector(
     Examples
     --------
     >>> from oodd_trivial import Clock
-    >>> known = {"gross-anomaly": "knows only the time"}
-    >>> check_detector(Clock, expected_failures=known).ok  # doctest: +ELLIPSIS
+    >>> failures = {"gross-anomaly": "knows only the time"}
+    >>> check_detector(Clock, expected_failures=failures).ok  # doctest: +ELLIPSIS
     passed   factory...
     True
     """

@@ -97,10 +97,7 @@ GOOD = DetectorSpec(
 
 @dataclass(frozen=True)
 class Broken:
-    """A spec, the check it must fail, the message, and the checks that fail with it.
-
-    In the message ``<n>`` stands for a number and ``<...>`` for any text.
-    """
+    """A spec, the check it must fail, what its message says, and the checks that fail with it."""
 
     check: str
     spec: DetectorSpec
@@ -125,68 +122,45 @@ def breaks(check, message, *, also=(), **changes):
 # How it is made, and what it says
 
 
-@breaks(
-    "factory",
-    "the factory returned NoScore without a method score: expected an object with fit(nominal) and "
-    "score(trajectory)",
-    parameters=None,
-)
+@breaks("factory", "the factory returned NoScore without a method score:", parameters=None)
 class NoScore:
     def __init__(self, *, seed, horizon): ...
 
     def fit(self, nominal): ...
 
 
-@breaks(
-    "factory",
-    "the factory, called with seed=0, horizon=1, raised TypeError: NoHorizon.__init__() got an "
-    "unexpected keyword argument 'horizon' (<...>)",
-)
+@breaks("factory", "the factory, called with seed=0, horizon=1, raised")
 class NoHorizon(Good):
     def __init__(self, *, seed):
         super().__init__(seed=seed)
 
 
-@breaks(
-    "unknown-parameter",
-    "the factory accepted no_such_parameter=1 without a word: expected a TypeError or ValueError, "
-    "so that a misspelt parameter is not taken for a setting",
-)
+@breaks("unknown-parameter", "the factory accepted no_such_parameter=1 without a word:")
 class TakesAnything(Good):
     def __init__(self, *, seed=0, horizon=1, power=1.0, **_):
         super().__init__(seed=seed, horizon=horizon, power=power)
 
 
-@breaks("fits", "fit raised RuntimeError: no mood (broken_detectors.py:<n>)")
+@breaks("fits", "fit raised RuntimeError: no mood (broken_detectors.py")
 class NoMood(Good):
     def fit(self, nominal):
         raise RuntimeError("no mood")
 
 
-@breaks("fits", "fit called sys.exit(3)")
+@breaks("fits", "fit called sys.exit(3")
 class Exits(Good):
     def fit(self, nominal):
         sys.exit(3)
 
 
-@breaks(
-    "inputs",
-    "without actions, fit raised IndexError: index 0 is out of bounds for axis 1 with size 0 "
-    '(broken_detectors.py:<n>); with them it works: expected inputs="observations+actions" in the '
-    "spec, as a detector that declares observations is handed actions of width 0",
-)
+@breaks("inputs", "without actions, fit raised IndexError: index 0 is out of")
 class LearnsActions(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ = self.std_ + np.concatenate([x.actions[:, 0] for x in nominal]).std()
 
 
-@breaks(
-    "inputs",
-    "without actions, score raised IndexError: index 0 is out of bounds for axis 1 with size 0 "
-    '(broken_detectors.py:<n>); with them it works: expected inputs="observations+actions" in the '
-    "spec, as a detector that declares observations is handed actions of width 0",
-)
+@breaks("inputs", "without actions, score raised IndexError: index 0 is out")
 class ScoresActions(Good):
     def score(self, x):
         scores = super().score(x)
@@ -197,8 +171,7 @@ class ScoresActions(Good):
 
 @breaks(
     "declared-parameters",
-    "scores change when the declared defaults (power=2.0) are spelt out: at t = 1 it is <n> "
-    "instead of <n>; expected the defaults of the spec to be those of the factory",
+    "scores change when the declared defaults (power=2.0) are",
     parameters=declared_by({"power": 2.0}),
 )
 class OtherDefault(Good): ...
@@ -206,51 +179,33 @@ class OtherDefault(Good): ...
 
 @breaks(
     "declared-parameters",
-    "the factory, called with seed=0, horizon=1, power=1.0, strength=2, raised TypeError: "
-    "Good.__init__() got an unexpected keyword argument 'strength' (<...>)",
+    "the factory, called with seed=0, horizon=1, power=1.0,",
     parameters=declared_by({"power": 1.0, "strength": 2}),
 )
 class NoSuchParameter(Good): ...
 
 
-@breaks(
-    "not-fitted",
-    "score before fit raised AttributeError: 'NoneType' object has no attribute 'sum' "
-    "(broken_detectors.py:<n>): expected oodd_eval.errors.NotFittedError or a message that speaks "
-    "of fit",
-)
+@breaks("not-fitted", "score before fit raised AttributeError: 'NoneType' object")
 class Unprepared(Good):
     def score(self, x):
         self.std_.sum()
         return super().score(x)
 
 
-@breaks(
-    "not-fitted",
-    "score before fit returned scores, other ones than after it: expected "
-    "oodd_eval.errors.NotFittedError",
-)
+@breaks("not-fitted", "score before fit returned scores, other ones than after")
 class ScoresUnfitted(Good):
     def score(self, x):
         return np.zeros(len(x)) if self.std_ is None else super().score(x)
 
 
-@breaks(
-    "wrong-dimension",
-    "score, fitted on 3 sensors and given 7, returned scores: expected a ValueError that names "
-    "both",
-)
+@breaks("wrong-dimension", "score, fitted on 3 sensors and given 7, returned scores:")
 class LooksAtTheFirst(Good):
     def score(self, x):
         d = len(self.std_) if self.std_ is not None else 0
         return super().score(Trajectory(x.observations[:, :d] if d else x.observations, x.actions))
 
 
-@breaks(
-    "wrong-dimension",
-    "score, fitted on 3 sensors and given 7, raised ValueError: bad shape "
-    "(broken_detectors.py:<n>): expected a ValueError that names both numbers",
-)
+@breaks("wrong-dimension", "score, fitted on 3 sensors and given 7, raised")
 class Taciturn(Good):
     def score(self, x):
         if self.std_ is not None and x.observation_dim != len(self.std_):
@@ -261,10 +216,7 @@ class Taciturn(Good):
 # Scores
 
 
-@breaks(
-    "shape",
-    "score returned shape (80,) for 81 observations: expected (81,), one score per observation",
-)
+@breaks("shape", "score returned shape (80,) for 81 observations: expected")
 class OneShort(Good):
     def score(self, x):
         return super().score(x)[1:]
@@ -282,10 +234,7 @@ class PlainList(Good):
         return super().score(x).tolist()
 
 
-@breaks(
-    "finite",
-    "the score at t = 30 of 81 is nan: expected finite scores but for one leading block of NaN",
-)
+@breaks("finite", "the score at t = 30 of 81 is nan: expected finite scores")
 class LateNan(Good):
     def score(self, x):
         scores = super().score(x)
@@ -293,21 +242,14 @@ class LateNan(Good):
         return scores
 
 
-@breaks(
-    "finite",
-    "the score at t = 40 of 81 is inf: expected finite scores but for one leading block of NaN",
-)
+@breaks("finite", "the score at t = 40 of 81 is inf: expected finite scores")
 class Overflows(Good):
     def score(self, x):
         scores = super().score(x)
         return np.where(scores > 25, np.inf, scores)
 
 
-@breaks(
-    "warm-up",
-    "the first 3 scores are NaN, but with horizon 1 and warm_up 0 at most 1 may be: declare "
-    "warm_up = 3, or pad",
-)
+@breaks("warm-up", "the first 3 scores are NaN, but with horizon 1 and")
 class SecretWarmUp(Good):
     def score(self, x):
         scores = super().score(x)
@@ -315,9 +257,7 @@ class SecretWarmUp(Good):
         return scores
 
 
-@breaks(
-    "warm-up", "warm_up is 9, but only the first 1 scores are NaN: declare what is left undefined"
-)
+@breaks("warm-up", "warm_up is 9, but only the first 1 scores are NaN:")
 class BraggingWarmUp(Good):
     warm_up = 9
 
@@ -327,7 +267,7 @@ class LongWarmUp(Good):
     warm_up = 50
 
 
-@breaks("horizon", "with horizon 4 the first 8 scores are NaN: expected at most 4")
+@breaks("horizon", "with horizon 4 the first 8 scores are NaN: expected at")
 class TwiceTheHorizon(Good):
     def score(self, x):
         scores = super().score(x)
@@ -335,11 +275,7 @@ class TwiceTheHorizon(Good):
         return scores
 
 
-@breaks(
-    "gross-anomaly",
-    "an episode whose sensors go wild scores above its nominal twin in 0% of pairs, expected at "
-    "least 75%: scores seem to point the other way: negate them",
-)
+@breaks("gross-anomaly", "an episode whose sensors go wild scores above its nominal")
 class Reversed(Good):
     def score(self, x):
         return -super().score(x)
@@ -348,32 +284,20 @@ class Reversed(Good):
 # The same answer to the same question
 
 
-@breaks(
-    "same-seed",
-    "a second detector of seed 0, fitted on the same trajectories, has other scores: at t = <n> "
-    "it is <n> instead of <n>; draw all randomness from the seed",
-)
+@breaks("same-seed", "a second detector of seed 0, fitted on the same")
 class ReadsTheGlobalState(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ *= 1 + np.random.get_state()[1][0] % 1000 / 2000  # noqa: NPY002
 
 
-@breaks(
-    "deterministic",
-    "a detector of seed 1 has other scores than one of seed 0: at t = 1 it is <n> instead of <n>; "
-    "expected deterministic=False",
-)
+@breaks("deterministic", "a detector of seed 1 has other scores than one of seed 0:")
 class Draws(Good):
     def score(self, x):
         return super().score(x) + self.seed
 
 
-@breaks(
-    "refit",
-    "a detector that was fitted on something else before has other scores: at t = 1 it is <n> "
-    "instead of <n>; fit has to begin anew",
-)
+@breaks("refit", "a detector that was fitted on something else before has")
 class Remembers(Good):
     fits = 0
 
@@ -387,8 +311,7 @@ class Remembers(Good):
 
 @breaks(
     "order",
-    "scores of a trajectory change with what was scored before: at t = 1 it is <n> instead of <n>; "
-    "score must not keep anything",
+    "scores of a trajectory change with what was scored",
     also={"score-many", "causality", "prefix"},
 )
 class Shocked(Good):
@@ -402,10 +325,7 @@ class Shocked(Good):
         return scores
 
 
-@breaks(
-    "score-many",
-    "score_many of 5 trajectories differs from score: at t = 1 it is <n> instead of <n>",
-)
+@breaks("score-many", "score_many of 5 trajectories differs from score: at t = 1")
 class MindsTheCompany(Good):
     def score_many(self, trajectories):
         return [self.score(x) + len(trajectories) - 1 for x in trajectories]
@@ -434,11 +354,7 @@ class Rescales(Good):
             x.observations[:] = np.abs(x.observations)
 
 
-@breaks(
-    "read-only",
-    "fit raised ValueError: cannot set WRITEABLE flag to True of this array "
-    "(broken_detectors.py:<n>)",
-)
+@breaks("read-only", "fit raised ValueError: cannot set WRITEABLE flag to True")
 class Unlocks(Good):
     def fit(self, nominal):
         for x in nominal:
@@ -450,10 +366,7 @@ class Unlocks(Good):
 
 
 @breaks(
-    "causality",
-    "scores before t = 2 change when the episode goes on otherwise from there: at t = 1 it is <n> "
-    "instead of <n>; a score may use nothing after its time",
-    also={"prefix", "streaming"},
+    "causality", "scores before t = 2 change when the episode goes on", also={"prefix", "streaming"}
 )
 class LooksAhead(Good):
     def score(self, x):
@@ -461,11 +374,7 @@ class LooksAhead(Good):
         return np.append(scores[:1], np.append(scores[2:], scores[-1:]))[: len(x)]
 
 
-@breaks(
-    "prefix",
-    "the first 1 of 81 observations alone have other scores: at t = 0 it is 0 instead of nan",
-    also={"streaming"},
-)
+@breaks("prefix", "the first 1 of 81 observations alone have other scores:", also={"streaming"})
 class KnowsTheLength(Good):
     def score(self, x):
         return super().score(x) if len(x) > 1 else np.zeros(1)
@@ -476,67 +385,48 @@ class ExplainsNothing(Good):
     def explain(self, x): ...
 
 
-@breaks(
-    "explain",
-    "explain returned shares as float64 of shape (81,), expected float64 of shape (81, 3)",
-)
+@breaks("explain", "explain returned shares as float64 of shape (81,),")
 class SharesOfOne(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return shares[:, 0], onsets
 
 
-@breaks(
-    "explain", "explain returned onsets as float64 of shape (81,), expected int64 of shape (81,)"
-)
+@breaks("explain", "explain returned onsets as float64 of shape (81,),")
 class OnsetsInBetween(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return shares, onsets - 0.5
 
 
-@breaks("explain", "explain raised ZeroDivisionError: division by zero (broken_detectors.py:<n>)")
+@breaks("explain", "explain raised ZeroDivisionError: division by zero")
 class DoubtsItself(Good):
     def explain(self, x):
         return 1 / 0
 
 
-@breaks(
-    "explain",
-    "explain gives the shares <...> at t = 1: parts of 1, or NaN alone where it is undefined",
-)
+@breaks("explain", "explain gives the shares")
 class SharesInPercent(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return 100 * shares, onsets
 
 
-@breaks(
-    "explain",
-    "explain gives the onset <n> at t = 1: a row from 0 to t, or -1 where the shares are NaN",
-)
+@breaks("explain", "explain gives the onset")
 class OnsetsAhead(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return shares, np.where(onsets < 0, onsets, onsets + 2)
 
 
-@breaks(
-    "explain",
-    "explain gives the onset 0 at t = 0, where the score is nan: expected -1, and shares of NaN, "
-    "where it is NaN only",
-)
+@breaks("explain", "explain gives the onset 0 at t = 0, where the score is")
 class ExplainsTheUndefined(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return np.where(np.isnan(shares), 1 / shares.shape[1], shares), np.maximum(onsets, 0)
 
 
-@breaks(
-    "explain",
-    "the first 2 of 81 observations alone have other shares: explain may use nothing after a row's "
-    "time",
-)
+@breaks("explain", "the first 2 of 81 observations alone have other shares:")
 class SharesOfTheWhole(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
@@ -544,40 +434,27 @@ class SharesOfTheWhole(Good):
         return np.where(np.isnan(shares), np.nan, mean), onsets
 
 
-@breaks(
-    "explain",
-    "the first <n> of 81 observations alone have other onsets: explain may use nothing after a "
-    "row's time",
-)
+@breaks("explain", "of 81 observations alone have other onsets: explain may")
 class OnsetInTheMiddle(Good):
     def explain(self, x):
         shares, onsets = super().explain(x)
         return shares, np.minimum(onsets, len(x) // 2)
 
 
-@breaks(
-    "explain",
-    "explain_last gives other onset than explain, first at t = 1: expected the row of explain for "
-    "the latest update",
-)
+@breaks("explain", "explain_last gives other onsets than explain, first at t")
 class LateWithWhy(Good):
     def explain_last(self):
         shares, onset = super().explain_last()
         return shares, max(onset - 1, -1)
 
 
-@breaks(
-    "streaming",
-    "update differs from score of the whole episode: at t = 11 it is <n> instead of <n>",
-)
+@breaks("streaming", "update differs from score of the whole episode: at t = 11")
 class Hurried(Good):
     def update(self, observation, action=None):
         return super().update(observation, action) + (len(self.seen) > 11)
 
 
-@breaks(
-    "streaming", "update differs from score of the whole episode: at t = 1 it is <n> instead of <n>"
-)
+@breaks("streaming", "update differs from score of the whole episode: at t = 1")
 class CountsEpisodes(Good):
     episodes = -1
 
@@ -609,7 +486,7 @@ class HalfStreaming(Good):
 
 @breaks(
     "short-trajectories",
-    "score of an episode of 1 observation raised IndexError: <...> (broken_detectors.py:<n>)",
+    "score of an episode of 1 observation raised IndexError",
     also={"prefix", "streaming", "explain"},
 )
 class NeedsTwo(Good):
@@ -619,20 +496,14 @@ class NeedsTwo(Good):
         return scores
 
 
-@breaks(
-    "constant-trajectory",
-    "an episode in which nothing moves has the score nan at t = 1: expected finite ones",
-)
+@breaks("constant-trajectory", "an episode in which nothing moves has the score nan at t")
 class DividesByTheSpread(Good):
     def score(self, x):
         still = len(x) > 3 and not np.ptp(x.observations, axis=0).any()
         return super().score(x) * (np.nan if still else 1)
 
 
-@breaks(
-    "constant-sensor",
-    "an episode with a sensor that stands still has the score nan at t = 1: expected finite ones",
-)
+@breaks("constant-sensor", "an episode with a sensor that stands still has the score")
 class DividesByZero(Good):
     def fit(self, nominal):
         super().fit(nominal)
@@ -640,9 +511,7 @@ class DividesByZero(Good):
         self.std_ = rows.std(axis=0, dtype=np.float64)
 
 
-@breaks(
-    "unequal-lengths", "fit raised ValueError: all input arrays must have the same shape (<...>)"
-)
+@breaks("unequal-lengths", "fit raised ValueError: all input arrays must have the")
 class Stacks(Good):
     def fit(self, nominal):
         super().fit(nominal)
@@ -652,33 +521,28 @@ class Stacks(Good):
 # Files
 
 
-@breaks(
-    "save-and-load",
-    "a detector that loaded a saved fit differs: at t = <n> it is <n> instead of <n>",
-    also={"shared-fit"},
-)
+@breaks("save-and-load", "a detector that loaded a saved fit differs: at t =", also={"shared-fit"})
 class SavesHalf(Good):
     def save(self, directory):
         np.savez(directory / "state.npz", std=np.ones_like(self.std_))
 
 
-@breaks("save-and-load", "save wrote no file into the directory that it was given",
-        also={"shared-fit", "saved-files"})  # fmt: skip
+@breaks(
+    "save-and-load",
+    "save wrote no file into the directory that it was given",
+    also={"shared-fit", "saved-files"},
+)
 class SavesNothing(Good):
     def save(self, directory): ...
 
 
-@breaks("save-and-load", "load raised FileNotFoundError: <...>", also={"shared-fit"})
+@breaks("save-and-load", "load raised FileNotFoundError", also={"shared-fit"})
 class LoadsElsewhere(Good):
     def load(self, directory):
         (directory / "elsewhere").read_bytes()
 
 
-@breaks(
-    "shared-fit",
-    "a fit of horizon 1, loaded for horizon 3, differs from a fit of horizon 3: at t = 3 it is <n> "
-    "instead of <n>; expected horizon_decides_fit=True",
-)
+@breaks("shared-fit", "a fit of horizon 1, loaded for horizon 3, differs from a")
 class FitsItsHorizon(Good):
     def fit(self, nominal):
         super().fit(nominal)
@@ -695,27 +559,24 @@ class Pickles(Good):
         (directory / self.extra).write_bytes(self.content)
 
 
-WROTE = "save wrote {}: expected JSON, npz without objects, or safetensors"
-
-
-@breaks("saved-files", WROTE.format("model.pkl, a pickle by its name"))
+@breaks("saved-files", "save wrote model.pkl, a pickle by its name: expected")
 class PicklesOpenly(Pickles):
     extra, content = "model.pkl", b"anything"
 
 
-@breaks("saved-files", WROTE.format("model.bin, a pickle by its first bytes"))
+@breaks("saved-files", "save wrote model.bin, a pickle by its first bytes:")
 class PicklesSecretly(Pickles):
     extra, content = "model.bin", b"\x80\x04N."
 
 
-@breaks("saved-files", WROTE.format("extra.npz, which holds Python objects in a.npy"))
+@breaks("saved-files", "save wrote extra.npz, which holds Python objects")
 class SavesObjects(Good):
     def save(self, directory):
         super().save(directory)
         np.savez(directory / "extra.npz", a=np.array([{}], dtype=object))
 
 
-@breaks("saved-files", WROTE.format("model.pt, which holds the pickle model/data.pkl"))
+@breaks("saved-files", "save wrote model.pt, which holds the pickle")
 class SavesLikeTorch(Good):
     def save(self, directory):
         super().save(directory)
@@ -729,41 +590,28 @@ ENDS, STARTED = [], []
 """Events that end threads, and processes, for those who clean up."""
 
 
-@breaks(
-    "random-state",
-    "fit or score changed the state of the global generator of numpy.random: use "
-    "numpy.random.default_rng(seed), or a generator of one's own",
-)
+@breaks("random-state", "fit or score changed the state of the global generator of")
 class Seeds(Good):
     def fit(self, nominal):
         super().fit(nominal)
         np.random.seed(self.seed)  # noqa: NPY002
 
 
-@breaks(
-    "thread-settings",
-    "fit or score changed OMP_NUM_THREADS: 3 -> 1: the number of threads is the user's",
-)
+@breaks("thread-settings", "fit or score changed OMP_NUM_THREADS: 3 -> 1: the number")
 class SetsThreads(Good):
     def fit(self, nominal):
         super().fit(nominal)
         os.environ["OMP_NUM_THREADS"] = "1"
 
 
-@breaks(
-    "global-settings",
-    "fit or score changed recursion limit: <n> -> 4321: leave, or put back, what is global",
-)
+@breaks("global-settings", "fit or score changed recursion limit")
 class SetsTheLimit(Good):
     def score(self, x):
         sys.setrecursionlimit(4321)
         return super().score(x)
 
 
-@breaks(
-    "global-settings",
-    "fit or score changed working directory: <...>work -> /: leave, or put back, what is global",
-)
+@breaks("global-settings", "fit or score changed working directory")
 class Wanders(Good):
     def score(self, x):
         os.chdir("/")
@@ -788,41 +636,35 @@ class LeavesADaemonThread(Good):
         threading.Thread(target=ENDS[-1].wait, name="pump", daemon=True).start()
 
 
-@breaks("leftovers", "left running: process <n> (sleep): end what was started")
+@breaks("leftovers", "left running: process")
 class LeavesAProcess(Good):
     def fit(self, nominal):
         super().fit(nominal)
         STARTED.append(subprocess.Popen(["sleep", "60"]))
 
 
-@breaks("quiet", "fit or score printed 8 characters, first 'fitting': expected none")
+@breaks("quiet", "fit or score printed 8 characters, first 'fitting':")
 class Prints(Good):
     def fit(self, nominal):
         super().fit(nominal)
         print("fitting")  # noqa: T201
 
 
-@breaks("quiet", "fit or score printed 4 characters, first 'deep': expected none")
+@breaks("quiet", "fit or score printed 4 characters, first 'deep': expected")
 class PrintsBelow(Good):
     def fit(self, nominal):
         super().fit(nominal)
         os.write(2, b"deep")
 
 
-@breaks(
-    "warnings", "fit or score warned: UserWarning: it is late: mend or silence what is expected"
-)
+@breaks("warnings", "fit or score warned: UserWarning: it is late: mend or")
 class Warns(Good):
     def fit(self, nominal):
         super().fit(nominal)
         warnings.warn("it is late", stacklevel=1)
 
 
-@breaks(
-    "network",
-    "the factory, fit or score asked the network for 127.0.0.1:9: a detector comes with all that "
-    "it needs",
-)
+@breaks("network", "the factory, fit or score asked the network for")
 class PhonesHome(Good):
     def fit(self, nominal):
         super().fit(nominal)
@@ -830,11 +672,7 @@ class PhonesHome(Good):
             socket.create_connection(("127.0.0.1", 9), timeout=0.1).close()
 
 
-@breaks(
-    "network",
-    "the factory, fit or score asked the network for weights.example:443: a detector comes with "
-    "all that it needs",
-)
+@breaks("network", "the factory, fit or score asked the network for")
 class FetchesOnce(Good):
     fetched = False
 
@@ -846,17 +684,14 @@ class FetchesOnce(Good):
                 socket.getaddrinfo("weights.example", 443)
 
 
-ADVICE = "write below XDG_CACHE_HOME (default ~/.cache), or to temporary files that are removed"
-
-
-@breaks("files", f"the factory, fit or score wrote model.bin: {ADVICE}")
+@breaks("files", "the factory, fit or score wrote model.bin: write below")
 class WritesHere(Good):
     def fit(self, nominal):
         super().fit(nominal)
         Path("model.bin").write_bytes(b"x")
 
 
-@breaks("files", f"the factory, fit or score wrote model.bin: {ADVICE}")
+@breaks("files", "the factory, fit or score wrote model.bin: write below")
 class WritesHereOnce(Good):
     written = False
 
@@ -867,11 +702,7 @@ class WritesHereOnce(Good):
             Path("model.bin").write_bytes(b"x")
 
 
-@breaks(
-    "files",
-    "in an empty working directory it raised FileNotFoundError: <...>: relative paths depend on "
-    "where the user stands",
-)
+@breaks("files", "in an empty working directory it raised FileNotFoundError")
 class ReadsHere(Good):
     """Reads a file that lies where the tests stand."""
 
@@ -880,20 +711,14 @@ class ReadsHere(Good):
         Path("here.txt").read_text()
 
 
-@breaks(
-    "time-budget",
-    "fit and score took <n> s on 12 episodes of 81 observations: expected at most 0.2 s",
-)
+@breaks("time-budget", "fit and score took")
 class Slow(Good):
     def fit(self, nominal):
         super().fit(nominal)
         time.sleep(0.25)
 
 
-@breaks(
-    "memory-budget",
-    "fit and score took <n> MB on 12 episodes of 81 observations: expected at most 100 MB",
-)
+@breaks("memory-budget", "fit and score took")
 class Fat(Good):
     def fit(self, nominal):
         super().fit(nominal)

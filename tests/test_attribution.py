@@ -215,8 +215,8 @@ def changed(row, at, value):
         (changed(1, 3, 4), "names sensor 0 and onset 4 at t = 3"),
         (changed(1, 3, -1), "names sensor 0 and onset -1 at t = 3"),
         (changed(0, 0, 0), "with the score nan"),
-        (changed(0, slice(7, 10), 1), "another sensor or onset at 3 of the first 40"),
-        (changed(1, slice(7, 10), 5), "another sensor or onset at 3 of the first 40"),
+        (changed(0, slice(7, 10), 1), "not causal: 3 sensors or onsets"),
+        (changed(1, slice(7, 10), 5), "not causal: 3 sensors or onsets"),
     ],
 )
 def test_what_cannot_be_an_explanation_is_refused(found, message):

@@ -67,12 +67,13 @@ def test_what_differs_is_named_with_both_values():
         check_prefix(
             np.array([math.nan, 1.0, 2.01]), WHOLE, detector="mine", where="hopper/test/iid[7]"
         )
-    assert str(error.value) == (
-        "detector 'mine' gives the first 3 of 5 observations of hopper/test/iid[7] other scores "
-        "when they are all it gets: at t = 2 it is 2.01 instead of 2; expected the same, as a "
-        "score may use nothing after its time and nothing of other episodes (`oodd-eval check "
-        "mine -k prefix`)"
-    )
+    for text in (
+        "is not causal",
+        "hopper/test/iid[7]",
+        "2.01 instead of 2",
+        "check mine -k prefix",
+    ):
+        assert text in str(error.value)
 
 
 @pytest.mark.parametrize("constant", [0.0, 5e3, -1e7, 1e12, 1e15])
@@ -96,7 +97,7 @@ def test_rollouts_may_leave_more_rounding_and_no_more_than_that():
     for horizon, allowed in ((1, 5e-3), (2, 25e-3)):
         given = {"detector": "mine", "where": "hopper/test/iid[7]", "horizon": horizon}
         check_prefix(whole[:90] + 0.9 * allowed, whole, **given)
-        with pytest.raises(ContractError, match="other scores when they are all it gets"):
+        with pytest.raises(ContractError, match="is not causal"):
             check_prefix(whole[:90] + 1.1 * allowed, whole, **given)
 
 
@@ -125,13 +126,6 @@ def test_the_spread_is_the_distance_to_the_k_th_nearest_other_score(scores, n):
     nearest = np.sort(np.abs(whole - whole[:, None]), axis=1)
     expected = nearest[:, k] if k < len(whole) else np.zeros(1)
     assert np.array_equal(_spread(whole[:n], whole), expected[:n])
-
-
-def test_a_nan_that_the_whole_episode_does_not_have_differs():
-    with pytest.raises(ContractError, match="at t = 1 it is nan instead of 1"):
-        check_prefix(
-            np.array([math.nan, math.nan]), WHOLE, detector="mine", where="hopper/test/iid[7]"
-        )
 
 
 class Magnitude:
@@ -163,5 +157,5 @@ def test_a_detector_in_this_process_is_probed_too(tiny_split):
     records = evaluate(Magnitude, tiny_split, environments="hopper")
     assert {r.status for r in records} == {"ok"}
     for wrong in (Centred, InCompany):
-        with pytest.raises(ContractError, match="when they are all it gets: at t = 0 it is"):
+        with pytest.raises(ContractError, match=r"is not causal: .* at t = 0 it is"):
             evaluate(wrong, tiny_split, environments="hopper")

@@ -163,12 +163,6 @@ def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path, damage):
     assert done.records[0].ok
 
 
-def test_a_detector_that_cannot_save_itself_is_scored_all_the_same(tiny_split, log, tmp_path):
-    _, done = go(tiny_split, tmp_path / "out", ("cannot",))
-    assert all(r.ok for r in done.records)
-    assert [p.name for p in (tmp_path / "out" / "fitted").iterdir()] == []
-
-
 def test_a_detector_that_cannot_load_itself_is_fitted(tiny_split, log, tmp_path):
     go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",))
     _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("drift",))
@@ -181,12 +175,6 @@ def test_a_fit_of_the_same_run_that_cannot_be_loaded_is_made_again(tiny_split, l
                  fresh=True)  # fmt: skip
     assert log() == ["fit", "fit"]
     assert [r.status for r in done.records] == ["ok", "ok"]
-
-
-def test_the_key_tells_nothing_of_the_environment(tiny_split, log, tmp_path):
-    plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
-    key = plan.units[0].fit_key
-    assert not any(c not in "0123456789abcdef" for c in key)
 
 
 def test_a_store_keeps_whole_directories_only(tmp_path):

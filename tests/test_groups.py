@@ -2,17 +2,14 @@
 
 import hashlib
 import tempfile
-from unittest.mock import patch
 
 import h5py
 import numpy as np
 import pytest
-from adversaries import Tree
 from helpers_plugins import install
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.parts import lengths_of, parts_of
-from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.contract import probes
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation import Channel
@@ -29,7 +26,6 @@ import hashlib, os, signal, subprocess, sys, threading, time
 from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import psutil
-from adversaries import Tree
 from oodd_eval import DetectorSpec, hookimpl
 
 
@@ -136,7 +132,7 @@ class Acts(Plain):
 
 @hookimpl
 def oodd_detectors():
-    made = {"plain": Plain, "remembers": Remembers, "company": Tree, "threads": Threads,
+    made = {"plain": Plain, "remembers": Remembers, "threads": Threads,
             "threads-saved": ThreadsSaved, "dies": Dies, "grows": Grows, "acts": Acts,
             "pool": Pool, "helped": Helped, "helped-saved": HelpedSaved, "talks": Talks,
             "notes": Notes,
@@ -156,26 +152,10 @@ def first(detector, split, **settings):
     return records[0]
 
 
-def test_a_detector_that_knows_shared_beginnings_learns_nothing(plugin, tiny_split, monkeypatch):
-    monkeypatch.setattr(unit.secrets, "randbits", lambda _: 2)  # one of the orders that are drawn
-
-    class Shared(Tree):
-        def __deepcopy__(self, memo):
-            return self
-
-    settings = {"environments": "hopper", "anomalies": "iid,drift,shutdown,gravity"}
-    records = evaluate("company", tiny_split, **settings)
-    assert [record.value("auc_matched") for record in records] == [0.5] * 4
-    # With one memory for all groups, it knows who leaves the others.
-    with patch.object(unit.contract, "probes", lambda *_: []):
-        records = evaluate(Shared, tiny_split, **settings)
-    assert max(record.value("auc_matched") for record in records) > 0.6
-
-
 def test_state_that_outlives_an_episode_is_found(plugin, tiny_split):
     record = first("remembers", tiny_split)
     assert record.status == "invalid"
-    assert "when they are all it gets" in record.reason
+    assert "is not causal" in record.reason
 
 
 def test_a_fit_with_running_threads_is_loaded_anew_for_every_group(plugin, tiny_split, tmp_path):
@@ -232,8 +212,6 @@ def test_an_error_is_told_although_the_detector_closed_its_streams(plugin, tiny_
 @pytest.mark.parametrize(
     ("tampered", "status", "reason"),
     [
-        ({"pid": "me"}, "error", "wrote into the pipe"),
-        ({"pid": -5}, "error", "wrote into the pipe"),
         ({"seconds_score": "long"}, "error", "wrote into the pipe"),
         ({"type": "array", "shape": "missing"}, "invalid", "score arrays came back, expected"),
     ],
@@ -291,28 +269,6 @@ def test_actions_are_withheld_from_whoever_does_not_declare_them(plugin, tiny_sp
     assert shown == {"acts": 0.0, "acts-both": float(width)}
 
 
-def test_a_bare_factory_is_shown_actions_in_a_run_and_in_checks(tiny_split):
-    class Acts:
-        def __init__(self, *, seed, horizon):
-            pass
-
-        def fit(self, nominal):
-            widths.update(x.action_dim for x in nominal)
-
-        def score(self, x):
-            widths.add(x.action_dim)
-            return np.zeros(len(x))
-
-    for run_it in (
-        lambda: evaluate(Acts, tiny_split, environments="hopper", anomalies="iid"),
-        lambda: Trial(Acts).fitted(),
-    ):
-        widths = set()
-        run_it()
-        assert 0 not in widths
-        assert widths
-
-
 PARTS_SCORED = ("calibration", "test/nominal", "test/iid", "test/drift")
 
 
@@ -359,28 +315,3 @@ def test_parts_of_several_runs_keep_their_orders(plugin, tiny_split, tmp_path):
     assert orders.pop("test/iid") == 7.0
     assert len(set(orders.values())) == 1
     assert 7.0 not in orders.values()
-
-
-def test_an_object_in_this_process_is_copied_for_every_group(tiny_split):
-    class Company:
-        def __init__(self, *, seed, horizon):
-            self.beginnings = []
-
-        def fit(self, nominal):
-            pass
-
-        def score(self, trajectory):
-            self.beginnings.append(trajectory.observations[0].tobytes())
-            return np.arange(len(trajectory)) - 1000.0 * len(set(self.beginnings))
-
-    class Shared(Company):
-        def __deepcopy__(self, memo):
-            return self
-
-    def value(detector):
-        scored = evaluate(detector, tiny_split, environments="hopper", anomalies="iid")
-        return scored[0].value("auc_matched")
-
-    with patch.object(unit.contract, "probes", lambda *_: []):
-        assert value(Company) == 0.5
-        assert value(Shared) != 0.5

@@ -63,14 +63,14 @@ QUICK = {
                 "invalid", r"returned nan at t = \d+ of cartpole/"),
     "ahead": ("""
         def score(self, x): return np.convolve(super().score(x), np.ones(9) / 9, mode="same")""",
-              "invalid", r"other scores when they are all it gets: at t = \d+ it is"),
+              "invalid", r"is not causal: .* at t = \d+ it is"),
     "length": ("def score(self, x): return super().score(x) - 0.1 * len(x)",
-               "invalid", r"gives the first \d+ of \d+ observations of cartpole/\S+ other"),
+               "invalid", r"when only its first \d+ of \d+ observations are given"),
     "keeper": ("""
         seen = 0
         def score(self, x):
             self.seen += len(x); return super().score(x) / self.seen""",
-               "invalid", r"other scores when they are all it gets: at t = 0 it is"),
+               "invalid", r"is not causal: .* at t = 0 it is"),
     "objects": ("def score(self, x): return super().score(x).astype(object)",
                 "invalid", "score returned ndarray of object"),
     "lazy": ("""

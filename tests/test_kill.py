@@ -141,16 +141,6 @@ def test_finished_units_are_not_fitted_again_after_a_kill(tiny_split, plugin, tm
     assert len(fits_in(log)) == 6 + len(begun) - finished
 
 
-def test_a_fitting_worker_and_its_children_end_with_a_killed_harness(tiny_split, plugin, tmp_path):
-    process = start(tiny_split, plugin, tmp_path / "fits", tmp_path / "out", pause=600)
-    marker = f"RUN={tmp_path / 'out'}"
-    assert wait_until((tmp_path / "fits").exists)
-    assert workers_of(marker)
-    process.kill()
-    process.communicate()
-    assert wait_until(lambda: not workers_of(marker), seconds=20)
-
-
 def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, plugin, tmp_path):
     log, output = tmp_path / "fits", tmp_path / "out"
     process = start(tiny_split, plugin, log, output, seeds="0,1", jobs=1, ENDLESS="1")

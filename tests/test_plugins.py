@@ -1,8 +1,6 @@
 """Discovery: what is broken harms nobody else, and is named; plug-ins are loaded when named."""
 
 import re
-import subprocess
-import sys
 from dataclasses import dataclass
 
 import pytest
@@ -160,19 +158,10 @@ def test_the_environment_variable_restricts(monkeypatch, tmp_path):
     assert set(discover().offers) == {"extra", *BUILT_IN}
 
 
-def test_a_disabled_plugin_is_left_out():
-    assert "clock" not in discover(["trivial"]).offers
-
-
 @pytest.mark.parametrize("arguments", [{"disabled": ["nosuch"]}, {"only": ["nosuch"]}])
 def test_restricting_to_what_is_not_installed_is_an_error(arguments):
     with pytest.raises(UnknownNameError, match="unknown plug-in 'nosuch'"):
         discover(**arguments)
-
-
-def test_unknown_detector_suggests_the_nearest():
-    with pytest.raises(UnknownNameError, match="did you mean 'persistence'"):
-        discover().offer("persistance")
 
 
 def spec_requiring(*modules, extra=""):
@@ -180,22 +169,13 @@ def spec_requiring(*modules, extra=""):
     return Offer(spec, "x", "oodd_x", "oodd-x", "1.0")
 
 
-def test_what_can_be_imported_is_available():
-    assert spec_requiring("numpy", "os.path").unavailable() == ""
-
-
 def test_what_is_missing_is_named_with_the_command_that_helps():
+    assert spec_requiring("numpy", "os.path").unavailable() == ""
+    assert "pip install no_such.part" in spec_requiring("no_such.part").unavailable()
     offer = spec_requiring("numpy", "no_such", extra="oodd-eval[reference]")
     assert offer.unavailable() == 'needs no_such: pip install "oodd-eval[reference]"'
     with pytest.raises(MissingExtraError, match="detector 'x' needs no_such"):
         offer.require()
-
-
-def test_a_missing_parent_package_is_missing_too():
-    assert (
-        "needs no_such.part: pip install no_such.part"
-        in spec_requiring("no_such.part").unavailable()
-    )
 
 
 @dataclass(frozen=True)
@@ -210,11 +190,6 @@ def test_parameters_are_defaults_and_overrides():
     assert list(found.items()) == [("kind", "a"), ("members", 2), ("rate", None)]
     assert resolve_parameters("x", None, {"any": 1}, others=True) == {"any": 1}
     assert parameters_of(None) == {}
-
-
-def test_an_unknown_parameter_suggests_the_nearest():
-    with pytest.raises(UnknownNameError, match="parameter of x 'member': did you mean 'members'"):
-        resolve_parameters("x", Known, {"member": 1})
 
 
 @pytest.mark.parametrize(
@@ -238,19 +213,3 @@ def test_parameters_known_at_run_time_are_declared_by_their_defaults():
     declared = parameters_of(declared_by(values))
     assert {name: p.default for name, p in declared.items()} == values
     assert resolve_parameters("x", declared_by(values), values) == values
-
-
-@pytest.mark.parametrize(
-    "command", ["--help", "--version", "", "rn", "list detectors", "list envs"]
-)
-def test_quick_commands_import_nothing_heavy(command):
-    heavy = {"numpy", "h5py", "rich", "pydantic", "torch", "sklearn", "gymnasium", "pybullet"}
-    if not command.startswith("list"):
-        heavy |= {"pluggy", "oodd_eval.cli.listing", "oodd_eval.cli.run"}
-    code = (
-        "import sys\nfrom oodd_eval.cli.main import main\n"
-        f"main({command.split()!r})\n"
-        f"print({heavy!r} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.splitlines()[-1] == "set()"

@@ -123,7 +123,7 @@ def test_an_improvement_fails_only_when_both_sides_count(cells, pytester, refere
     better = altered(reference, pytester.path / "better.jsonl", far=1.0)
     for two_sided in (False, True):
         own = cells(oodd_reference=str(better), oodd_env="hopper", oodd_two_sided=two_sided)
-        own.run(set(own.cells))
+        own.run(set(own.names))
         failing = {
             d.tolerance.metric for found in own._differences.values() for d in found if d.fails
         }
@@ -143,8 +143,8 @@ def oodd_detectors():
 def test_a_detector_that_fails_is_reported_with_its_state(cells, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "fails", FAILING)
     own = cells(oodd_detector="fails", oodd_env="hopper")
-    own.run(set(own.cells))
-    for cell in own.cells:
+    own.run(set(own.names))
+    for cell in own.names:
         with pytest.raises(
             Regression, match=r"^error: RuntimeError: no mood \(oodd_fails.py:\d+\)"
         ):
@@ -166,8 +166,8 @@ def test_a_new_cell_is_skipped(cells, reference, tmp_path):
     less = [r for r in read_record_set(reference).records if str(r.cell) != cell]
     write_reference(less, tmp_path / "less.jsonl")
     own = cells(oodd_reference=str(tmp_path / "less.jsonl"), oodd_env="hopper")
-    own.run(set(own.cells))
-    first, *others = own.cells
+    own.run(set(own.names))
+    first, *others = own.names
     with pytest.raises(pytest.skip.Exception, match=r"not in .*less.jsonl: nothing"):
         own.check(first, None)
     for cell in others:
@@ -177,7 +177,7 @@ def test_a_new_cell_is_skipped(cells, reference, tmp_path):
 def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, reference, tmp_path):
     own = [r for r in read_record_set(reference).records if r.environment == "hopper"]
     write_reference([replace(r, horizon=10, seed=3) for r in own], tmp_path / "r.jsonl")
-    found = cells(oodd_reference=str(tmp_path / "r.jsonl")).cells
+    found = cells(oodd_reference=str(tmp_path / "r.jsonl")).names
     assert len(found) == 8
     assert found[0] == "tiny/hopper/iid::persistence[h=10,seed=3]"
 

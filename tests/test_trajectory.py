@@ -35,10 +35,8 @@ def test_without_actions_their_width_is_zero():
 def test_a_trajectory_without_actions_passes_pipe_and_file():
     reading, writing = os.pipe()
     alone = Trajectory(np.arange(6.0).reshape(3, 2))
-    Channel(-1, writing).send_trajectory(alone)
-    received = Channel(reading, -1).receive_trajectory()
-    os.close(reading)
-    os.close(writing)
+    Channel(writing).send_trajectory(alone)
+    received = Channel(reading).receive_trajectory()
     kept = TrajectoryFile([alone, episode(4), alone])
     found = [received, *kept]
     kept.close()

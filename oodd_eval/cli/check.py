@@ -9,8 +9,7 @@ from oodd_eval.cli.terminal import discovered, know_own, make_console
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import Predicate, assignment, check_known, expression
-from oodd_eval.plugins.conformance import CHECKS, Report, Result, expected
-from oodd_eval.plugins.conformance.supervise import supervise
+from oodd_eval.plugins.conformance import Report, Result
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
 
@@ -43,6 +42,8 @@ def define(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Carry out ``oodd-eval check``: 1 when a check failed, 5 when none ran, else 0."""
+    from oodd_eval.testing import CHECKS, supervise
+
     limits = Limits(options.timeout, options.memory)
     expecting, parameters = dict(options.expect), dict(options.param)
     wanted = expression(options.expression) if options.expression else lambda _: True
@@ -64,12 +65,12 @@ def run(options: argparse.Namespace) -> int:
     for horizon in options.horizon:
         arguments = {"horizon": horizon, "seed": options.seed, "parameters": parameters}
         if options.verbosity >= 0:
-            told = {"horizon": horizon, "seed": options.seed, **parameters}.items()
-            settings = ", ".join(f"{name} {value}" for name, value in told)
+            values = {"horizon": horizon, "seed": options.seed, **parameters}.items()
+            settings = ", ".join(f"{name} {value}" for name, value in values)
             console.print(f"{spec.name} of {offer.origin}, {settings}")
         results = []
-        for found in supervise(offer, arguments, names, limits):
-            result = expected(found, expecting)
+        for outcome in supervise(offer, arguments, names, limits):
+            result = outcome.expected(expecting)
             results.append(result)
             if options.verbosity >= 0 or not result.ok:
                 console.print(result.line(max(map(len, names))), style=_STYLES[result.status])

@@ -1,6 +1,107 @@
-"""The reading of a watchdog: score, alarm and what is at fault in one row."""
+"""Values that a watchdog gives: a reading after every row, and the promise of its threshold.
 
+The promise is for operation without end, where nominal operation alarms some day. Its statistic
+exceeds a high threshold in bursts, rarer than episodes are long; what is promised is the mean time
+between them.
+"""
+
+import math
 from dataclasses import astuple, dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+FEWEST: Final = 20
+"""Nominal episodes that a tail can be estimated from."""
+TAIL: Final = 0.25
+"""Share of the episodes, those with the largest statistics, that the tail is estimated from."""
+_NORMAL: Final = 1.96  # a 95 % interval of a normal distribution
+
+
+@dataclass(frozen=True, slots=True)
+class RunLength:
+    """A promised mean time between false alarms.
+
+    Attributes
+    ----------
+    hours
+        The promise.
+    low, high
+        95 % interval of what a threshold from so few episodes may really give, in hours.
+    observed
+        Nominal operation that it was estimated from, in hours. A promise beyond it rests on the
+        shape of the tail.
+    """
+
+    hours: float
+    low: float
+    high: float
+    observed: float
+
+    @classmethod
+    def fit(
+        cls, largest: Floats, rows: int, hours: float, rate: float
+    ) -> "tuple[float, RunLength]":
+        """Return the threshold that nominal operation exceeds once in so many hours, with that.
+
+        The k largest statistics of n episodes exceed the largest of the others by amounts that
+        are taken for exponential, as those of accumulated sums are far out. With their mean b the
+        threshold u + b x is exceeded by a share k / n e^-x of the episodes.
+
+        Parameters
+        ----------
+        largest : float64 array of shape (n,)
+            The largest statistic of each nominal episode; at least 20.
+        rows
+            Observations in all of these episodes together.
+        hours, rate
+            Mean time between false alarms, and observations in a second.
+
+        Returns
+        -------
+        threshold : float
+            Of the statistic.
+        promise : RunLength
+            The mean time between false alarms with its interval.
+
+        Raises
+        ------
+        UsageError
+            For fewer than 20 episodes, or a time that they are too long for.
+
+        Examples
+        --------
+        >>> largest = np.random.default_rng(0).exponential(size=400)
+        >>> threshold, promise = RunLength.fit(largest, 400 * 500, hours=10, rate=50)
+        >>> round(threshold, 1), round(promise.low, 1), round(promise.high, 1)
+        (8.3, 2.6, 38.3)
+        """
+        n, observed = len(largest), rows / rate / 3600
+        if n < FEWEST:
+            raise UsageError(
+                f"a mean time between false alarms needs {FEWEST} nominal episodes for the "
+                f"threshold, got {n}: record more, or cut long ones"
+            )
+        k = max(FEWEST // 2, round(TAIL * n))
+        ordered = np.sort(largest)
+        above, start = ordered[n - k :], float(ordered[n - k - 1])
+        # Episodes among n that are to alarm, as many as promises fit into what was observed.
+        expected = observed / hours
+        x = math.log(k / expected)
+        if x <= 0:
+            raise UsageError(
+                f"{hours:g} h between false alarms is less than {observed / k:.3g} h, which is "
+                f"what {n} episodes of {observed:.3g} h in all are cut for: promise more"
+            )
+        # Relative errors of the share k / n, and of the mean of k exponential amounts.
+        error = math.exp(_NORMAL * math.sqrt((1 - k / n + x**2) / k))
+        promise = cls(hours, hours / error, hours * error, observed)
+        return start + x * float((above - start).mean()), promise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +149,10 @@ class Reading:
 
     def __str__(self) -> str:
         """Return one line: the state, and in an alarm what is at fault and since when."""
-        told = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
-        told += [f"{name} {fault}" for name, fault in self.faults.items()]
+        parts = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
+        parts += [f"{name} {fault}" for name, fault in self.faults.items()]
         if self.sensor and self.sensor not in self.faults:
-            told.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
+            parts.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
         if self.onset is not None:
-            told.append(f"since row {self.onset}")
-        return ", ".join(told)
+            parts.append(f"since row {self.onset}")
+        return ", ".join(parts)

@@ -92,8 +92,7 @@ class StreamLimits:
 
     def arrays(self) -> Arrays:
         """Return what `of` reads, which is finite."""
-        found = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        return {name: np.nan_to_num(a) for name, a in found.items()}
+        return {f.name: np.nan_to_num(np.asarray(getattr(self, f.name))) for f in fields(self)}
 
     @classmethod
     def of(cls, arrays: Arrays) -> "StreamLimits":
@@ -205,10 +204,10 @@ class Stream:
     def _command(self, action: ArrayLike | None) -> NDArray[np.float32] | None:
         if not self._t or not len(self._action):
             return None
-        found = self._read("action", action, len(self._action))
-        usable = bool(np.isfinite(found).all())
+        command = self._read("action", action, len(self._action))
+        usable = bool(np.isfinite(command).all())
         self._count(ACTION, "missing", happened=not usable)
-        self._action = found if usable else self._action
+        self._action = command if usable else self._action
         return self._action
 
     def _compare_stamps(self, time: float, acted: float | None, rate: float) -> None:
@@ -233,13 +232,13 @@ class Stream:
         if values is None:
             return np.full(width, np.nan, np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            found = np.asarray(values, dtype=np.float64).astype(np.float32)
-        if found.shape != (width,):
+            row = np.asarray(values, dtype=np.float64).astype(np.float32)
+        if row.shape != (width,):
             raise TrajectoryError(
-                f"the watchdog was given an {what} of shape {found.shape}, expected ({width},) as "
+                f"the watchdog got an {what} of shape {row.shape}, expected ({width},) as "
                 "in its nominal trajectories: hand over NaN for what is missing, None for all"
             )
-        return found
+        return row
 
     def _judge(self) -> None:
         """Compare the counts with their limits."""
@@ -267,9 +266,8 @@ class Stream:
 
 def _repeats(equal: NDArray[np.bool_], moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the rows, (T,), in which all of several moving sensors equal the row before."""
-    several = moving.sum() > 1
-    found: NDArray[np.bool_] = equal[:, moving].all(axis=1) & several
-    return found
+    repeats: NDArray[np.bool_] = equal[:, moving].all(axis=1) & (moving.sum() > 1)
+    return repeats
 
 
 def _counted(count: float, happened: bool) -> float:

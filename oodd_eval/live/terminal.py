@@ -80,8 +80,8 @@ class TerminalMonitor:
         for name, share in list(reading.sensors.items())[:SENSORS]:
             bar = "█" * round(WIDTH * share)
             table.add_row(name, f"{share:4.0%}", bar, reading.faults.get(name, ""))
-        shown = Group(Text(str(reading), style=style), Text(past), Text(statistic), table)
-        return Panel(shown, title=self.title, border_style=style)
+        picture = Group(Text(str(reading), style=style), Text(past), Text(statistic), table)
+        return Panel(picture, title=self.title, border_style=style)
 
 
 def _bar(share: float) -> str:

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import FittedStateError, UsageError
-from oodd_eval.live.endless import RunLength
-from oodd_eval.live.made import Made, streaming
-from oodd_eval.live.reading import Reading
+from oodd_eval.live.handle import DetectorHandle, streaming
+from oodd_eval.live.reading import Reading, RunLength
 from oodd_eval.live.stream import ACTION, OBSERVATION, Stream, StreamLimits
 from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, least_episodes
 from oodd_eval.metrics.cusum import Standardization
@@ -58,16 +57,16 @@ class Watchdog:
 
     def __init__(
         self,
-        made: Made,
+        handle: DetectorHandle,
         rule: GuaranteedAlarm,
         limits: StreamLimits,
         sensors: Sequence[str],
         settings: Settings,
         run_length: RunLength | None,
     ) -> None:
-        self._made, self.rule, self._limits, self.sensors = made, rule, limits, list(sensors)
+        self._handle, self.rule, self._limits, self.sensors = handle, rule, limits, list(sensors)
         self.settings, self.run_length = settings, run_length
-        self._live = streaming(made.detector)
+        self._live = streaming(handle.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
         self._monitor, self._stream = Monitor(rule), Stream(limits, settings.rate)
         self.reset()
@@ -131,7 +130,7 @@ class Watchdog:
         UsageError
             When the calibration episodes are too few for the promise, or an argument is wrong.
         """
-        made = Made.make(detector, statistic, seed, horizon, parameters or {})
+        handle = DetectorHandle.make(detector, statistic, seed, horizon, parameters or {})
         training, others = list(train), list(calibration)
         if rate is not None and not rate > 0:
             raise UsageError(f"rate={rate!r}, expected observations in a second, above 0")
@@ -148,7 +147,7 @@ class Watchdog:
         if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
             expected = "shares between 0 and 1"
             raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
-        least = least_episodes(alpha, made.alarm, confidence) if hours is None else 1
+        least = least_episodes(alpha, handle.alarm, confidence) if hours is None else 1
         if len(others) < least:
             raise UsageError(
                 f"alpha={alpha!r} takes {least} calibration episodes, got {len(others)}: record "
@@ -158,23 +157,23 @@ class Watchdog:
         width = training[0].observation_dim if training else 0
         if sensors is not None and (len(names) != width or len({*names}) != width):
             raise UsageError(f"{len(names)} names of sensors {names}, expected {width}, all unlike")
-        made.detector.fit([made.shown(x) for x in training])
+        handle.detector.fit([handle.visible(x) for x in training])
         # Without a guarantee to keep exact, the limits may know what the threshold is from.
         limits = StreamLimits.fit(training if hours is None else training + others)
-        scores = [np.asarray(made.detector.score(made.shown(x)), np.float64) for x in others]
+        score = handle.detector.score
+        scores = [np.asarray(score(handle.visible(x)), np.float64) for x in others]
         run_length = None
         if hours is None:
             faulty = [limits.faulty(x) for x in others]
             # An episode with a fault alarms at any threshold. Those that standardize stay.
             scores = [
-                np.array([np.inf]) if f and (made.alarm == "score" or i % 2) else s
+                np.array([np.inf]) if f and (handle.alarm == "score" or i % 2) else s
                 for i, (f, s) in enumerate(zip(faulty, scores, strict=True))
             ]
-            rule = GuaranteedAlarm.fit(scores, alpha, made.alarm, confidence)
+            rule = GuaranteedAlarm.fit(scores, alpha, handle.alarm, confidence)
         else:
-            unbounded = GuaranteedAlarm(
-                Standardization.fit(scores) if made.alarm == "cusum" else None, math.inf
-            )
+            cusum = Standardization.fit(scores) if handle.alarm == "cusum" else None
+            unbounded = GuaranteedAlarm(cusum, math.inf)
             # One after the other: what a sum has reached at the end of one goes on in the next.
             joined = unbounded.statistic(np.concatenate(scores))
             ends = np.cumsum([len(s) for s in scores])
@@ -183,7 +182,7 @@ class Watchdog:
             rule = replace(unbounded, threshold=threshold)
         names = names or [f"sensor {d}" for d in range(width)]
         settings = Settings(alpha, confidence, rate, latch, hold_off)
-        return cls(made, rule, limits, names, settings, run_length)
+        return cls(handle, rule, limits, names, settings, run_length)
 
     @property
     def promise(self) -> str:
@@ -261,12 +260,12 @@ class Watchdog:
         if isinstance(observation, Mapping):
             observation = [observation.get(name, math.nan) for name in self.sensors]
         row, command = self._stream.take(observation, action, time, acted)
-        score = float(self._live.update(row, command if self._made.actions else None))
+        score = float(self._live.update(row, command if self._handle.actions else None))
         above = self._monitor.update(score)
         faults = {
             str(d): fault
             for d, fault in self._stream.faults.items()
-            if d != ACTION or self._made.actions
+            if d != ACTION or self._handle.actions
         }
         self._causes = frozenset(faults) | ({"statistic"} if above else set())
         self._known &= self._causes
@@ -308,7 +307,13 @@ class Watchdog:
         return number if isinstance(number, str) else self.sensors[number]
 
     def copy(self) -> Self:
-        """Return another watchdog with the same fit, for another robot, at the beginning."""
+        """Return a watchdog with the same fit, for another robot.
+
+        Returns
+        -------
+        Watchdog
+            At the beginning of an episode.
+        """
         other = copy.deepcopy(self)
         other.reset()
         return other
@@ -318,33 +323,33 @@ class Watchdog:
 
         Parameters
         ----------
-        directory
-            Where to; the detector's own files go into a directory ``detector`` in it.
+        directory : str or Path
+            The detector's own files go into a directory ``detector`` in it.
 
         Raises
         ------
         UsageError
             When the detector cannot be saved, or the directory is not empty.
         """
-        place = Path(directory)
-        if not isinstance(self._made.detector, StorableDetector):
-            what = f"{type(self._made.detector).__name__} has no save and load"
+        path = Path(directory)
+        if not isinstance(self._handle.detector, StorableDetector):
+            what = f"{type(self._handle.detector).__name__} has no save and load"
             raise UsageError(f"{what}: fit the watchdog anew where it is needed")
-        if place.exists() and any(place.iterdir()):
-            raise UsageError(f"{str(place)!r} is not empty: save into a new directory")
-        (place / DETECTOR).mkdir(parents=True)
-        self._made.detector.save(place / DETECTOR)
-        save_state(place, kind=KIND, settings={}, arrays=self._limits.arrays())
+        if path.exists() and any(path.iterdir()):
+            raise UsageError(f"{str(path)!r} is not empty: save into a new directory")
+        (path / DETECTOR).mkdir(parents=True)
+        self._handle.detector.save(path / DETECTOR)
+        save_state(path, kind=KIND, settings={}, arrays=self._limits.arrays())
         nominal = self.rule.standardization
-        told = {
-            "made": self._made.told(),
+        state = {
+            "made": self._handle.state(),
             "sensors": self.sensors,
             "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
             "standardization": nominal and [nominal.mean, nominal.std],
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
         }
-        (place / FILE).write_text(json.dumps(told, indent=1), encoding="utf-8")
+        (path / FILE).write_text(json.dumps(state, indent=1), encoding="utf-8")
 
     @classmethod
     def load(cls, directory: str | Path, detector: Detector | None = None) -> Self:
@@ -352,9 +357,9 @@ class Watchdog:
 
         Parameters
         ----------
-        directory
-            Where it was saved.
-        detector
+        directory : str or Path
+            The directory that `save` was called with.
+        detector : Detector, optional
             An instance with the parameters of the saved one, where that had no name.
 
         Returns
@@ -366,26 +371,26 @@ class Watchdog:
         FittedStateError
             When the files are missing or damaged.
         """
-        place = Path(directory)
-        limits = StreamLimits.of(load_state(place, kind=KIND, settings={}))
+        path = Path(directory)
+        limits = StreamLimits.of(load_state(path, kind=KIND, settings={}))
         try:
-            told = json.loads((place / FILE).read_text(encoding="utf-8"))
-            made = Made.of(told["made"], detector)
-            nominal, threshold = told["standardization"], told["threshold"]
+            state = json.loads((path / FILE).read_text(encoding="utf-8"))
+            handle = DetectorHandle.from_state(state["made"], detector)
+            nominal, threshold = state["standardization"], state["threshold"]
             rule = GuaranteedAlarm(
                 None if nominal is None else Standardization(*map(float, nominal)),
                 math.inf if threshold is None else float(threshold),
             )
-            length = told["run_length"]
+            length = state["run_length"]
             run_length = None if length is None else RunLength(*map(float, length))
-            names = [str(name) for name in told["sensors"]]
-            settings = Settings(**told["settings"])
+            names = [str(name) for name in state["sensors"]]
+            settings = Settings(**state["settings"])
         except UsageError:
             raise
         except (OSError, ValueError, KeyError, TypeError) as error:
-            what = f"{str(place / FILE)!r} cannot be read as a saved watchdog"
+            what = f"{str(path / FILE)!r} cannot be read as a saved watchdog"
             raise FittedStateError(f"{what}: {type(error).__name__}: {error}") from None
-        if not isinstance(made.detector, StorableDetector) or len(names) != len(limits.mean):
-            raise FittedStateError(f"{str(place)!r} does not fit {type(made.detector).__name__}")
-        made.detector.load(place / DETECTOR)
-        return cls(made, rule, limits, names, settings, run_length)
+        if not isinstance(handle.detector, StorableDetector) or len(names) != len(limits.mean):
+            raise FittedStateError(f"{str(path)!r} does not fit {type(handle.detector).__name__}")
+        handle.detector.load(path / DETECTOR)
+        return cls(handle, rule, limits, names, settings, run_length)

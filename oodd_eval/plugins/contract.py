@@ -65,12 +65,17 @@ class Detector(Protocol):
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:
-        """Learn from nominal trajectories, forgetting any earlier fit. The result is ignored.
+        """Learn from nominal trajectories, forgetting any earlier fit.
 
         Parameters
         ----------
-        nominal
+        nominal : sequence of Trajectory
             Training trajectories, all with the same numbers of sensors and actions.
+
+        Returns
+        -------
+        object
+            Ignored.
         """
 
     def score(self, trajectory: Trajectory) -> Scores:
@@ -78,13 +83,20 @@ class Detector(Protocol):
 
         Parameters
         ----------
-        trajectory
+        trajectory : Trajectory
             One episode with T transitions.
 
         Returns
         -------
         float64 array of shape (T + 1,)
             NaN in the leading undefined rows only.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        TrajectoryError
+            For another number of sensors than in training.
         """
 
 
@@ -114,6 +126,11 @@ class StreamingDetector(Detector, Protocol):
         -------
         float
             NaN where the score is undefined.
+
+        Raises
+        ------
+        TrajectoryError
+            For another number of readings than in training, or a reading that is not finite.
         """
 
 
@@ -126,7 +143,7 @@ class StorableDetector(Detector, Protocol):
 
         Parameters
         ----------
-        directory
+        directory : Path
             An empty directory.
         """
 
@@ -135,7 +152,7 @@ class StorableDetector(Detector, Protocol):
 
         Parameters
         ----------
-        directory
+        directory : Path
             Written by a detector with the same parameters, except those that do not decide the fit
             (`oodd_eval.plugins.parameters.parameter`).
 
@@ -246,12 +263,24 @@ def check_scores(
 
     Parameters
     ----------
-    scores, trajectory
-        What the detector returned, and was given (or its number of observations).
-    horizon, warm_up
+    scores : object
+        The value that the detector returned.
+    trajectory : Trajectory or int
+        The scored episode, or its number of observations.
+    horizon, warm_up : int
         Rows: NaN may stand in the leading ``max(horizon, warm_up)`` only.
-    detector, where
-        Names for the `ContractError` that is raised, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
+    detector, where : str
+        Names for messages, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
+
+    Returns
+    -------
+    float64 array of shape (T + 1,)
+        The scores.
+
+    Raises
+    ------
+    ContractError
+        When they do not honour the contract, or `warm_up` is no int from 0 to `MAX_WARM_UP`.
     """
     import numpy as np  # noqa: PLC0415  see above
 
@@ -311,39 +340,39 @@ def probes(lengths: Mapping[str, Sequence[int]], seed: int) -> list[Probe]:
 
 
 def check_prefix(
-    found: Scores, whole: Scores, *, detector: str, where: str, horizon: int = 1
+    scores: Scores, whole: Scores, *, detector: str, where: str, horizon: int = 1
 ) -> None:
     """Raise `ContractError` when the scores of a prefix differ from those of the whole episode."""
-    if wrong := difference(found, whole, TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE):
+    if problem := difference(scores, whole, TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE):
         raise ContractError(
-            f"detector {detector!r} gives the first {len(found)} of {len(whole)} observations of "
-            f"{where} other scores when they are all it gets: {wrong}; expected the same, as a "
-            f"score may use nothing after its time and nothing of other episodes (`oodd-eval check "
-            f"{detector} -k prefix`)"
+            f"detector {detector!r} is not causal: scores of {where} change when only its first "
+            f"{len(scores)} of {len(whole)} observations are given: {problem}; a score may use "
+            "nothing after its time and nothing of other episodes "
+            f"(`oodd-eval check {detector} -k prefix`)"
         )
 
 
-def difference(found: Scores, whole: Scores, tolerance: float = 0.0) -> str:
+def difference(scores: Scores, whole: Scores, tolerance: float = 0.0) -> str:
     """Return where scores of first rows differ from the `whole` episode's; empty if nowhere.
 
     The tolerance is relative to how far scores vary around the score: to its distance from the
     k-th nearest other score of the episode, k being a tenth of all. So neither a constant that is
     added to scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
-    scores are equal, they have to be equal in `found`, too.
+    scores are equal, they have to be equal here, too.
     """
     import numpy as np  # noqa: PLC0415  see above
 
-    expected = whole[: len(found)]
+    expected = whole[: len(scores)]
     # Scores near the largest float overflow here; another check finds that they are too large.
     with np.errstate(invalid="ignore", over="ignore"):
-        same = (found == expected) | (np.isnan(found) & np.isnan(expected))
+        same = (scores == expected) | (np.isnan(scores) & np.isnan(expected))
         if tolerance and not same.all():
-            same |= np.abs(found - expected) <= tolerance * _spread(expected, whole)
+            same |= np.abs(scores - expected) <= tolerance * _spread(expected, whole)
     if same.all():
         return ""
     t = int(np.flatnonzero(~same)[0])
-    digits = 10 if f"{found[t]:.10g}" != f"{expected[t]:.10g}" else 17
-    return f"at t = {t} it is {found[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
+    digits = 10 if f"{scores[t]:.10g}" != f"{expected[t]:.10g}" else 17
+    return f"at t = {t} it is {scores[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
 
 
 def _spread(scores: Scores, whole: Scores) -> Scores:
@@ -354,10 +383,10 @@ def _spread(scores: Scores, whole: Scores) -> Scores:
     if not ordered.size:
         return np.zeros(len(scores))
     k, last = max(1, len(ordered) // 10), len(ordered) - 1
-    place, spread = np.searchsorted(ordered, scores), np.full(len(scores), np.inf)
+    position, spread = np.searchsorted(ordered, scores), np.full(len(scores), np.inf)
     # The k nearest ones and the score itself are neighbours among the ordered scores.
     for first in range(-k, 1):
-        low, high = place + first, place + first + k
+        low, high = position + first, position + first + k
         inside = (low >= 0) & (high <= last)
         farther = np.maximum(
             scores - ordered[low.clip(0, last)], ordered[high.clip(0, last)] - scores

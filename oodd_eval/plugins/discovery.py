@@ -10,25 +10,27 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import chdir, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from types import ModuleType
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import pluggy
 
 from oodd_eval import plugins as hooks
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
-from oodd_eval.names import check_known, select
+from oodd_eval.names import PARAMETER_NAME, SPEC_NAME, check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
-from oodd_eval.plugins.specs import check_detector_spec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
     from oodd_eval.data.own import OwnSpec
+
+_Spec = TypeVar("_Spec")
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -88,11 +90,8 @@ class Plugin:
     def specs(self) -> list[DetectorSpec]:
         """Return what its `oodd_detectors` returns, checked."""
         specs: list[DetectorSpec] = []
-        for found in self.hook.oodd_detectors():
-            if not isinstance(found, list) or not all(isinstance(s, DetectorSpec) for s in found):
-                wrong = f"oodd_detectors of {self} returned {found!r:.80}"
-                raise PluginError(f"{wrong}, expected a list of oodd_eval.DetectorSpec")
-            specs += found
+        for returned in self.hook.oodd_detectors():
+            specs += _list_of(returned, DetectorSpec, f"oodd_detectors of {self}")
         for spec in specs:
             check_detector_spec(spec)
         return specs
@@ -101,18 +100,14 @@ class Plugin:
         """Return its environments and anomalies, checked."""
         from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, check_spec  # noqa: PLC0415
 
-        found: list[OwnSpec] = []
-        for hook, kind in (("oodd_environments", EnvironmentSpec), ("oodd_anomalies", AnomalySpec)):
-            for specs in getattr(self.hook, hook)():
-                if not isinstance(specs, list) or not all(isinstance(s, kind) for s in specs):
-                    expected = f"a list of oodd_eval.{kind.__name__}"
-                    raise PluginError(
-                        f"{hook} of {self} returned {specs!r:.80}, expected {expected}"
-                    )
-                found += specs
-        for spec in found:
+        specs: list[OwnSpec] = []
+        for returned in self.hook.oodd_environments():
+            specs += _list_of(returned, EnvironmentSpec, f"oodd_environments of {self}")
+        for returned in self.hook.oodd_anomalies():
+            specs += _list_of(returned, AnomalySpec, f"oodd_anomalies of {self}")
+        for spec in specs:
             check_spec(spec)
-        return found
+        return specs
 
     def offer(self, spec: DetectorSpec) -> Offer:
         """Return a spec as an offer; its version names the library that does the work, too."""
@@ -145,17 +140,17 @@ class Plugins:
         """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
         for point in list(self._waiting):
             self._load(point)
-        found: dict[str, tuple[OwnSpec, str]] = {}
+        offered: dict[str, tuple[OwnSpec, str]] = {}
         for plugin in list(self.loaded.values()):
             with self.blaming(plugin.point):
-                own: dict[str, tuple[OwnSpec, str]] = {}
+                of_plugin: dict[str, tuple[OwnSpec, str]] = {}
                 for spec in plugin.own_specs():
-                    if previous := found.get(spec.name) or own.get(spec.name):
+                    if previous := offered.get(spec.name) or of_plugin.get(spec.name):
                         by = f"{previous[1]} and by {plugin}"
                         raise PluginError(f"{spec.name!r} is offered twice, by {by}")
-                    own[spec.name] = (spec, str(plugin))
-                found |= own
-        return found
+                    of_plugin[spec.name] = (spec, str(plugin))
+                offered |= of_plugin
+        return offered
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -176,8 +171,8 @@ class Plugins:
         none offers it, and `UsageError` when it has a colon and none can make a detector of it.
         """
         if name not in self._offers and ":" in name:
-            made = self._from_spec(name)
-            return self._offers.setdefault(made.spec.name, made)
+            offer = self._from_spec(name)
+            return self._offers.setdefault(offer.spec.name, offer)
         for point in sorted(self._waiting, key=lambda p: (_foreign(p), p.name != name)):
             if name not in self._offers:
                 self._load(point)
@@ -248,9 +243,9 @@ class Plugins:
         for point in self._points:
             if point in self._waiting:
                 self._load(point)
-            made = self.loaded.get(point.name)
-            if made and made.point is point and made.hook.oodd_detector_from_spec.get_hookimpls():
-                yield made
+            plugin = self.loaded.get(point.name)
+            if plugin and plugin.point is point and _implements(plugin, "oodd_detector_from_spec"):
+                yield plugin
 
     def _from_spec(self, text: str) -> Offer:
         """Ask one plug-in after the other; a failure is told as that plug-in's."""
@@ -293,11 +288,11 @@ def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = N
         only = [name.strip() for name in os.environ[RESTRICT].split(",") if name.strip()]
     check_known("plug-in", names, *disabled, *(only or ()))
 
-    def wanted(point: EntryPoint) -> bool:
+    def selected(point: EntryPoint) -> bool:
         built_in = point.name == _BUILT_IN and not _foreign(point)
         return point.name not in disabled and (only is None or built_in or point.name in only)
 
-    return Plugins([p for p in points if wanted(p)], [p for p in observers if wanted(p)])
+    return Plugins([*filter(selected, points)], [*filter(selected, observers)])
 
 
 def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
@@ -327,6 +322,41 @@ def offer_of(plugin: str, detector: str) -> Offer:
         raise
 
 
+def _list_of(returned: object, kind: type[_Spec], hook: str) -> list[_Spec]:
+    """Return what a hook returned, if it is a list of specs of one kind."""
+    if not isinstance(returned, list) or not all(isinstance(spec, kind) for spec in returned):
+        expected = f"a list of oodd_eval.{kind.__name__}"
+        raise PluginError(f"{hook} returned {returned!r:.80}, expected {expected}")
+    return returned
+
+
+def _implements(plugin: Plugin, hook: str) -> bool:
+    return bool(getattr(plugin.hook, hook).get_hookimpls())
+
+
+def check_detector_spec(spec: DetectorSpec) -> None:
+    """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
+    for names, expected, fits in _FIELDS:
+        for name in names.split():
+            if not fits(value := getattr(spec, name)):
+                raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
+
+
+def _matches(pattern: str, value: object) -> bool:
+    return isinstance(value, str) and bool(re.fullmatch(pattern, value, re.ASCII))
+
+
+def _is_line(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= 1000 and value.isprintable()
+
+
+def _declares(parameters: Any) -> bool:
+    if parameters is None:
+        return True
+    declares = isinstance(parameters, type) and is_dataclass(parameters)
+    return declares and all(_matches(PARAMETER_NAME, f.name) for f in fields(parameters))
+
+
 def describe(error: BaseException) -> str:
     """Return an exception in one line: its type and its message."""
     try:
@@ -343,6 +373,36 @@ def printable(reason: str) -> str:
         reason = f"{reason[:half]} ... {reason[-half:]}"
     # Halves of surrogate pairs, which no file takes, are not printable either.
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in reason)
+
+
+_FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
+    (
+        "name",
+        "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
+        lambda value: _matches(SPEC_NAME, value),
+    ),
+    ("factory", "a function or class", callable),
+    ("summary reference extra fit_name", "a printable line of at most 1000 characters", _is_line),
+    (
+        "inputs",
+        "observations or observations+actions",
+        ("observations", "observations+actions").__contains__,
+    ),
+    ("alarm", "cusum or score", ("cusum", "score").__contains__),
+    (
+        "deterministic other_parameters horizon_decides_fit",
+        "True or False",
+        lambda value: isinstance(value, bool),
+    ),
+    (
+        "requires",
+        "names of modules",
+        lambda value: isinstance(value, tuple | list) and all(map(_is_line, value)),
+    ),
+    ("version", "a version such as 1.2", lambda value: _matches("[A-Za-z0-9.+!_-]{0,64}", value)),
+    ("parameters", "a dataclass with fields of ASCII names, or None", _declares),
+)
+"""Fields of a spec, what is expected of them, and whether a value is."""
 
 
 def _foreign(point: EntryPoint) -> bool:

@@ -47,8 +47,12 @@ class ExplainingDetector(Detector, Protocol):
 
         Parameters
         ----------
-        trajectory
+        trajectory : Trajectory
             One episode, which a fitted detector may not have scored.
+
+        Returns
+        -------
+        Explanation
         """
 
 
@@ -96,9 +100,9 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
         ("onsets", onsets, f"int64 of shape {(rows,)}"),
     ):
         is_array = isinstance(array, np.ndarray) and not np.ma.is_masked(array)
-        found = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
-        if found != form:
-            raise ContractError(f"explain returned {name} as {found}, expected {form}")
+        actual = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
+        if actual != form:
+            raise ContractError(f"explain returned {name} as {actual}, expected {form}")
     undefined = np.isnan(shares).all(axis=1)
     parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= _ROUNDING)
     known = (onsets >= 0) & (onsets <= np.arange(rows))
@@ -118,28 +122,28 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
 
 
 def check_named(
-    found: object, scores: Scores, sensors: int, where: str, whole: Named | None = None
+    array: object, scores: Scores, sensors: int, where: str, whole: Named | None = None
 ) -> Named:
     """Return what came from a worker, if it can explain these scores; else `ContractError`.
 
     Where the scores are of a prefix, `whole` is what is kept for the episode.
     """
     rows = len(scores)
-    if not isinstance(found, np.ndarray) or found.dtype != np.int32 or found.shape != (2, rows):
+    if not isinstance(array, np.ndarray) or array.dtype != np.int32 or array.shape != (2, rows):
         raise ContractError(f"no explanation came back for {where}")
-    known = ((found >= 0) & (found <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
-    fine = np.where(np.isnan(scores), (found == -1).all(axis=0), known)
+    known = ((array >= 0) & (array <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
+    fine = np.where(np.isnan(scores), (array == -1).all(axis=0), known)
     if not fine.all():
         t = int(fine.argmin())
         raise ContractError(
-            f"explain names sensor {found[0, t]} and onset {found[1, t]} at t = {t} of {where}, "
+            f"explain names sensor {array[0, t]} and onset {array[1, t]} at t = {t} of {where}, "
             f"with the score {scores[t]}: expected both where it is defined, and -1 elsewhere"
         )
-    differing = (found != (found if whole is None else whole[:, :rows])).any(axis=0)
+    differing = (array != (array if whole is None else whole[:, :rows])).any(axis=0)
     if differing.mean() > FLIPPED:
         raise ContractError(
-            f"explain names another sensor or onset at {differing.sum()} of the first {rows} "
-            f"observations of {where} when they are all it gets: expected the same, as it may use "
+            f"explain is not causal: {differing.sum()} sensors or onsets of {where} change when "
+            f"only its first {rows} observations are given: expected the same, as it may use "
             "nothing after a row's time (`oodd-eval check` with -k explain)"
         )
-    return found
+    return array

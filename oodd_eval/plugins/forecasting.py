@@ -39,9 +39,9 @@ class FeatureScale:
         widths = sorted({x.observation_dim for x in nominal})
         transitions = sum(x.transitions for x in nominal)
         if len(widths) != 1 or not transitions:
-            found = f"{len(nominal)} trajectories with {transitions} transitions, {widths} sensors"
+            data = f"{len(nominal)} trajectories with {transitions} transitions, {widths} sensors"
             expected = "at least one transition and the same number of sensors everywhere"
-            raise TrajectoryError(f"cannot fit on {found}: expected {expected}")
+            raise TrajectoryError(f"cannot fit on {data}: expected {expected}")
         rows = np.concatenate([x.observations for x in nominal]).astype(np.float64)
         std = rows.std(axis=0)
         return cls(rows.mean(axis=0), np.where(std < CONSTANT, 1.0, std))
@@ -71,8 +71,10 @@ class FeatureScale:
 
     def must_fit(self, trajectory: Trajectory) -> None:
         """Raise `TrajectoryError` when the trajectory has another number of sensors."""
-        if (found := trajectory.observation_dim) != len(self.mean):
-            what = f"fitted on {len(self.mean)} sensors and asked to score a trajectory of {found}"
+        if (sensors := trajectory.observation_dim) != len(self.mean):
+            what = (
+                f"fitted on {len(self.mean)} sensors and asked to score a trajectory of {sensors}"
+            )
             advice = "score trajectories of the environment that the detector was fitted on"
             raise TrajectoryError(f"{what}: {advice}")
 
@@ -85,13 +87,13 @@ class FeatureScale:
 
         Raises `TrajectoryError` for another number of sensors, or a value that is not finite.
         """
-        found = np.array(observation, dtype=np.float32)
-        if found.shape != self.mean.shape or not np.isfinite(found).all():
-            n, wild = len(self.mean), int((~np.isfinite(found)).sum())
-            given = f"an observation of shape {found.shape} with {wild} values that are not finite"
+        row = np.array(observation, dtype=np.float32)
+        if row.shape != self.mean.shape or not np.isfinite(row).all():
+            n, wild = len(self.mean), int((~np.isfinite(row)).sum())
+            actual = f"an observation of shape {row.shape} with {wild} values that are not finite"
             expected = f"expected ({n},), all finite"
-            raise TrajectoryError(f"fitted on {n} sensors and given {given}: {expected}")
-        return found
+            raise TrajectoryError(f"fitted on {n} sensors and given {actual}: {expected}")
+        return row
 
 
 def anomaly_scores(
@@ -101,12 +103,12 @@ def anomaly_scores(
 
     Parameters
     ----------
-    observations
-        Of shape (T + 1, D).
-    errors
-        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, of shape
-        (T + 1 - horizon,).
-    horizon
+    observations : float32 array of shape (T + 1, D)
+        Standardized readings of one episode; only their number counts.
+    errors : float64 array of shape (T + 1 - horizon,)
+        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, in training
+        standard deviations.
+    horizon : int
         Prediction horizon in steps.
 
     Returns

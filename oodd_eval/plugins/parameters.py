@@ -47,8 +47,8 @@ def parameter(
     }
     # Dataclasses refuse defaults that all instances would share and could change.
     if isinstance(default, list | dict):
-        made = functools.partial(copy.deepcopy, default)
-        return dataclasses.field(default_factory=made, metadata=facts)
+        copies = functools.partial(copy.deepcopy, default)
+        return dataclasses.field(default_factory=copies, metadata=facts)
     return dataclasses.field(default=default, metadata=facts)
 
 
@@ -106,14 +106,14 @@ def parameters_of(declared: type | None) -> dict[str, ParameterInfo]:
     """Return the parameters that a dataclass declares, by name; none for None."""
     if declared is None:
         return {}
-    hints, found = typing.get_type_hints(declared), {}
+    hints, infos = typing.get_type_hints(declared), {}
     for f in dataclasses.fields(declared):
         hint = hints[f.name]
         within = typing.get_args(hint) if typing.get_origin(hint) is list else ()
         items = tuple(t for part in within for t in _types_of(part))
         default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
-        found[f.name] = ParameterInfo(_types_of(hint), items, default, **f.metadata)
-    return found
+        infos[f.name] = ParameterInfo(_types_of(hint), items, default, **f.metadata)
+    return infos
 
 
 def _types_of(hint: Any) -> tuple[type, ...]:
@@ -132,19 +132,19 @@ def checked(declared: type[Declared], detector: str, values: Mapping[str, Any]) 
 
 
 def resolve_parameters(
-    detector: str, declared: type | None, given: Mapping[str, Any], *, others: bool = False
+    detector: str, declared: type | None, values: Mapping[str, Any], *, others: bool = False
 ) -> dict[str, Any]:
     """Return a detector's parameters with defaults filled in, sorted by name.
 
     Raises `UsageError` for a wrong value, or a name not declared, unless it takes `others`.
     """
     known = parameters_of(declared)
-    for name, value in given.items():
+    for name, value in values.items():
         if name not in known and not others:
             raise UnknownNameError(f"parameter of {detector}", name, known)
         if name in known and (problem := known[name].problem(value)):
             raise UsageError(f"parameter {name!r} of {detector} is {value!r}, {problem}")
-    return dict(sorted({**{n: p.default for n, p in known.items()}, **given}.items()))
+    return dict(sorted({**{n: p.default for n, p in known.items()}, **values}.items()))
 
 
 def declared_by(defaults: Mapping[str, Any], base: type = object) -> type:

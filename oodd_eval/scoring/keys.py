@@ -37,7 +37,7 @@ def source_digest(module: str) -> str:
         for name, path in _files(top):
             files[name] = path.read_bytes()
             if path.suffix == ".py":
-                pending += [found.decode() for found in _IMPORT.findall(files[name])]
+                pending += [package.decode() for package in _IMPORT.findall(files[name])]
     for name, code in sorted(files.items()):
         content.update(f"{name}\0{hashlib.sha256(code).hexdigest()}\0".encode())
     return content.hexdigest()
@@ -60,8 +60,8 @@ def _files(top: str) -> Iterator[tuple[str, Path]]:
 def scores_key(detector: str, environment: str, identity: Mapping[str, Any]) -> str:
     """Return the key of a unit's scores as a short file name."""
     # Some file systems take no colons, and some do not tell capitals.
-    shown = detector.lower().replace(":", "-")
-    return f"{shown}-{environment}-{_digest(identity)[:20]}"
+    file_name = detector.lower().replace(":", "-")
+    return f"{file_name}-{environment}-{_digest(identity)[:20]}"
 
 
 def fit_key(identity: Mapping[str, Any]) -> str:

@@ -75,7 +75,7 @@ class Observers:
     again: a plug-in that watches may not stop the run. The program's own observers may raise.
     """
 
-    def __init__(self, plugins: Plugins, own: Iterable[object] = ()) -> None:
+    def __init__(self, plugins: Plugins, observers: Iterable[object] = ()) -> None:
         specification = sys.modules[__name__]
         self._plugins = plugins
         self._foreign: list[tuple[EntryPoint, pluggy.HookRelay]] = []
@@ -88,7 +88,7 @@ class Observers:
                 if id(module) not in observing:
                     observing[id(module)] = point
                     self._foreign.append((point, register(module, specification)))
-        self._own = [register(observer, specification) for observer in own]
+        self._observers = [register(observer, specification) for observer in observers]
 
     def notify(self, hook: str, **arguments: Any) -> None:
         """Call one hook of every observer."""
@@ -101,5 +101,5 @@ class Observers:
                     call(**copy.deepcopy(arguments))
             if len(self._plugins.broken) > failures:
                 self._foreign.remove(entry)
-        for hooks in self._own:
+        for hooks in self._observers:
             getattr(hooks, hook)(**arguments)

@@ -25,8 +25,8 @@ class Unit:
     """One fit: setting x seed x environment, and the anomalies that it scores.
 
     `anomalies` are conditions, such as ``"iid"`` or ``"iid@kept99"``. `parameters` are all that the
-    factory gets, sorted by name; `shown` are those that are part of the result, which the device is
-    not. `plugin` is empty for a factory of this process, which has no `source` (the digest of a
+    factory gets, sorted by name; `recorded` are those that are part of the result, so not the
+    device. `plugin` is empty for a factory of this process, which has no `source` (the digest of a
     plug-in's code) and no key of a stored fit; its scores are stored under a key, but never taken
     from there by a later run.
     """
@@ -36,7 +36,7 @@ class Unit:
     seed: int
     anomalies: tuple[str, ...]
     parameters: Mapping[str, Any]
-    shown: Mapping[str, Any]
+    recorded: Mapping[str, Any]
     plugin: str
     distribution: str
     version: str
@@ -77,10 +77,10 @@ class Plan:
         kind, strength = split_condition(anomaly)
         return Cell(self.split, unit.environment, kind, unit.setting, unit.seed, strength)
 
-    def matching(self, wanted: Predicate) -> "Plan":
+    def matching(self, predicate: Predicate) -> "Plan":
         """Return the plan with those cells only whose text passes, without empty units."""
         units = (
-            replace(u, anomalies=tuple(a for a in u.anomalies if wanted(str(self.cell(u, a)))))
+            replace(u, anomalies=tuple(a for a in u.anomalies if predicate(str(self.cell(u, a)))))
             for u in self.units
         )
         return replace(self, units=tuple(u for u in units if u.anomalies))
@@ -95,7 +95,7 @@ class Plan:
             detector_version=unit.version,
             plugin=f"{unit.distribution}:{unit.plugin}",
             plugin_source=unit.source,
-            parameters=dict(unit.shown),
+            parameters=dict(unit.recorded),
             overrides=unit.setting.overrides,
             inputs=unit.inputs,
             alarm=unit.alarm,
@@ -133,37 +133,44 @@ def make_plan(
     unknown or refused, and a device that no detector has, raises `UsageError`.
     """
     offers = [plugins.offer(name) for name in detectors]
-    given = [dict(parameters or {}) for _ in offers]
-    for offer, own in zip(offers, given, strict=True) if device is not None else ():
-        if "device" in parameters_of(offer.spec.parameters):
-            if device not in DEVICES:
-                raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
-            own["device"] = device
-    if device is not None and offers and not any("device" in own for own in given):
-        names = ", ".join(offer.spec.name for offer in offers)
-        raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
+    values = [dict(parameters or {}) for _ in offers]
+    if device is not None:
+        _set_device(device, offers, values)
     units = tuple(
-        make_unit(offer, own, split, environment, conditions, horizon, seed, limit)
+        make_unit(offer, chosen, split, environment, conditions, horizon, seed, limit)
         for environment in environments
         if (conditions := _chosen(split.conditions(environment), anomalies))
-        for offer, own in zip(offers, given, strict=True)
+        for offer, chosen in zip(offers, values, strict=True)
         for horizon in horizons
         for seed in seeds
     )
     return Plan(split.name, split.digest, units, split.groups, limit)
 
 
+def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str, Any]]) -> None:
+    """Set the parameter ``device`` of those detectors that have it."""
+    pairs = zip(offers, values, strict=True)
+    having = [v for offer, v in pairs if "device" in parameters_of(offer.spec.parameters)]
+    if offers and not having:
+        names = ", ".join(offer.spec.name for offer in offers)
+        raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
+    if having and device not in DEVICES:
+        raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
+    for chosen in having:
+        chosen["device"] = device
+
+
 def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str, ...]:
     """Return the conditions that some names choose, in the order of the names."""
     if names is None:
         return tuple(conditions)
-    found = (c for name in names for c in conditions if name in (c, split_condition(c)[0]))
-    return tuple(dict.fromkeys(found))
+    chosen = (c for name in names for c in conditions if name in (c, split_condition(c)[0]))
+    return tuple(dict.fromkeys(chosen))
 
 
 def make_unit(
     offer: Offer,
-    given: Mapping[str, Any],
+    values: Mapping[str, Any],
     split: Split,
     environment: str,
     anomalies: Sequence[str],
@@ -174,21 +181,17 @@ def make_unit(
     """Resolve one unit: its parameters, its setting and its keys."""
     spec = offer.spec
     declared = parameters_of(spec.parameters)
-    resolved = resolve_parameters(spec.name, spec.parameters, given, others=spec.other_parameters)
+    resolved = resolve_parameters(spec.name, spec.parameters, values, others=spec.other_parameters)
     kinds = {name: declared[name].decides if name in declared else "fit" for name in resolved}
-    shown = {name: value for name, value in resolved.items() if kinds[name] != "nothing"}
-    overrides = {
-        name: value
-        for name, value in shown.items()
-        if name not in declared or value != declared[name].default
-    }
+    recorded = {name: value for name, value in resolved.items() if kinds[name] != "nothing"}
+    overrides = {n: v for n, v in recorded.items() if n not in declared or v != declared[n].default}
     source = source_digest(offer.module) if offer.plugin else ""
     identity: dict[str, Any] = {
         "distribution": offer.distribution,
         "version": offer.version,
         "source": source,
         "detector": spec.name,
-        "parameters": shown,
+        "parameters": recorded,
         "seed": seed,
         "horizon": horizon,
         "environment": environment,
@@ -198,7 +201,7 @@ def make_unit(
     scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
     fit = ""
     if offer.plugin:
-        deciding = {name: value for name, value in shown.items() if kinds[name] == "fit"}
+        deciding = {name: value for name, value in recorded.items() if kinds[name] == "fit"}
         # A fit serves all splits that have its training part.
         same: dict[str, Any] = {
             "detector": spec.fit_name or spec.name,
@@ -214,7 +217,7 @@ def make_unit(
         seed=seed,
         anomalies=tuple(anomalies),
         parameters=resolved,
-        shown=shown,
+        recorded=recorded,
         plugin=offer.plugin,
         distribution=offer.distribution,
         version=offer.version,

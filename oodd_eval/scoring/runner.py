@@ -1,7 +1,7 @@
 """Run a plan: one worker per unit, several at a time, every finished unit kept at once.
 
-The runner prints nothing. Observers (`oodd_eval.scoring.observers`) hear of every cell, and results
-are the same bytes for any number of jobs.
+The runner prints nothing. Observers (`oodd_eval.scoring.observers`) are called for every cell, and
+results are the same bytes for any number of jobs.
 """
 
 import time
@@ -58,7 +58,7 @@ def run(
         results.prepare()
     executor = open_executor(settings, split, results)
     writer = RecordWriter(results)
-    hearing = Observers(plugins, observers)
+    notify = Observers(plugins, observers).notify
     interrupted, done = False, 0
     opened = ExitStack()
     try:
@@ -67,18 +67,18 @@ def run(
             UnitJob(plan, unit, data(unit.environment), plugins.offer(unit.setting.detector))
             for unit in plan.units
         ]
-        hearing.notify("oodd_run_started", plan=plan)
+        notify("oodd_run_started", plan=plan)
         origin = gather(settings.command)
         with closing(_as_they_finish(jobs, executor, settings, results)) as finished:
             for index, scored in finished:
                 if scored is None:
-                    hearing.notify("oodd_unit_started", unit=plan.units[index])
+                    notify("oodd_unit_started", unit=plan.units[index])
                     continue
                 done += 1
                 records = _records(jobs[index], scored, origin)
                 writer.add(index, records)
                 for record in records:
-                    hearing.notify("oodd_cell_finished", record=record, resumed=scored.resumed)
+                    notify("oodd_cell_finished", record=record, resumed=scored.resumed)
                 if settings.stop_on_failure and scored.status != "ok":
                     break
     except KeyboardInterrupt:
@@ -88,7 +88,7 @@ def run(
         opened.close()
         writer.write()
     records = writer.records
-    hearing.notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
+    notify("oodd_run_finished", plan=plan, records=records, interrupted=interrupted)
     return RunOutcome(records, interrupted, len(plan.units) - done)
 
 
@@ -110,12 +110,12 @@ def _as_they_finish(
     waiting.prepare()
     ready: list[int] = []
     running: dict[Future[Scored], int] = {}
-    told: set[int] = set()
+    announced: set[int] = set()
 
     def begun() -> list[int]:
-        """Return the jobs at work that have not been told: the pool takes them in their order."""
-        new = [index for index in [*running.values()][: executor.jobs] if index not in told]
-        told.update(new)
+        """Return the jobs at work that are not announced: the pool takes them in their order."""
+        new = [index for index in [*running.values()][: executor.jobs] if index not in announced]
+        announced.update(new)
         return new
 
     def score(job: UnitJob) -> Scored:
@@ -150,8 +150,8 @@ def _as_they_finish(
             for future in [f for f in running if f in finished]:
                 index = running.pop(future)
                 waiting.done(index)
-                if index not in told:  # it began and finished since jobs were last told
-                    told.add(index)
+                if index not in announced:  # it began and finished since jobs were last announced
+                    announced.add(index)
                     yield index, None
                 yield index, future.result()
     finally:
@@ -184,7 +184,7 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
     counts = {"train": job.data.train, "calibration": job.data.calibration, "test": job.data.twins}
     # A whole number, also when it was read back from a file of floats.
     steps = int(cost["steps_scored"]) if "steps_scored" in cost else None
-    device = {name: v for name, v in unit.parameters.items() if name not in unit.shown}
+    device = {name: v for name, v in unit.parameters.items() if name not in unit.recorded}
     outcome: dict[str, Any] = {
         "status": scored.status,
         "reason": scored.reason,

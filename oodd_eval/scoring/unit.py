@@ -67,7 +67,7 @@ class UnitJob:
         self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
     ) -> Scored:
         """Return the unit's scores, or how its detector failed."""
-        work = _Work(self, parts_of(self.data, self.unit.anomalies))
+        work = GroupedScoring(self, parts_of(self.data, self.unit.anomalies))
         if self.unit.local:
             return work.in_process()
         if reason := self.offer.unavailable():
@@ -80,8 +80,8 @@ class UnitJob:
 
         if results is None:
             # It is this process that removes what was saved, however the worker ends.
-            with tempfile.TemporaryDirectory(prefix="oodd-eval-") as place:
-                return work.checked(isolated(save=place))
+            with tempfile.TemporaryDirectory(prefix="oodd-eval-") as directory:
+                return work.checked(isolated(save=directory))
         fits = results.fits
         return work.checked(_with_kept_fit(isolated, fits, self.unit.fit_key, stop, fresh=fresh))
 
@@ -94,7 +94,7 @@ class UnitJob:
         return Scored(file=kept, resumed=True) if kept else None
 
 
-class _Work:
+class GroupedScoring:
     """The trajectories of one unit, the groups in which they are scored, and the checks of scores.
 
     A group holds no two trajectories of one seed: as many calibration trajectories as there are
@@ -133,7 +133,7 @@ class _Work:
             "load": load,
             "save": save,
         }
-        nominal = map(self._shown, islice(data.train, train))
+        nominal = map(self._visible, islice(data.train, train))
         parts, again = (map(self._members, g) for g in (self._groups, self._explained))
         return run_isolated(request, nominal, parts, again, limits=limits, stop=stop)
 
@@ -166,20 +166,24 @@ class _Work:
             horizon=unit.setting.horizon,
             parameters=unit.parameters,
         )
-        detector.fit([*map(self._shown, islice(self._job.data.train, limit))])
-        shown = ([*self._members(group)] for group in self._groups)
-        returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in shown]
+        detector.fit([*map(self._visible, islice(self._job.data.train, limit))])
+        chunks = ([*self._members(group)] for group in self._groups)
+        returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in chunks]
         parts = self._placed(returned, getattr(detector, "warm_up", 0))
         again = self._explained if explanations.explains(detector) else ()
-        chunks = ([*self._members(group)] for group in again)
-        copies = ((copy.deepcopy(detector), chunk) for chunk in chunks)
-        explained = [one for pair in copies for one in explanations.explain_chunk(*pair)]
+        explained = [
+            explanation
+            for group in again
+            for explanation in explanations.explain_chunk(
+                copy.deepcopy(detector), [*self._members(group)]
+            )
+        ]
         return Scored(file=ScoreFile(parts, {}, self._order, self._explanations(explained, parts)))
 
     def _members(self, group: Sequence[Probe]) -> Iterator[Trajectory]:
-        return (self._shown(self._sets[p.part][p.index][: p.rows]) for p in group)
+        return (self._visible(self._sets[p.part][p.index][: p.rows]) for p in group)
 
-    def _shown(self, trajectory: Trajectory) -> Trajectory:
+    def _visible(self, trajectory: Trajectory) -> Trajectory:
         """Return what the detector may see: no actions, unless it declares that it uses them."""
         withheld = self._job.unit.inputs == "observations"
         return trajectory.without_actions() if withheld else trajectory
@@ -192,40 +196,44 @@ class _Work:
         detector, horizon = unit.setting.detector, unit.setting.horizon
         # In the order of the split: the first fault that is told is the same in every run.
         for k, group in enumerate(self._ordered):
-            for (part, i, rows), one in zip(map(astuple, group), scores[k], strict=True):
+            for (part, i, rows), array in zip(map(astuple, group), scores[k], strict=True):
                 where = f"{unit.environment}/{part}[{i}]"
-                found = contract.check_scores(
-                    one, rows, horizon=horizon, warm_up=warm_up, detector=detector, where=where
+                checked = contract.check_scores(
+                    array, rows, horizon=horizon, warm_up=warm_up, detector=detector, where=where
                 )
                 if group is self._probes:
                     contract.check_prefix(
-                        found, parts[part][i], detector=detector, where=where, horizon=horizon
+                        checked, parts[part][i], detector=detector, where=where, horizon=horizon
                     )
                 else:
-                    parts[part][i] = found
+                    parts[part][i] = checked
         return parts
 
     def _explanations(
         self, returned: Sequence[object], parts: Mapping[str, Sequence[Scores]]
     ) -> dict[str, list[Named]]:
         """Check explanations, if there are any; raise `ContractError`, or return them by part."""
-        wanted = [probe for group in self._explained for probe in group]
-        if returned and len(returned) != len(wanted):
-            raise ContractError(f"{len(returned)} explanations came back, expected {len(wanted)}")
-        given = {
-            (p.rows < len(parts[p.part][p.index]), p.part, p.index): (p.rows, one)
-            for p, one in zip(wanted, returned, strict=False)
-        }
-        found: dict[str, list[Named]] = {}
-        for cut, part, i in sorted(given):  # whole ones before those that are cut
-            rows, one = given[cut, part, i]
-            own, where = found.setdefault(part, []), f"{self._job.unit.environment}/{part}[{i}]"
-            scores, whole = parts[part][i][:rows], own[i] if cut else None
+        probes = [probe for group in self._explained for probe in group]
+        if returned and len(returned) != len(probes):
+            raise ContractError(f"{len(returned)} explanations came back, expected {len(probes)}")
+        explained: dict[str, list[Named]] = {}
+
+        def key(pair: tuple[Probe, object]) -> tuple[bool, str, int]:
+            probe = pair[0]  # whole ones before those that are cut
+            return probe.rows < len(parts[probe.part][probe.index]), probe.part, probe.index
+
+        for probe, array in sorted(zip(probes, returned, strict=False), key=key):
+            scores, named = parts[probe.part][probe.index], explained.setdefault(probe.part, [])
+            cut, where = probe.rows < len(scores), f"{probe.part}[{probe.index}]"
             checked = explanations.check_named(
-                one, scores, len(self._job.data.sensors), where, whole
+                array,
+                scores[: probe.rows],
+                len(self._job.data.sensors),
+                f"{self._job.unit.environment}/{where}",
+                named[probe.index] if cut else None,
             )
-            own += [] if cut else [checked]
-        return found
+            named += [] if cut else [checked]
+        return explained
 
 
 def _with_kept_fit(
@@ -243,7 +251,7 @@ def _with_kept_fit(
     if outcome.seconds_fit is not None:
         outcome.seconds_fit = fit.seconds_fit
     elif outcome.status != "ok" and not stop():
-        # It ended before it was loaded; whatever the reason, a fit of its own is what counts.
+        # The kept fit could not be loaded: discard it and fit again.
         fits.distrust(key)
         return _with_kept_fit(isolated, fits, key, stop, fresh=True)
     return outcome
@@ -255,5 +263,5 @@ def groups(lengths: Mapping[str, Sequence[int]]) -> list[list[Probe]]:
     All have that size but the last one of calibration, where the twins do not divide it.
     """
     size = max(1, len(lengths.get(TWINS, ())))
-    every = [[Probe(part, i, n) for i, n in enumerate(own)] for part, own in lengths.items()]
+    every = [[Probe(part, i, n) for i, n in enumerate(ns)] for part, ns in lengths.items()]
     return [part[i : i + size] for part in every for i in range(0, len(part), size)]

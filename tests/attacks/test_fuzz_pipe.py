@@ -36,8 +36,8 @@ RECORD = Record(
 FIT = st.fixed_dictionaries(
     {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": st.booleans() | ANY}
 )
-NAMES = st.sampled_from(["status", "reason", "type", "pid", "forked", "seconds_score",
-                         "peak_rss_mb", "seconds_fit", "warm_up", "explains"])  # fmt: skip
+NAMES = st.sampled_from(["status", "reason", "type", "seconds_score", "peak_rss_mb", "seconds_fit",
+                         "warm_up", "explains"])  # fmt: skip
 KNOWN = st.sampled_from(["array", "explanation", "error", "ok", "oom", "timeout", 0, 1.5, True])
 MESSAGE = FIT | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
 JSON = MESSAGE.map(lambda message: json.dumps(message).encode())
@@ -54,7 +54,7 @@ def saved(draw):
 
 
 def framed(content):
-    return len(content).to_bytes(8, "little") + content
+    return len(content).to_bytes(4, "big") + content
 
 
 FRAME = (JSON | saved() | st.binary(max_size=50) | damaged(JSON)).map(framed)
@@ -66,10 +66,7 @@ TALKS = TALK | damaged(TALK) | TALK.map(PREFIX.__add__) | saved().map(lambda a: 
 
 def child_of(descriptor):
     """What the supervisor knows of a worker, without one."""
-    return SimpleNamespace(
-        channel=Channel(descriptor, -1), elapsed=1.0, peak=10**6, together=max,
-        watch=lambda pid, forked: None,
-    )  # fmt: skip
+    return SimpleNamespace(channel=Channel(descriptor), elapsed=1.0, peak=10**6)
 
 
 def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
@@ -92,7 +89,7 @@ def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
         except (OoddError, LookupError, TypeError, ValueError, OverflowError):
             outcome.status, outcome.reason = "error", "garbled"
         finally:
-            os.close(reading)
+            child.channel.close()
         scored = Scored(outcome.status, outcome.reason)
         assert scored.status in STATUSES
         assert scored.reason or scored.status == "ok" or outcome.reason == ""

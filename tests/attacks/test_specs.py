@@ -86,15 +86,3 @@ def test_a_wrong_name_made_for_a_colon(name, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "odd", code)
     with pytest.raises(PluginError, match="name of a DetectorSpec is"):
         discover().offer("odd:one")
-
-
-def test_escapes_of_an_import_error_do_not_reach_the_terminal(monkeypatch, tmp_path, capsys):
-    install(monkeypatch, tmp_path, "odd", 'raise RuntimeError("\\x1b[2J" + "x" * 10**5)')
-    plugins = discover()
-    assert plugins.offers
-    (broken,) = plugins.broken
-    assert broken.reason.isprintable()
-    assert len(broken.reason) < 1000
-    assert cli.main(["list", "detectors"]) == 1
-    out, err = capsys.readouterr()
-    assert "\x1b[2J" not in out + err

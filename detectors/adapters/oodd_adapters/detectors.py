@@ -123,7 +123,7 @@ class OutlierDetector(_Adapter):
 
     Parameters
     ----------
-    given, more
+    arguments, more
         Arguments of `_Adapter`.
     method
         Name of the scoring method.
@@ -131,8 +131,8 @@ class OutlierDetector(_Adapter):
         1 if higher means more anomalous there, -1 if it is the reverse.
     """
 
-    def __init__(self, *given: Any, method: str, sign: int, **more: Any) -> None:
-        super().__init__(*given, **more, lag=0)
+    def __init__(self, *arguments: Any, method: str, sign: int, **more: Any) -> None:
+        super().__init__(*arguments, **more, lag=0)
         self.method, self.sign = method, sign
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:

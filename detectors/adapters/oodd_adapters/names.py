@@ -35,8 +35,8 @@ def pyod_class(name: str) -> type:
                 places.setdefault(defined, file.stem)
     if name not in places:
         raise UnknownNameError("detector of PyOD", name, places)
-    found = getattr(importlib.import_module(f"pyod.models.{places[name]}"), name)
-    return _class(found, f"pyod:{name}", "fit", "decision_function")
+    outlier_class = getattr(importlib.import_module(f"pyod.models.{places[name]}"), name)
+    return _class(outlier_class, f"pyod:{name}", "fit", "decision_function")
 
 
 def sklearn_class(name: str) -> tuple[str, type]:
@@ -45,20 +45,20 @@ def sklearn_class(name: str) -> tuple[str, type]:
     The name is ``IsolationForest``, or with the path to it, ``ensemble.IsolationForest``. Raises
     `UsageError` when there is no such class, or it is something else.
     """
-    modules = [importlib.import_module(f"sklearn.{place}") for place in PLACES]
+    modules = [importlib.import_module(f"sklearn.{module}") for module in PLACES]
     known = {n: c for m in modules for n in m.__all__ if _judges(c := getattr(m, n))}
     if name in known:
         return name, known[name]
     short = name.rpartition(".")[2]
     if short == name and not any(hasattr(m, name) for m in modules):
         raise UnknownNameError("outlier detector of scikit-learn", name, known)
-    found: Any = None if short == name else imported(f"sklearn.{name}", f"sklearn:{name}")
-    if not _judges(found):
+    candidate: Any = None if short == name else imported(f"sklearn.{name}", f"sklearn:{name}")
+    if not _judges(candidate):
         raise UsageError(
             f"'sklearn:{name}' is neither an outlier detector nor a density estimator; those of "
             f"scikit-learn are {', '.join(sorted(known))}"
         )
-    return short if known.get(short) is found else name, found
+    return short if known.get(short) is candidate else name, candidate
 
 
 def imported(path: str, spec: str) -> Any:
@@ -94,16 +94,16 @@ def forecaster_class(path: str) -> type:
     Raises `UsageError` when there is none; of scikit-learn's classes, when it is not a regressor.
     """
     spec = f"forecast:{path}"
-    found = _class(imported(path, spec), spec, "fit", "predict")
+    forecaster = _class(imported(path, spec), spec, "fit", "predict")
     if path.startswith("sklearn."):
         from sklearn.base import RegressorMixin  # noqa: PLC0415  an optional extra
 
-        if not issubclass(found, RegressorMixin):
+        if not issubclass(forecaster, RegressorMixin):
             raise UsageError(
                 f"{spec!r} is not a regressor: a forecaster predicts numbers, such as "
                 "forecast:sklearn.linear_model.Ridge"
             )
-    return found
+    return forecaster
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,14 +140,14 @@ class Signature:
         """Return True if it names this parameter; those that ``**`` would take do not count."""
         return name in (*self.plain, *self.required, *(self.others or ()))
 
-    def check(self, given: Mapping[str, Any], spec: str) -> None:
+    def check(self, values: Mapping[str, Any], spec: str) -> None:
         """Raise `UsageError` unless the class can be made of these parameters."""
-        for name in given:
+        for name in values:
             if self.others is not None and name not in self:
                 raise UnknownNameError(
                     f"parameter of {spec}", name, [*self.plain, *self.required, *self.others]
                 )
-        if missing := [name for name in self.required if name not in given]:
+        if missing := [name for name in self.required if name not in values]:
             raise UsageError(
                 f"{spec} needs a value for {', '.join(missing)}: give it as --param {missing[0]}=…"
             )
@@ -163,23 +163,23 @@ def _is_plain(value: object) -> bool:
         return False
 
 
-def _judges(found: object) -> bool:
+def _judges(candidate: object) -> bool:
     """Return True for a class of scikit-learn that scores how nominal a row is."""
     from sklearn.base import DensityMixin, OutlierMixin  # noqa: PLC0415  an optional extra
     from sklearn.neighbors import KernelDensity  # noqa: PLC0415  which lacks the mixin
 
     return (
-        inspect.isclass(found)
-        and issubclass(found, DensityMixin | OutlierMixin | KernelDensity)
-        and hasattr(found, "score_samples")
+        inspect.isclass(candidate)
+        and issubclass(candidate, DensityMixin | OutlierMixin | KernelDensity)
+        and hasattr(candidate, "score_samples")
     )
 
 
-def _class(found: Any, spec: str, *methods: str) -> type:
-    if inspect.isclass(found) and all(callable(getattr(found, m, None)) for m in methods):
-        return found
+def _class(candidate: Any, spec: str, *methods: str) -> type:
+    if inspect.isclass(candidate) and all(callable(getattr(candidate, m, None)) for m in methods):
+        return candidate
     raise UsageError(
-        f"{spec!r} is {found!r:.60}, expected a class with the methods {' and '.join(methods)}"
+        f"{spec!r} is {candidate!r:.60}, expected a class with the methods {' and '.join(methods)}"
     )
 
 
@@ -196,6 +196,6 @@ def _no_module(name: str, spec: str) -> UsageError:
 
 def _directory(module: str) -> Path | None:
     """Return where the modules of a package are; None for a module that is none."""
-    found = find_spec(module)
-    places = found.submodule_search_locations if found else None
+    spec = find_spec(module)
+    places = spec.submodule_search_locations if spec else None
     return Path(next(iter(places))) if places else None

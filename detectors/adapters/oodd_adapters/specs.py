@@ -14,7 +14,7 @@ from oodd_eval import Detector, DetectorSpec
 from oodd_eval.plugins.parameters import checked, declared_by
 from oodd_eval.scoring.keys import source_digest
 
-_OWN = frozenset(f.name for f in fields(AdapterParameters))
+_WINDOW_PARAMETERS = frozenset(f.name for f in fields(AdapterParameters))
 
 
 def pyod(name: str) -> DetectorSpec:
@@ -23,10 +23,10 @@ def pyod(name: str) -> DetectorSpec:
     if not _present("pyod"):
         return _absent(f"pyod:{name}", summary, "pyod", "oodd-eval[pyod]")
     try:
-        found = pyod_class(name)
+        library_class = pyod_class(name)
     except ModuleNotFoundError as error:
         return _absent(f"pyod:{name}", summary, str(error.name), "")
-    recipe = Recipe(found, f"pyod:{name}", outlier=("decision_function", 1))
+    recipe = Recipe(library_class, f"pyod:{name}", outlier=("decision_function", 1))
     return recipe.spec(summary, f"pyod.{version('pyod')}")
 
 
@@ -35,11 +35,11 @@ def sklearn(name: str) -> DetectorSpec:
     if not _present("sklearn"):
         summary = f"scikit-learn's {name} on a window of observations"
         return _absent(f"sklearn:{name}", summary, "sklearn", "oodd-eval[reference]")
-    name, found = sklearn_class(name)
-    recipe = Recipe(found, f"sklearn:{name}", outlier=("score_samples", -1))
+    name, library_class = sklearn_class(name)
+    recipe = Recipe(library_class, f"sklearn:{name}", outlier=("score_samples", -1))
     if "novelty" in recipe.signature:
         # Without it the class judges its training rows and no others.
-        recipe = Recipe(found, recipe.name, recipe.outlier, {"novelty": True})
+        recipe = Recipe(library_class, recipe.name, recipe.outlier, {"novelty": True})
     summary = f"scikit-learn's {name} on a window of observations"
     return recipe.spec(summary, _sklearn_version())
 
@@ -51,10 +51,10 @@ def forecast(path: str) -> DetectorSpec:
     top = path.partition(".")[0]
     if top == "sklearn" and not _present(top):
         return _absent(name, summary, top, "oodd-eval[reference]")
-    found = forecaster_class(path)
+    library_class = forecaster_class(path)
     # Code of one's own changes without a new version; its digest tells.
     label = _sklearn_version() if top == "sklearn" else f"{top}.{source_digest(top)[:12]}"
-    return Recipe(found, name, outlier=None).spec(summary, label)
+    return Recipe(library_class, name, outlier=None).spec(summary, label)
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Recipe:
 
     Attributes
     ----------
-    found
+    library_class
         The class.
     name
         Of the detector.
@@ -73,7 +73,7 @@ class Recipe:
         Parameters of the class that are not the user's to choose.
     """
 
-    found: type
+    library_class: type
     name: str
     outlier: tuple[str, int] | None
     fixed: Mapping[str, Any] = field(default_factory=dict)
@@ -81,18 +81,18 @@ class Recipe:
     @property
     def signature(self) -> Signature:
         """Return the parameters of the class's constructor."""
-        return Signature.of(self.found)
+        return Signature.of(self.library_class)
 
     def spec(self, summary: str, label: str) -> DetectorSpec:
         """Return the spec; the label says which version of which library does the work."""
         signature = self.signature
-        hidden = {*self.fixed, *_OWN, "random_state"}
+        hidden = {*self.fixed, *_WINDOW_PARAMETERS, "random_state"}
         plain = {n: v for n, v in signature.plain.items() if n not in hidden}
         return DetectorSpec(
             name=self.name,
             factory=self,
             summary=summary,
-            reference=f"{self.found.__module__}.{self.found.__qualname__}",
+            reference=f"{self.library_class.__module__}.{self.library_class.__qualname__}",
             parameters=declared_by(plain, AdapterParameters),
             other_parameters=bool(signature.required or signature.others is None),
             version=label,
@@ -101,18 +101,18 @@ class Recipe:
     def __call__(self, *, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
         """Return an unfitted detector, as the harness asks for it."""
         signature = self.signature
-        own = {n: parameters.pop(n) for n in _OWN & parameters.keys()}
+        window_parameters = {n: parameters.pop(n) for n in _WINDOW_PARAMETERS & parameters.keys()}
         arguments = {**parameters, **self.fixed}
         if "random_state" in signature:
             arguments.setdefault("random_state", seed)
         signature.check(arguments, self.name)
-        make: Callable[[], Any] = lambda: self.found(**arguments)  # noqa: E731
-        given = checked(AdapterParameters, self.name, own)
+        make: Callable[[], Any] = lambda: self.library_class(**arguments)  # noqa: E731
+        windows = checked(AdapterParameters, self.name, window_parameters)
         if self.outlier is None:
-            return ForecastDetector(self.name, make, given, seed=seed, horizon=horizon)
+            return ForecastDetector(self.name, make, windows, seed=seed, horizon=horizon)
         method, sign = self.outlier
         return OutlierDetector(
-            self.name, make, given, seed=seed, horizon=horizon, method=method, sign=sign
+            self.name, make, windows, seed=seed, horizon=horizon, method=method, sign=sign
         )
 
 

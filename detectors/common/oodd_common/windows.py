@@ -60,7 +60,7 @@ def windows(
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _FactoryArguments:
     """Arguments that the harness gives to every factory."""
 
     seed: int = parameter(0, low=0)
@@ -104,7 +104,7 @@ class WindowDetector(ABC):
         lag: int | None = None,
         actions: bool = False,
     ) -> None:
-        checked(_Given, name, {"seed": seed, "horizon": horizon})
+        checked(_FactoryArguments, name, {"seed": seed, "horizon": horizon})
         self.name, self.seed, self.horizon = name, seed, horizon
         self.window, self.lag = window, horizon if lag is None else lag
         self.actions = actions
@@ -170,13 +170,13 @@ class WindowDetector(ABC):
     def _command(self, action: Row | None) -> Row:
         """Return an action as it is, (A,)."""
         width = len(self.action_scale_.mean)
-        found = np.asarray(np.nan if action is None else action, dtype=np.float32)
-        if found.shape != (width,) or not np.isfinite(found).all():
+        command = np.asarray(np.nan if action is None else action, dtype=np.float32)
+        if command.shape != (width,) or not np.isfinite(command).all():
             raise TrajectoryError(
                 f"detector {self.name!r} was given an action {action}, expected {width} finite "
                 "numbers"
             )
-        return found
+        return command
 
     def _widths(self, x: Trajectory) -> tuple[int, int]:
         """Return the numbers of sensors and of action columns that judgements look at."""
@@ -186,10 +186,10 @@ class WindowDetector(ABC):
         """Raise `TrajectoryError` for other numbers of sensors or action columns than in `fit`."""
         sensors = len(self._scale().mean)
         fitted = (sensors, len(self.action_scale_.mean) if self.actions else 0)
-        if (found := self._widths(trajectory)) != fitted:
+        if (widths := self._widths(trajectory)) != fitted:
             raise TrajectoryError(
                 f"detector {self.name!r} was fitted on (sensors, action columns) {fitted} "
-                f"and asked to score a trajectory of {found}: score trajectories of the "
+                f"and asked to score a trajectory of {widths}: score trajectories of the "
                 "environment that it was fitted on"
             )
 

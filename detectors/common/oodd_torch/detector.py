@@ -183,8 +183,8 @@ class NetworkDetector(StorableWindowDetector):
             scale=still,
             longest=max(map(len, held_out)) - 1,
         )
-        found = np.concatenate(forecaster.distances(held_out)).mean(0)
-        residual: NDArray[np.float32] = np.maximum(found, LEAST).astype(np.float32)
+        distances = np.concatenate(forecaster.distances(held_out)).mean(0)
+        residual: NDArray[np.float32] = np.maximum(distances, LEAST).astype(np.float32)
         return residual
 
     def _take(

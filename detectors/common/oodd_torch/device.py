@@ -10,12 +10,12 @@ def resolved_device(detector: str, device: str) -> str:
 
     ``"auto"`` is cuda where there is one. Raises `UsageError` for cuda where there is none.
     """
-    found = torch.cuda.is_available()
-    if device == "cuda" and not found:
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
         raise UsageError(
             f"parameter 'device' of {detector} is 'cuda', expected auto or cpu, since torch finds "
             "no CUDA device here"
         )
     if device == "auto":
-        return "cuda" if found else "cpu"
+        return "cuda" if available else "cpu"
     return device

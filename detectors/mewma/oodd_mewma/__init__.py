@@ -40,10 +40,10 @@ def make_mewma_a(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detec
     return _make("mewma-a", seed, horizon, parameters, actions=True)
 
 
-def _make(name: str, seed: int, horizon: int, given: dict[str, Any], *, actions: bool) -> Detector:
+def _make(name: str, seed: int, horizon: int, values: dict[str, Any], *, actions: bool) -> Detector:
     from oodd_mewma.detector import MewmaDetector  # noqa: PLC0415  keeps the listing quick
 
-    parameters = checked(MewmaParameters, name, given)
+    parameters = checked(MewmaParameters, name, values)
     return MewmaDetector(name, parameters, seed=seed, horizon=horizon, actions=actions)
 
 

@@ -132,7 +132,7 @@ class MewmaDetector(StorableWindowDetector):
         # What scoring will see: residuals of forecasts that were fitted to other trajectories.
         # A single trajectory has no others, and judges itself.
         alone = len(folds) == 1
-        unseen = [(every if alone else every - own).solve(ridge) for own in moments]
+        unseen = [(every if alone else every - m).solve(ridge) for m in moments]
 
         squares, rows = np.zeros(len(self.observation_scale_.mean)), 0
         for fold, coefficients in zip(folds, unseen, strict=True):
@@ -152,8 +152,8 @@ class MewmaDetector(StorableWindowDetector):
         self.whitening_ = self._whitening(total / count)
 
         distances: list[Floats] = []
-        for fold, coefficients, own, n in zip(folds, unseen, sums, counts, strict=True):
-            others = total / count if alone else (total - own) / (count - n)
+        for fold, coefficients, fold_sum, n in zip(folds, unseen, sums, counts, strict=True):
+            others = total / count if alone else (total - fold_sum) / (count - n)
             root = self._whitening(others)
             distances += [_distances(self._smoothed(x, coefficients), root) for x in fold]
         pooled = np.concatenate(distances, axis=1)  # (W, N)

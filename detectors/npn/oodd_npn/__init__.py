@@ -14,13 +14,13 @@ from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.plugins.parameters import checked
 
 
-def npn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def npn(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return an `oodd_torch.detector.NetworkDetector` of networks without quantiles."""
     # torch takes a second to import, and listing detectors should not.
     from oodd_torch.detector import NetworkDetector  # noqa: PLC0415
 
-    given = checked(NetworkParameters, "npn", parameters)
-    return NetworkDetector("npn", given, seed=seed, horizon=horizon, quantiles=False)
+    parameters = checked(NetworkParameters, "npn", values)
+    return NetworkDetector("npn", parameters, seed=seed, horizon=horizon, quantiles=False)
 
 
 @hookimpl

@@ -123,11 +123,11 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         shares = np.full(trajectory.observations.shape, np.nan)
         onsets = np.full(len(trajectory), -1)
         if trajectory.transitions >= self.horizon:
-            found = Onsets(self.charts_)(self.charts_.columns(self._evidence(trajectory)))
-            rows, of_row = np.unique(found, return_inverse=True)
+            first_rows = Onsets(self.charts_)(self.charts_.columns(self._evidence(trajectory)))
+            rows, of_row = np.unique(first_rows, return_inverse=True)
             known, now = self._known(trajectory), trajectory.observations[self.horizon :]
             shares[self.horizon :] = self._shares(known.rows(rows), now[rows])[of_row]
-            onsets[self.horizon :] = found + self.horizon
+            onsets[self.horizon :] = first_rows + self.horizon
         return Explanation(shares, onsets)
 
     def reset(self) -> None:

@@ -97,8 +97,8 @@ class DensityEnsemble:
         hidden = _silu(weights @ x.T + bias)
         for weights, bias in deeper:
             hidden += _silu(weights @ hidden + bias)
-        made, d = out @ hidden + out_bias, self._sensors
-        mean, scale, tail, dependence = np.split(made, [d, 2 * d, 3 * d], axis=1)
+        outputs, d = out @ hidden + out_bias, self._sensors
+        mean, scale, tail, dependence = np.split(outputs, [d, 2 * d, 3 * d], axis=1)
         scale = np.exp(np.maximum(LOG_SCALE * np.tanh(scale / LOG_SCALE), self._floor))
         residual = y.T - mean
         known = dependence * residual[:, self._column]

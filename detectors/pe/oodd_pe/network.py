@@ -142,8 +142,8 @@ class DensityNetworks(torch.nn.Module):
         step = -(-len(x) // SURVEYED)
         x, y = x[::step], y[::step]
         parts = zip(torch.split(x, CHUNK), torch.split(y, CHUNK), strict=True)
-        found = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
-        scales = torch.cat(found, dim=1).cpu().numpy()
+        log_scales = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
+        scales = torch.cat(log_scales, dim=1).cpu().numpy()
         least = round(LEAST_SCALES * scales.shape[1])
         lowest = np.partition(scales, least, axis=1)[:, least : least + 1]
         return torch.from_numpy(lowest).to(x.device)

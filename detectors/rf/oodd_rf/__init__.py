@@ -28,20 +28,20 @@ class SmoothedForestParameters(ForestParameters):
     )
 
 
-def make_rf(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def make_rf(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return an unfitted `RandomForestDetector`."""
     from oodd_rf.detector import RandomForestDetector  # noqa: PLC0415  keeps the listing quick
 
-    given = checked(ForestParameters, "rf", parameters)
-    return RandomForestDetector("rf", given, seed=seed, horizon=horizon)
+    parameters = checked(ForestParameters, "rf", values)
+    return RandomForestDetector("rf", parameters, seed=seed, horizon=horizon)
 
 
-def make_rf_ewma(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def make_rf_ewma(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return an unfitted `SmoothedForestDetector`."""
     from oodd_rf.smoothed import SmoothedForestDetector  # noqa: PLC0415  keeps the listing quick
 
-    given = checked(SmoothedForestParameters, "rf-ewma", parameters)
-    return SmoothedForestDetector("rf-ewma", given, seed=seed, horizon=horizon)
+    parameters = checked(SmoothedForestParameters, "rf-ewma", values)
+    return SmoothedForestDetector("rf-ewma", parameters, seed=seed, horizon=horizon)
 
 
 @hookimpl

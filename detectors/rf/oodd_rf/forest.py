@@ -109,8 +109,8 @@ def _tree(nodes: Arrays, values: Floats, depth: int, inputs: int) -> Tree:
     from sklearn.tree._tree import Tree  # noqa: PLC0415  an optional extra
 
     left, right, feature = nodes["left_child"], nodes["right_child"], nodes["feature"]
-    own, count, leaf = np.arange(len(left)), len(left), left < 0
-    follows = (left > own) & (right > own) & (left < count) & (right < count)
+    indices, count, leaf = np.arange(len(left)), len(left), left < 0
+    follows = (left > indices) & (right > indices) & (left < count) & (right < count)
     splits = (feature >= 0) & (feature < inputs)
     if not (follows & splits)[~leaf].all() or (right[leaf] >= 0).any() or not leaf[-1]:
         raise FittedStateError(

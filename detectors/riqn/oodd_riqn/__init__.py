@@ -35,30 +35,36 @@ def riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
     return _make("riqn", checked(RiqnParameters, "riqn", parameters), seed, horizon)
 
 
-def riqn_ms(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def riqn_ms(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return the same with mean sampling: rollouts are fed the mean of M samples."""
-    given = checked(RiqnParameters, "riqn-ms", parameters)
-    return _make("riqn-ms", given, seed, horizon, mean_sampling=True)
+    parameters = checked(RiqnParameters, "riqn-ms", values)
+    return _make("riqn-ms", parameters, seed, horizon, mean_sampling=True)
 
 
-def riqn_r(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def riqn_r(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return `riqn` with another score: the median forecast, and sensors in nominal distances."""
-    given = checked(RiqnParameters, "riqn-r", parameters)
-    return _make("riqn-r", given, seed, horizon, residual_units=True)
+    parameters = checked(RiqnParameters, "riqn-r", values)
+    return _make("riqn-r", parameters, seed, horizon, residual_units=True)
 
 
-def n_riqn(*, seed: int = 0, horizon: int = 1, **parameters: Any) -> Detector:
+def n_riqn(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     """Return the same without memory: a window of observations instead of the GRU."""
-    given = checked(WindowRiqnParameters, "n-riqn", parameters)
-    return _make("n-riqn", given, seed, horizon, window=given.window, recurrent=False)
+    parameters = checked(WindowRiqnParameters, "n-riqn", values)
+    return _make("n-riqn", parameters, seed, horizon, window=parameters.window, recurrent=False)
 
 
-def _make(name: str, given: RiqnParameters, seed: int, horizon: int, **kind: Any) -> Detector:
+def _make(name: str, parameters: RiqnParameters, seed: int, horizon: int, **kind: Any) -> Detector:
     # torch takes a second to import, and listing detectors should not.
     from oodd_torch.detector import NetworkDetector  # noqa: PLC0415
 
     return NetworkDetector(
-        name, given, seed=seed, horizon=horizon, samples=given.samples, levels=given.levels, **kind
+        name,
+        parameters,
+        seed=seed,
+        horizon=horizon,
+        samples=parameters.samples,
+        levels=parameters.levels,
+        **kind,
     )
 
 

@@ -1,16 +1,13 @@
-"""Checks that a detector honours the contract. `oodd_eval.testing` is their public face."""
+"""Tests that a detector honours the contract, in pytest, and what they came to.
+
+Modules ``test_*.py`` of this package hold the tests; `oodd_eval.testing` is their public face.
+"""
 
 import textwrap
-import time
-import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
-
-from oodd_eval.plugins.conformance import checks_consistency, checks_contract, checks_process
-from oodd_eval.plugins.conformance.trial import CheckFailedError, CheckSkipped, Factory, Trial
-from oodd_eval.plugins.discovery import printable
+from typing import Final
 
 STATUSES: Final = {
     "passed": "passed",
@@ -28,9 +25,18 @@ _COLUMNS: Final = 80
 class Result:
     """Result of one check.
 
-    The status is ``"passed"``, ``"failed"``, ``"skipped"``, ``"xfailed"`` or ``"xpassed"``; the
-    message says why; the detail is where a failing detector raised, or the end of what it printed
-    before it crashed. The first check that needs the shared fit has it in its seconds.
+    Attributes
+    ----------
+    name
+        The check's.
+    status
+        ``"passed"``, ``"failed"``, ``"skipped"``, ``"xfailed"`` or ``"xpassed"``.
+    message
+        Why it is so; empty for a check that passed.
+    seconds
+        What the check took. The first one that needs the shared fit has it in its seconds.
+    detail
+        Where a failing detector raised, or the end of what it printed before it crashed.
     """
 
     name: str
@@ -44,10 +50,20 @@ class Result:
         """True if it is as expected."""
         return self.status not in {"failed", "xpassed"}
 
+    def expected(self, failures: Mapping[str, str]) -> "Result":
+        """Return what the result is where failures are expected: their reasons, by name."""
+        reason = failures.get(self.name)
+        if reason is not None and self.status == "failed":
+            return replace(self, status="xfailed", message=f"{reason} [{self.message}]")
+        if reason is not None and self.status == "passed":
+            message = f"expected to fail ({reason}): take it from the expected failures"
+            return replace(self, status="xpassed", message=message)
+        return self
+
     def line(self, width: int = 0) -> str:
         """Return status, name and message: in one line, or below where there is no room for it."""
-        shown = self.status if self.ok else self.status.upper()
-        start = f"{shown:<8} {self.name:<{width}}"
+        status = self.status if self.ok else self.status.upper()
+        start = f"{status:<8} {self.name:<{width}}"
         if len(start) + 2 + len(self.message) <= _COLUMNS:
             return f"{start}  {self.message}".rstrip()
         below = textwrap.wrap(self.message, _COLUMNS - 9, break_on_hyphens=False)
@@ -81,69 +97,3 @@ class Report:
     def __str__(self) -> str:
         width = max((len(result.name) for result in self.results), default=0)
         return "\n".join([*(result.line(width) for result in self.results), self.summary()])
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One named check; the summary says what holds when it passes."""
-
-    name: str
-    summary: str
-    function: Callable[[Trial], None]
-
-    def __call__(self, detector: Factory | Trial, **arguments: Any) -> None:
-        """Return if the detector passes; raise `CheckFailedError` or `CheckSkipped` if not.
-
-        It is given as what `Trial` takes, or as a `Trial`. The next check of the same shares the
-        fit.
-        """
-        if isinstance(detector, Trial):
-            return detector.carry_out(self.function)
-        if not _latest or _latest[0] != (detector, arguments):
-            _latest[:] = [(detector, arguments), Trial(detector, **arguments)]
-        return self(_latest[1])
-
-    def __str__(self) -> str:
-        """Return the name: the ids of parametrized tests."""
-        return self.name
-
-
-_latest: list[Any] = []  # arguments and trial of the last check of a factory
-
-CHECKS: Final = {
-    (name := function.__name__.removeprefix("check_").replace("_", "-")): Check(
-        name, (function.__doc__ or "").removesuffix("."), function
-    )
-    for module in (checks_contract, checks_consistency, checks_process)
-    for function in vars(module).values()
-    if getattr(function, "__name__", "").startswith("check_")
-}
-"""The checks by name, in the order in which they are carried out; a docstring says what holds."""
-
-
-def carry_out(trial: Trial, checks: Iterable[str]) -> Iterator[Result]:
-    """Carry out the named checks of one detector, each when its result is asked for."""
-    for name in checks:
-        start = time.perf_counter()
-        status, message, detail = "passed", "", ""
-        try:
-            CHECKS[name](trial)
-        except CheckFailedError as error:
-            status, message = "failed", printable(str(error))
-            if error.__cause__:
-                lines = "".join(traceback.format_exception(error.__cause__)).splitlines()
-                detail = "\n".join(printable(line) for line in lines)
-        except CheckSkipped as skip:
-            status, message = "skipped", str(skip)
-        yield Result(name, status, message, time.perf_counter() - start, detail)
-
-
-def expected(result: Result, expected_failures: Mapping[str, str]) -> Result:
-    """Return the result in the light of the failures that are expected, by name, with reasons."""
-    reason = expected_failures.get(result.name)
-    if reason is not None and result.status == "failed":
-        return replace(result, status="xfailed", message=f"{reason} [{result.message}]")
-    if reason is not None and result.status == "passed":
-        message = f"expected to fail ({reason}): take it from the expected failures"
-        return replace(result, status="xpassed", message=message)
-    return result

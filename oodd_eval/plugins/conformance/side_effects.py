@@ -16,10 +16,8 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event
 from typing import IO, Any, Final
 from unittest.mock import patch
 
@@ -27,14 +25,13 @@ import numpy as np
 import psutil
 
 from oodd_eval.data.files import redirected
+from oodd_eval.plugins.isolation.worker import peak_rss_mb
 
 _THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
 
 # Set before code is watched, so that setting the usual value is seen as well.
 _UNUSUAL_THREADS: Final = 3
 _UNUSUAL_SEED: Final = 0x0DD
-
-_SAMPLE_SECONDS: Final = 0.005
 
 _CALLS: Final = "connect getaddrinfo gethostbyaddr gethostbyname sendmsg sendto"
 _NETWORK: Final = frozenset(f"socket.{call}" for call in _CALLS.split())
@@ -132,17 +129,16 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
         settings_before = {**settings_before, "working directory": str(Path.cwd())}
         printed = stack.enter_context(_captured())
         caught = stack.enter_context(warnings.catch_warnings(record=True, action="always"))
-        start, memory, end = time.perf_counter(), psutil.Process().memory_info().rss, Event()
-        with auditing(seen), ThreadPoolExecutor() as pool:
-            peak = pool.submit(_peak_memory, end)
+        with contextlib.suppress(OSError):  # Linux then forgets the peak so far.
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        start, memory = time.perf_counter(), peak_rss_mb()
+        with auditing(seen):
             try:
                 work()
             except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
                 seen.error = error
-            finally:
-                end.set()
         seen.seconds = time.perf_counter() - start
-        seen.megabytes = (peak.result() - memory) / 1e6
+        seen.megabytes = peak_rss_mb() - memory
         seen.random = [name for name, state in _generators().items() if generators[name] != state]
         seen.threads = _changes(threads, _thread_settings())
         seen.settings = _changes(settings_before, settings())
@@ -168,7 +164,7 @@ def settings() -> dict[str, str]:
     directory = "removed"
     with contextlib.suppress(FileNotFoundError):
         directory = str(Path.cwd())
-    found: dict[str, object] = {
+    values: dict[str, object] = {
         "numpy error handling": np.geterr(),
         "numpy print options": np.get_printoptions(),
         "recursion limit": sys.getrecursionlimit(),
@@ -180,7 +176,7 @@ def settings() -> dict[str, str]:
         "torch gradients enabled": torch.is_grad_enabled() if torch else True,
         "torch deterministic algorithms": deterministic,
     }
-    return {name: str(value) for name, value in found.items()}
+    return {name: str(value) for name, value in values.items()}
 
 
 def outside(written: Iterable[str], here: Path) -> list[str]:
@@ -194,7 +190,7 @@ def outside(written: Iterable[str], here: Path) -> list[str]:
         str(path.relative_to(here) if path.is_relative_to(here) else path)
         for path in map(Path, dict.fromkeys(written))
         if "__pycache__" not in path.parts
-        and not any(path.is_relative_to(place) for place in allowed)
+        and not any(path.is_relative_to(directory) for directory in allowed)
         and not (path.is_relative_to(tempfile.gettempdir()) and not path.exists())
     ]
 
@@ -216,8 +212,8 @@ def seeded_generators(seed: int) -> Iterator[None]:
 @contextlib.contextmanager
 def _set_apart(here: Path) -> Iterator[None]:
     """Work in empty directories, with unusual generators and thread settings; then put all back."""
-    for place in (work := here / "work", temporary := here / "temporary"):
-        place.mkdir()
+    for directory in (work := here / "work", temporary := here / "temporary"):
+        directory.mkdir()
     variables = dict.fromkeys(_THREAD_VARIABLES, str(_UNUSUAL_THREADS))
     with (
         seeded_generators(_UNUSUAL_SEED),
@@ -235,17 +231,17 @@ def _set_apart(here: Path) -> Iterator[None]:
 def _generators() -> dict[str, object]:
     kind, words, *rest = np.random.get_state()  # noqa: NPY002
     numpy_state = kind, np.asarray(words).tobytes(), rest
-    found: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
+    states: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
     if torch := sys.modules.get("torch"):
-        found["torch"] = torch.get_rng_state().numpy().tobytes()
-    return found
+        states["torch"] = torch.get_rng_state().numpy().tobytes()
+    return states
 
 
 def _thread_settings() -> dict[str, str]:
-    found = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
+    values = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
     if torch := sys.modules.get("torch"):
-        found["torch.get_num_threads()"] = str(torch.get_num_threads())
-    return found
+        values["torch.get_num_threads()"] = str(torch.get_num_threads())
+    return values
 
 
 def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
@@ -265,18 +261,9 @@ def _captured() -> Iterator[IO[str]]:
         yield file
 
 
-def _peak_memory(end: Event) -> int:
-    """Return the largest resident memory of this process until the end."""
-    process, peak, done = psutil.Process(), 0, False
-    while not done:
-        done = end.wait(_SAMPLE_SECONDS)
-        peak = max(peak, process.memory_info().rss)
-    return peak
-
-
 def _running() -> set[tuple[int, str]]:
     """Return the further threads and the children of this process: id and name."""
-    found = {
+    running = {
         (thread.ident or 0, f"{DAEMON if thread.daemon else 'thread'} {thread.name}")
         for thread in threading.enumerate()
         if thread is not threading.main_thread()
@@ -284,5 +271,5 @@ def _running() -> set[tuple[int, str]]:
     for child in psutil.Process().children():
         with contextlib.suppress(psutil.NoSuchProcess):
             if child.status() != psutil.STATUS_ZOMBIE:
-                found.add((child.pid, f"process {child.pid} ({child.name()})"))
-    return found
+                running.add((child.pid, f"process {child.pid} ({child.name()})"))
+    return running

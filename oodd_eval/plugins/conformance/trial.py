@@ -3,19 +3,22 @@
 Checks that only score share one fitted detector, because fits take the time. A check that needs
 what another one is about (a factory that works, a fit, the shape of scores) is skipped without it
 and names the other one, so that one fault is told once.
+
+The fixture `trial` hands it to the tests; it needs a fixture `detector`, with what `Trial` takes.
+
+PYTEST_DONT_REWRITE: messages are whole sentences.
 """
 
 import contextlib
 import functools
-import unittest
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import pytest
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, settings, watch
 from oodd_eval.plugins.contract import (
@@ -35,12 +38,8 @@ ROWS: Final = 80  # observations of an episode, beyond the horizon
 Factory = Callable[..., Detector] | DetectorSpec  # a factory, or what a plug-in offers
 
 
-class CheckFailedError(ContractError, AssertionError):
-    """A detector does not behave as the contract asks; the message says in which way."""
-
-
-class CheckSkipped(unittest.SkipTest):
-    """A check does not apply, or cannot be carried out; pytest reports it as a skip."""
+class RaisedError(AssertionError):
+    """A detector raised; the message says what it was doing, and where."""
 
 
 class Trial:
@@ -72,11 +71,11 @@ class Trial:
         self.events = Events()  # of all checks so far
         self._settings_before = settings()
 
-    def carry_out(self, check: "Callable[[Trial], None]") -> None:
-        """Carry out a check; warnings are the matter of the check of that name alone."""
-        with warnings.catch_warnings(), auditing(self.events), doing("the detector"):
-            warnings.simplefilter("ignore")
-            check(self)
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[None]:
+        """Watch a check; warnings are the matter of the check of that name alone."""
+        with warnings.catch_warnings(action="ignore"), auditing(self.events):
+            yield
 
     def make(self, **changes: Any) -> Detector:
         """Return a new unfitted detector; `changes` replace seed, horizon or parameters."""
@@ -85,18 +84,18 @@ class Trial:
         with doing(f"the factory, called with {called},"):
             detector = self.spec.factory(**arguments)
         for method in ("fit", "score"):
-            if not callable(getattr(detector, method, None)):
-                wrong = f"{type(detector).__name__} without a method {method}"
-                expected = "expected an object with fit(nominal) and score(trajectory)"
-                raise CheckFailedError(f"the factory returned {wrong}: {expected}")
+            assert callable(getattr(detector, method, None)), (
+                f"the factory returned {type(detector).__name__} without a method {method}: "
+                "expected an object with fit(nominal) and score(trajectory)"
+            )
         return detector
 
     def unfitted(self) -> Detector:
         """Return a new unfitted detector, for checks that are about something else."""
         try:
             return self.make()
-        except CheckFailedError:
-            raise CheckSkipped("needs a detector: see check 'factory'") from None
+        except AssertionError:
+            pytest.skip("needs a detector: see check 'factory'")
 
     def fit(self, nominal: Sequence[Trajectory] | None = None, **changes: Any) -> Detector:
         """Return a detector of its own, fitted on the training trajectories or the given ones."""
@@ -107,20 +106,20 @@ class Trial:
         return detector
 
     @functools.cached_property
-    def first_fit(self) -> Detector | CheckFailedError:
+    def first_fit(self) -> Detector | AssertionError:
         """The fitted detector that checks share, or why it cannot be fitted or cannot score."""
         self.unfitted()
         try:
             detector = self.fit()
             with doing("score"):
                 detector.score(self.nominal(1)[0])
-        except CheckFailedError as error:
+        except AssertionError as error:
             return error
         return detector
 
     def needs_actions(self) -> bool:
         """Tell whether a detector that declares observations works with actions only."""
-        if self.actions or not isinstance(self.first_fit, CheckFailedError):
+        if self.actions or not isinstance(self.first_fit, AssertionError):
             return False
         self.actions = True
         try:
@@ -133,8 +132,8 @@ class Trial:
 
     def fitted(self) -> Detector:
         """Return the shared fitted detector, for checks about something else: only to score."""
-        if isinstance(self.first_fit, CheckFailedError):
-            raise CheckSkipped("needs a fitted detector: see check 'fits'")
+        if isinstance(self.first_fit, AssertionError):
+            pytest.skip("needs a fitted detector: see check 'fits'")
         return self.first_fit
 
     def scores(self, trajectory: Trajectory, detector: Detector | None = None) -> Scores:
@@ -145,14 +144,14 @@ class Trial:
     def must_agree(self, detector: Detector, what: str, advice: str = "", n: int = 2) -> None:
         """Fail when a detector does not give `n` trajectories the scores of the shared one."""
         for x in self.nominal(n):
-            must_equal(self.scores(x, detector), self.scores(x), what, advice)
+            assert_equal(self.scores(x, detector), self.scores(x), what, advice)
 
     def learns_nothing(self) -> bool:
         """Tell whether a detector scores without a fit as it does after it."""
         trajectory = self.nominal(1)[0]
         try:
             before = self.scores(trajectory, self.unfitted())
-        except Exception:  # noqa: BLE001  whatever it is: without a fit it does not score
+        except (Exception, pytest.skip.Exception):  # noqa: BLE001  whatever it is: without a fit it does not score
             return False
         return np.array_equal(before, self.scores(trajectory), equal_nan=True)
 
@@ -224,36 +223,48 @@ def doing(what: str) -> Iterator[None]:
     """Turn whatever a detector raises into a failure that says what it was doing, and where."""
     try:
         yield
-    except (CheckFailedError, CheckSkipped):
+    except RaisedError:
         raise
     except (Exception, SystemExit) as error:
         raised = "" if isinstance(error, SystemExit) else "raised "
-        raise CheckFailedError(f"{what} {raised}{reason_of(error)}") from error
+        raise RaisedError(f"{what} {raised}{reason_of(error)}") from error
 
 
 def as_scores(returned: object, trajectory: Trajectory) -> Scores:
     """Return scores as float64; skip when their form, which another check is about, is wrong."""
     if not isinstance(returned, np.ndarray) or returned.shape != (len(trajectory),):
-        raise CheckSkipped("needs one score per observation: see checks 'shape' and 'dtype'")
+        pytest.skip("needs one score per observation: see checks 'shape' and 'dtype'")
     try:
         return returned.astype(np.float64)
     except (TypeError, ValueError):
-        raise CheckSkipped("needs scores that are numbers: see check 'dtype'") from None
+        pytest.skip("needs scores that are numbers: see check 'dtype'")
 
 
-def must_equal(
-    found: Scores, wanted: Scores, what: str, advice: str = "", tolerance: float = 0.0
+def assert_equal(
+    scores: Scores, expected: Scores, what: str, advice: str = "", tolerance: float = 0.0
 ) -> None:
     """Fail when scores differ, with the first difference between `what` and `advice`."""
-    if wrong := difference(found, wanted, tolerance):
-        raise CheckFailedError(f"{what}: {wrong}" + (f"; {advice}" if advice else ""))
+    problem = difference(scores, expected, tolerance)
+    assert not problem, f"{what}: {problem}" + (f"; {advice}" if advice else "")
 
 
 def offered(detector: Detector, first: str, second: str) -> Any:
     """Return a detector that has both of two optional methods; skip the check if it has none."""
     has = [callable(getattr(detector, name, None)) for name in (first, second)]
     if not any(has):
-        raise CheckSkipped(f"has no {first} and {second}")
-    if not all(has):
-        raise CheckFailedError(f"has only one of {first} and {second}: expected both, or none")
+        pytest.skip(f"has no {first} and {second}")
+    assert all(has), f"has only one of {first} and {second}: expected both, or none"
     return detector
+
+
+@pytest.fixture(scope="module")
+def shared_trial(detector: Factory | Trial) -> Trial:
+    """Return what the tests of a module share."""
+    return detector if isinstance(detector, Trial) else Trial(detector)
+
+
+@pytest.fixture
+def trial(shared_trial: Trial) -> Iterator[Trial]:
+    """Yield what the tests share, watched while one of them runs."""
+    with shared_trial.watched():
+        yield shared_trial

@@ -1,8 +1,8 @@
 """Detectors in processes of their own, with limits: a failing one is a status, never a crash.
 
-Harness and workers exchange JSON and arrays over pipes, nothing executable. A frame is an
-8-byte little-endian length and that many bytes: UTF-8 JSON, or an array as `numpy.save` writes it
-with pickling refused. The messages before say which of the two comes next.
+Harness and workers exchange JSON and arrays over a socket, nothing executable: frames of
+`multiprocessing.connection`, each UTF-8 JSON, or an array as `numpy.save` writes it with pickling
+refused. The messages before say which of the two comes next.
 """
 
 import io
@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from typing import Any, Final
 
 import numpy as np
@@ -22,39 +23,48 @@ from oodd_eval.data.bounded import npy_header
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
 
+MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
+
+LONGEST_FRAME: Final = 2**31  # bytes; a larger length was not written by a channel
+LONGEST_MESSAGE: Final = 2**24  # bytes of JSON
+LOG_BYTES: Final = 64_000  # of what is printed, the last ones are kept
+CHUNK: Final = 64  # trajectories that a worker scores at once
+PROCESSES: Final = 256  # at most, in a sandbox
+SCORED: Final = 93  # exit code of a process that has scored its group, and of no other
+
+# Of an array that a worker sends for a trajectory, at most so many bytes for each row are read:
+# twice those of float64 scores, so that a wrong type can still be told by its name.
+ROW_BYTES: Final = 16
+
+POLL_SECONDS: Final = 0.05  # between two looks at a process
+LOOK_SECONDS: Final = 0.5  # between two looks at all that it has started, which take longer
+END_POLL_SECONDS: Final = 0.005
+HUNT_SECONDS: Final = 5.0  # for which marked processes are hunted, should they multiply
+CLOSED_SECONDS: Final = 5.0  # for which a worker that has closed its channel may take to end
+FIT_END_SECONDS: Final = 1.0  # that threads and processes of a fit have to end
+
 
 class ChannelClosedError(OoddError, EOFError):
     """The other side ended before the message was complete."""
 
 
 class ChannelGarbledError(OoddError, ValueError):
-    """Bytes that are no message: the detector wrote into the pipe."""
-
-
-MARK: Final = "OODD_EVAL_PROCESS"  # a value that only a process and all that it starts share
-_PATIENCE: Final = 5.0  # seconds for which marked processes are hunted, should they multiply
-END_POLL_SECONDS: Final = 0.005
-
-LONGEST_FRAME: Final = 2**31  # bytes; a larger length was not written by a channel
-LONGEST_MESSAGE: Final = 2**24  # bytes of JSON
-
-# Of an array that a worker sends for a trajectory, at most so many bytes for each row are read:
-# twice those of float64 scores, so that a wrong type can still be told by its name.
-ROW_BYTES: Final = 16
+    """Bytes that are no message: the detector wrote into the channel."""
 
 
 class Channel:
-    """A conversation over two file descriptors; -1 for the one of a direction that is not used.
+    """A conversation over a socket, which it closes.
 
-    `wait` is called before every read, and may raise to give up; by default reads block.
+    `check` is called after every frame that was read, and may raise to give up.
     """
 
-    def __init__(self, reading: int, writing: int, wait: Callable[[], None] = lambda: None) -> None:
-        self._reading, self._writing, self._wait = reading, writing, wait
+    def __init__(self, descriptor: int, check: Callable[[], None] = lambda: None) -> None:
+        self._connection, self._check = Connection(descriptor), check
+        self.close = self._connection.close
 
     def send(self, message: dict[str, Any]) -> None:
         """Send a JSON object. Values JSON does not know are sent as their text."""
-        self._send_frame(json.dumps(message, default=repr).encode())
+        self._connection.send_bytes(json.dumps(message, default=repr).encode())
 
     def receive(self) -> dict[str, Any]:
         """Receive a JSON object; `ChannelGarbledError` when something else comes."""
@@ -70,7 +80,7 @@ class Channel:
         """Send an array that holds no Python objects."""
         buffer = io.BytesIO()
         np.save(buffer, array, allow_pickle=False)
-        self._send_frame(buffer.getbuffer())
+        self._connection.send_bytes(buffer.getbuffer())
 
     def receive_array(self, most: int = LONGEST_FRAME) -> NDArray[Any]:
         """Receive an array of at most so many bytes, header included; raise as `receive` does."""
@@ -90,27 +100,16 @@ class Channel:
         observations = self.receive_array()
         return Trajectory(observations, self.receive_array())
 
-    def _send_frame(self, payload: bytes | memoryview) -> None:
-        for part in (len(payload).to_bytes(8, "little"), payload):
-            rest = memoryview(part)
-            while rest:
-                rest = rest[os.write(self._writing, rest) :]
-
     def _receive_frame(self, most: int) -> bytes:
-        length = int.from_bytes(self._receive_bytes(8), "little")
-        if length > most:
-            raise ChannelGarbledError(f"a message of {length} bytes was announced over the pipe")
-        return self._receive_bytes(length)
-
-    def _receive_bytes(self, n: int) -> bytes:
-        parts = bytearray()
-        while len(parts) < n:
-            self._wait()
-            part = os.read(self._reading, min(n - len(parts), 1 << 20))
-            if not part:
-                raise ChannelClosedError(f"the other side ended after {len(parts)} of {n} bytes")
-            parts += part
-        return bytes(parts)
+        try:
+            frame = self._connection.recv_bytes(most)
+        except (EOFError, OSError) as error:
+            self._check()
+            if isinstance(error, EOFError) or self._connection.readable:
+                raise ChannelClosedError(f"the other side ended: {error}") from None
+            raise ChannelGarbledError(f"a message over the pipe is too long: {error}") from None
+        self._check()
+        return frame
 
 
 def _read_array(content: bytes) -> NDArray[Any]:
@@ -132,7 +131,7 @@ def end_all(pid: int, mark: str) -> None:
     for kill in (os.killpg, os.kill):
         with suppress(ProcessLookupError, PermissionError):
             kill(pid, signal.SIGKILL)
-    deadline = time.monotonic() + _PATIENCE
+    deadline = time.monotonic() + HUNT_SECONDS
     strays, clean = [*strays, *_marked(mark)], 1
     # A process whose parent ended during one search is found by the next one.
     while (strays or clean < 2) and time.monotonic() < deadline:

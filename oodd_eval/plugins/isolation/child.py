@@ -9,13 +9,13 @@ import contextlib
 import math
 import os
 import secrets
-import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,12 +23,17 @@ from typing import Final
 import psutil
 
 from oodd_eval.errors import OoddError
-from oodd_eval.plugins.isolation import END_POLL_SECONDS, MARK, Channel, ChannelClosedError, end_all
-from oodd_eval.plugins.isolation.sandbox import PROCESSES, Sandbox
-
-LOG_BYTES: Final = 64_000
-POLL_SECONDS: Final = 0.05  # between two looks at a child that is silent
-LOOK_SECONDS: Final = 0.5  # between two looks at all processes of a sandbox, which take longer
+from oodd_eval.plugins.isolation import (
+    END_POLL_SECONDS,
+    LOG_BYTES,
+    LOOK_SECONDS,
+    MARK,
+    POLL_SECONDS,
+    PROCESSES,
+    Channel,
+    end_all,
+)
+from oodd_eval.plugins.isolation.sandbox import Sandbox
 
 _SINGLE_THREAD: Final = (
     "OMP_NUM_THREADS",
@@ -57,54 +62,56 @@ Stop = Callable[[], bool]  # tells whether the work is to end, such as `threadin
 
 
 class GivenUpError(OoddError, RuntimeError):
-    """A process has to end: the status and reason of its cell, and what is told of the process."""
+    """A process has to end: the status and reason of its cell, and how the process ended."""
 
-    def __init__(self, status: str, reason: str, told: str = "") -> None:
+    def __init__(self, status: str, reason: str, ending: str = "") -> None:
         super().__init__(reason)
-        self.status, self.reason, self.told = status, reason, told
+        self.status, self.reason, self.ending = status, reason, ending
 
 
 class Child:
-    """A module run as ``python -m MODULE READ_FD WRITE_FD LIFELINE_FD``, within limits.
+    """A module run as ``python -m MODULE CHANNEL_FD LIFELINE_FD``, within limits.
 
     It has no standard input, the import path of this process, one thread for numerical libraries,
     and none of the variables that steer the harness. The system closes the lifeline when this
-    process is killed: see `oodd_eval.plugins.isolation.worker.connect`. `sending` is the descriptor
-    to write to it, for the caller to close; `channel` gives up with `GivenUpError` at a limit.
-    In a sandbox, the limit of memory is for all its processes together.
+    process is killed: see `oodd_eval.plugins.isolation.worker.connect`. A thread keeps the limits;
+    the limit of memory is for the process with all that it has started. After a limit was passed,
+    or the process has ended, what was sent can still be read, and `channel` then raises.
     """
 
     def __init__(
         self, module: str, limits: Limits, stop: Stop | None = None, box: Sandbox | None = None
     ) -> None:
-        reading, self.sending = os.pipe()
-        self._receiving, writing = os.pipe()
+        self._socket, remote = socket.socketpair()
         lifeline, self._held = os.pipe()
-        descriptors: tuple[int, ...] = (reading, writing, lifeline)
+        descriptors = [remote.detach(), lifeline]
         self._mark, self._box, self._looked = secrets.token_hex(8), box, -math.inf
         command = [sys.executable, "-P", "-m", module, *map(str, descriptors)]
         environment = {**_environment(box), MARK: self._mark}
         if box:
-            command, more = box.command(command)
-            descriptors = (*descriptors, more)
+            command, arguments = box.command(command)
+            descriptors.append(arguments)
         self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            pass_fds=descriptors,
+            pass_fds=tuple(descriptors),
             env=environment,
             start_new_session=True,
         )
         for descriptor in descriptors:
             os.close(descriptor)
-        self.channel = Channel(self._receiving, self.sending, self._wait)
-        self._limits, self._stop, self.forked = limits, stop, True
-        self._seen = self._scoring = psutil.Process(self._process.pid)
+        self.channel = Channel(os.dup(self._socket.fileno()), self._check)
+        self._limits, self._stop = limits, stop
+        self._verdict: GivenUpError | None = None
+        self._seen = psutil.Process(self._process.pid)
         self._printed, self.peak, self._killed = b"", 0, _killed_for_memory()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
         self.start_clock()
+        self._ended = threading.Event()
+        self._threads = [threading.Thread(target=f, daemon=True) for f in (self._read, self._watch)]
+        for thread in self._threads:
+            thread.start()
 
     def start_clock(self) -> None:
         """Count the seconds of the limit from now on."""
@@ -114,18 +121,6 @@ class Child:
     def elapsed(self) -> float:
         """Seconds of the limit that are used up."""
         return time.monotonic() - self._start
-
-    def watch(self, pid: int, *, forked: bool) -> None:
-        """Hold a process of it to the limit of memory, too; `ValueError` when it is none of its."""
-        if self._box:  # Its numbers mean nothing out here, and all its processes are watched.
-            self.forked = forked
-            return
-        with contextlib.suppress(psutil.NoSuchProcess):  # It may have ended by now.
-            process = psutil.Process(pid)
-            if process.ppid() == self._process.pid:
-                self._scoring, self.forked = process, forked
-            elif process.is_running():  # While one is reaped, Linux says that its parent is 0.
-                raise ValueError(pid)
 
     @property
     def exited(self) -> bool:
@@ -144,17 +139,29 @@ class Child:
             time.sleep(END_POLL_SECONDS)
         return True
 
+    def hang_up(self) -> None:
+        """Send nothing more: the process reads what was sent, and then the end."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_WR)
+
     def end(self) -> str:
         """Kill it with all that it has started, and return the end of what was printed."""
+        self._ended.set()
         end_all(self._process.pid, self._mark)
         self.returncode = self._process.wait()
         if self._box and self.returncode > 128:  # So bubblewrap tells of a signal.
             self.returncode = 128 - self.returncode
-        # A process that escaped could hold the pipe open for ever: do not wait for it.
-        self._reader.join(timeout=1.0)
-        os.close(self._receiving)
+        # A process that escaped could hold socket and output open for ever: do not wait for it.
+        self.hang_up()
+        for thread in self._threads:
+            thread.join(timeout=1.0)
         os.close(self._held)
         return self._printed.decode(errors="replace")
+
+    def close(self) -> None:
+        """Close the channel, once nothing is sent any more."""
+        self.channel.close()
+        self._socket.close()
 
     def _read(self) -> None:
         """Read what is printed, and keep the end of it."""
@@ -162,6 +169,17 @@ class Child:
             with self._process.stdout as pipe:
                 while part := os.read(pipe.fileno(), 1 << 16):
                     self._printed = (self._printed + part)[-LOG_BYTES:]
+
+    def _watch(self) -> None:
+        """Close the channel when a limit is passed, or when the process has ended.
+
+        A process that it has started may hold the channel open, or send half a frame.
+        """
+        with contextlib.suppress(GivenUpError):
+            while not self._ended.wait(POLL_SECONDS) and not self.exited:
+                self._check()
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RD)
 
     def death(self) -> str:
         """Say how it ended, after `end`."""
@@ -174,71 +192,53 @@ class Child:
         """Tell whether it was killed while the system killed processes for want of memory."""
         return self.returncode == -signal.SIGKILL and _killed_for_memory() > self._killed
 
-    def _wait(self) -> None:
-        """Wait for the next bytes, and give up when a limit is passed."""
-        while not self._ready(POLL_SECONDS):
-            self._check()
-            if self.exited:
-                # A grandchild may hold the pipe open, so that its end would never come.
-                if not self._ready(0):
-                    raise ChannelClosedError("the process ended")
-                return
-        self._check()
-
-    def _ready(self, seconds: float) -> bool:
-        return bool(select.select([self._receiving], [], [], seconds)[0])
-
     def _check(self) -> None:
+        """Raise `GivenUpError` when a limit is passed, and ever after."""
+        self._verdict = self._verdict or self._judge()
+        if self._verdict:
+            raise self._verdict
+
+    def _judge(self) -> GivenUpError | None:
         if self._stop and self._stop():
-            raise GivenUpError("error", "interrupted")
+            return GivenUpError("error", "interrupted")
         seconds, memory = self._limits.seconds, self._limits.memory
         if seconds is not None and self.elapsed > seconds:
             reason = f"not done after {seconds:g} s (--timeout)"
-            raise GivenUpError("timeout", reason, f"was {reason}")
-        used = self._resident_bytes() if self._box is None else self._sandboxed_bytes()
+            return GivenUpError("timeout", reason, f"was {reason}")
+        used, processes = self._used()
         self.peak = max(self.peak, used)
         if memory is not None and used > memory:
             held, most = f"{used / 1e6:.0f} MB", f"{memory / 1e6:.0f} MB (--memory)"
             reason = f"resident memory {held} is over the limit of {most}"
-            raise GivenUpError("oom", reason, f"held {held}, more than {most}")
+            return GivenUpError("oom", reason, f"held {held}, more than {most}")
+        if self._box and processes > PROCESSES:
+            reason = f"started more than {PROCESSES} processes (--sandbox)"
+            return GivenUpError("error", reason, reason)
+        return None
 
-    def _resident_bytes(self) -> int:
-        held = []
-        for process in {self._seen, self._scoring}:
-            with contextlib.suppress(psutil.Error):
-                held.append(int(process.memory_info().rss))
-        return int(self.together(held))
+    def _used(self) -> tuple[int, int]:
+        """Return the resident bytes and the number of its processes: now and then of all of them.
 
-    def _sandboxed_bytes(self) -> int:
-        """Return what all processes of the sandbox hold; what they share counts once."""
-        if time.monotonic() - self._looked < LOOK_SECONDS:
-            return 0
-        self._looked = time.monotonic()
-        with contextlib.suppress(psutil.Error):
-            inside = self._seen.children(recursive=True)
-            if len(inside) > PROCESSES:
-                reason = f"started more than {PROCESSES} processes (--sandbox)"
-                raise GivenUpError("error", reason, reason)
-            held = 0
-            for process in inside:
-                with contextlib.suppress(psutil.Error):
-                    held += int(process.memory_full_info().pss)
-            return held
-        return 0
-
-    def together(self, held: Sequence[float]) -> float:
-        """Return the memory of a worker and a process that scores, of what each of them holds.
-
-        What a fork shares counts in both: the larger of the two holds all of it.
+        What processes share counts once.
         """
-        return max(held, default=0) if self.forked else sum(held)
+        processes, held = [], 0
+        with contextlib.suppress(psutil.Error):
+            if time.monotonic() - self._looked < LOOK_SECONDS:
+                return int(self._seen.memory_info().rss), 1
+            self._looked = time.monotonic()
+            processes = [self._seen, *self._seen.children(recursive=True)]
+        for process in processes:
+            with contextlib.suppress(psutil.Error):
+                info = process.memory_full_info()
+                held += int(getattr(info, "pss", info.uss))
+        return held, len(processes)
 
 
 def _killed_for_memory() -> int:
     """Return how many processes the system has killed for want of memory; 0 if it does not tell."""
     with contextlib.suppress(OSError, StopIteration, ValueError):
-        told = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
-        return int(next(line.split()[1] for line in told if line.startswith("oom_kill ")))
+        lines = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
+        return int(next(line.split()[1] for line in lines if line.startswith("oom_kill ")))
     return 0
 
 
@@ -246,7 +246,7 @@ def _environment(box: Sandbox | None) -> dict[str, str]:
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
     # A detector must not see the harness's settings, nor the test that pytest names.
     steering = ("OODD_EVAL_", "PYTEST_CURRENT_TEST")
-    own = {name: value for name, value in os.environ.items() if not name.startswith(steering)}
-    kept = box.environment() if box else own
+    variables = {n: value for n, value in os.environ.items() if not n.startswith(steering)}
+    kept = box.environment() if box else variables
     single = dict.fromkeys(_SINGLE_THREAD, "1")
     return {**kept, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}

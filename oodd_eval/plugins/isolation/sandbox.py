@@ -18,7 +18,6 @@ from typing import Any, Final
 from oodd_eval.errors import UsageError
 
 SCRATCH: Final = Path("/tmp")  # noqa: S108  of the sandbox, not of the system
-PROCESSES: Final = 256  # at most, in a sandbox
 
 _READ_ONLY: Final = (
     "/usr",
@@ -99,20 +98,20 @@ class Sandbox:
         yield from ("--unshare-all", "--unshare-user", "--disable-userns", "--die-with-parent")
         yield from ("--cap-drop", "ALL", "--hostname", "sandbox")
         yield from ("--proc", "/proc", "--dev", "/dev", "--bind", str(self._outside), str(SCRATCH))
-        shown: dict[Path, Path] = {}  # by the place in the sandbox: where it really is
+        targets: dict[Path, Path] = {}  # real paths by those in the sandbox
         for path in _readable():
-            if any(path.is_relative_to(other) for other in shown):
+            if any(path.is_relative_to(other) for other in targets):
                 continue
             if path.is_symlink() and path.parent == Path("/"):  # such as /lib
                 yield from ("--symlink", str(path.readlink()), str(path))
                 continue
-            shown[path] = Path(os.path.realpath(path))
+            targets[path] = Path(os.path.realpath(path))
             yield from ("--ro-bind", str(path), str(path))
         for hidden in self._hidden:
-            for place, really in shown.items():
-                if hidden.exists() and hidden.is_relative_to(really):
+            for path, target in targets.items():
+                if hidden.exists() and hidden.is_relative_to(target):
                     mask = ("--tmpfs",) if hidden.is_dir() else ("--ro-bind", os.devnull)
-                    yield from (*mask, str(place / hidden.relative_to(really)))
+                    yield from (*mask, str(path / hidden.relative_to(target)))
         yield from ("--remount-ro", "/", "--chdir", str(SCRATCH))
 
 
@@ -158,13 +157,13 @@ def _readable() -> Iterator[Path]:
         if entry.is_file() or entry.name in {"site-packages", "dist-packages"}:
             yield entry.absolute()
         elif entry.is_dir():
-            yield from (found.absolute() for found in sorted(entry.iterdir()) if _importable(found))
+            yield from (path.absolute() for path in sorted(entry.iterdir()) if _importable(path))
     # Editable installs may find modules elsewhere.
     for name, module in sorted(sys.modules.items()):
         if "." not in name:
-            for place in (*getattr(module, "__path__", ()), getattr(module, "__file__", None)):
-                if place and Path(place).exists():
-                    yield Path(place).absolute()
+            for path in (*getattr(module, "__path__", ()), getattr(module, "__file__", None)):
+                if path and Path(path).exists():
+                    yield Path(path).absolute()
 
 
 def _importable(path: Path) -> bool:

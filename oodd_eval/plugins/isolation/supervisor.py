@@ -1,12 +1,11 @@
 """Run one detector in a process of its own, and turn every way to fail into a status."""
 
 import math
-import os
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final, TypeVar
@@ -14,13 +13,19 @@ from typing import Any, Final, TypeVar
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.plugins.isolation import ROW_BYTES, Channel, ChannelClosedError, ChannelGarbledError
+from oodd_eval.plugins.isolation import (
+    CHUNK,
+    CLOSED_SECONDS,
+    ROW_BYTES,
+    Channel,
+    ChannelClosedError,
+    ChannelGarbledError,
+)
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
 from oodd_eval.plugins.isolation.sandbox import Sandbox
 
-CHUNK: Final = 64  # trajectories that a worker scores at once
-
-_TOLD: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}  # by a worker, of itself
+_FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
+"""What a worker may say of itself."""
 
 _T = TypeVar("_T")
 _Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
@@ -68,31 +73,18 @@ def run_isolated(
     exhausted. Scores come back in the order of the groups. When `stop` says True, the worker is
     killed and the status is ``"error"``. Only errors of reading the trajectories are raised.
     """
-    if limits.hidden is None:
-        return _isolated(request, train, groups, explained, limits, stop, None)
-    with closing(Sandbox(limits.hidden)) as box:
-        inside = box.taken(request)
-        outcome = _isolated(inside, train, groups, explained, limits, stop, box)
-        box.give(request)
-    return outcome
-
-
-def _isolated(
-    request: Mapping[str, Any],
-    train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]],
-    explained: Iterable[Iterable[Trajectory]],
-    limits: Limits,
-    stop: Stop,
-    box: Sandbox | None,
-) -> Outcome:
-    child = Child("oodd_eval.plugins.isolation.worker", limits, stop, box)
-    outcome, expected = Outcome(), _Expected()
-    # From another thread, so that neither side can deadlock on a full pipe.
-    with ThreadPoolExecutor(1) as pool:
+    outcome, expected, box, inside = Outcome(), _Expected(), None, request
+    with ExitStack() as stack:
+        if limits.hidden is not None:
+            box = stack.enter_context(closing(Sandbox(limits.hidden)))
+            inside = box.taken(request)
+        module = "oodd_eval.plugins.isolation.worker"
+        child = stack.enter_context(closing(Child(module, limits, stop, box)))
+        # From another thread, so that neither side can deadlock on a full socket.
+        pool = stack.enter_context(ThreadPoolExecutor(1))
         explains: Future[bool] = Future()
         parts = _noted("array", groups, expected), _noted("explanation", explained, expected)
-        sent = pool.submit(_send, child, request, train, *parts, explains)
+        sent = pool.submit(_send, child, inside, train, *parts, explains)
         try:
             _converse(child, outcome, explains, expected)
         except GivenUpError as error:
@@ -103,12 +95,14 @@ def _isolated(
         except ChannelClosedError:
             doing = "fitting" if outcome.seconds_fit is None else "scoring"
             outcome.status = "error"
-            if not child.wait_for_exit(seconds=5.0):
+            if not child.wait_for_exit(seconds=CLOSED_SECONDS):
                 outcome.reason = f"the worker closed its pipe while {doing}, without a result"
         finally:
             if not explains.done():
                 explains.set_result(False)
             outcome.log = child.end()
+        if box:
+            box.give(request)
     sent.result()
     if outcome.status == "error" and not outcome.reason:
         outcome.reason = f"the worker {child.death()} while {doing}"
@@ -130,26 +124,23 @@ def _converse(
     while outcome.seconds_score is None:
         message = channel.receive()
         if "status" in message:
-            if message["status"] not in _TOLD:
+            if message["status"] not in _FAILURES:
                 raise ValueError(message["status"])
             raise GivenUpError(message["status"], _typed(message, "reason", str))
         if outcome.seconds_fit is None:
-            outcome.warm_up, told = message["warm_up"], _typed(message, "explains", bool)
+            outcome.warm_up, answer = message["warm_up"], _typed(message, "explains", bool)
             outcome.seconds_fit = _number(message, "seconds_fit", child.elapsed)
-            explains.set_result(told)
-        elif "pid" in message:
-            child.watch(_typed(message, "pid", int), forked=_typed(message, "forked", bool))
+            explains.set_result(answer)
         elif "peak_rss_mb" in message:
-            held = _number(message, "peak_rss_mb", memory)
+            peak = max(peak, _number(message, "peak_rss_mb", memory))
             if "seconds_score" in message:
                 seconds += _number(message, "seconds_score", child.elapsed)
-                peak = max(peak, held)
             else:
                 outcome.seconds_score = min(seconds, child.elapsed)
-                outcome.peak_rss_mb = max(child.together([peak, held]), child.peak / 1e6)
+                outcome.peak_rss_mb = max(peak, child.peak / 1e6)
         elif (kind := _typed(message, "type", str)) in arrays:
-            wanted, rows = expected.popleft()
-            if kind != wanted:
+            expected_kind, rows = expected.popleft()
+            if kind != expected_kind:
                 raise ValueError(kind)
             arrays[kind].append(channel.receive_array(4096 + ROW_BYTES * rows))
         else:
@@ -203,10 +194,10 @@ def _send(
         for group in explained if explains.result() else ():
             _send_group(channel, group, explain=True)
         channel.send({"group": False})
-    except BrokenPipeError:
+    except ConnectionError:
         pass  # The worker ended; the receiving side finds out why.
     finally:
-        os.close(child.sending)
+        child.hang_up()
 
 
 def _send_group(channel: Channel, group: Iterable[Trajectory], *, explain: bool) -> None:

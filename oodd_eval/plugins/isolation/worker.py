@@ -10,7 +10,7 @@ GPU starts some), and further processes would be shared by all groups: the fit i
 by a fresh process for each group. Files and shared memory are not watched. When all is scored, some
 groups come once more to a detector that explains, each in a process of its own as before.
 
-Messages have descriptors of their own, so that nothing that a detector prints gets between them.
+Messages have a descriptor of their own, so that nothing that a detector prints gets between them.
 """
 
 import faulthandler
@@ -41,7 +41,7 @@ from oodd_eval.errors import ContractError, TrajectoryError
 from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
 from oodd_eval.plugins.discovery import describe, offer_of, printable
 from oodd_eval.plugins.explanations import explain_chunk, explains
-from oodd_eval.plugins.isolation import MARK, ROW_BYTES, Channel, end_all
+from oodd_eval.plugins.isolation import FIT_END_SECONDS, MARK, ROW_BYTES, SCORED, Channel, end_all
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
     MemoryError: "oom",
@@ -50,10 +50,6 @@ _STATUSES: Final[dict[type[BaseException], str]] = {
     ModuleNotFoundError: "unavailable",
 }
 """Status of a cell by what its detector raised."""
-
-
-SCORED: Final = 93  # exit code of a process that has scored its group, and of no other
-PATIENCE: Final = 1.0  # seconds that threads and processes of a fit have to end
 
 
 class TrajectoryFile(TrajectorySequence):
@@ -93,8 +89,8 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, SystemExit):
         return f"called sys.exit({error.code!r})"
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    return describe(error) + ("" if isinstance(error, ContractError) else place)
+    origin = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return describe(error) + ("" if isinstance(error, ContractError) else origin)
 
 
 def peak_rss_mb() -> float:
@@ -111,16 +107,16 @@ def peak_rss_mb() -> float:
 
 def serve(channel: Channel, descriptors: Sequence[str]) -> None:
     """Fit the requested detector and have every group that comes scored by a process of its own."""
-    threads, own = psutil.Process().num_threads(), os.getpid()
+    threads, pid = psutil.Process().num_threads(), os.getpid()
     request = channel.receive()
     train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
     start = time.perf_counter()
-    detector = _made(request)
+    detector = _make_detector(request)
     if request["load"]:
         _load(detector, request["load"])
     else:
         detector.fit(train)
-    if os.getpid() != own:
+    if os.getpid() != pid:
         os._exit(1)  # The fit has forked, and one process answers.
     seconds_fit = time.perf_counter() - start
     saved = request["load"] or (request["save"] and _saved(detector, request["save"]))
@@ -148,7 +144,7 @@ def _runs_on(threads: int) -> bool:
 
     The system ends a thread a moment after it was joined.
     """
-    here, end = psutil.Process(), time.monotonic() + PATIENCE
+    here, end = psutil.Process(), time.monotonic() + FIT_END_SECONDS
     while here.num_threads() > threads or _children():
         if time.monotonic() > end:
             return True
@@ -164,12 +160,12 @@ def _children() -> list[psutil.Process]:
             os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
         except ChildProcessError:
             return []
-    found = []
+    children = []
     for child in psutil.Process().children(recursive=True):
         with suppress(psutil.Error):
             if child.status() != psutil.STATUS_ZOMBIE:
-                found.append(child)
-    return found
+                children.append(child)
+    return children
 
 
 def _end_children() -> None:
@@ -178,26 +174,26 @@ def _end_children() -> None:
             child.kill()
 
 
-def _made(request: dict[str, Any]) -> Detector:
+def _make_detector(request: dict[str, Any]) -> Detector:
     gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
     spec = offer_of(request["plugin"], request["detector"]).spec
-    given = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    detector = make_detector(spec.factory, **given)
+    arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
+    detector = make_detector(spec.factory, **arguments)
     gc.enable()
     return detector
 
 
 def _load(detector: Detector, directory: str) -> None:
     if not isinstance(detector, StorableDetector):
-        raise ContractError("a detector that had saved itself has no load(directory) any more")
+        raise ContractError("the detector has save but no load")
     detector.load(Path(directory))
 
 
-def _saved(detector: Detector, place: str) -> str:
+def _saved(detector: Detector, path: str) -> str:
     """Let a detector save itself; return the directory, or nothing where that fails."""
     if not isinstance(detector, StorableDetector):
         return ""
-    directory = Path(place)
+    directory = Path(path)
     try:
         detector.save(directory)
     except BaseException:  # noqa: BLE001  a detector may raise anything; a later run fits again
@@ -207,7 +203,7 @@ def _saved(detector: Detector, place: str) -> str:
         with suppress(OSError):
             directory.mkdir(parents=True)
         return ""
-    return place
+    return path
 
 
 def _fork(channel: Channel, detector: Detector) -> int:
@@ -232,7 +228,7 @@ def _start(descriptors: Sequence[str], order: str) -> int:
 
 
 def _end_like(code: int) -> NoReturn:
-    """End this process as a group's process ended, which has told the harness what it could."""
+    """Exit with the group's exit code or signal."""
     if code < 0:
         if -code != signal.SIGKILL:
             signal.signal(-code, signal.SIG_DFL)
@@ -240,25 +236,24 @@ def _end_like(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _score_group(channel: Channel, detector: Detector, *, forked: bool = True) -> None:
+def _score_group(channel: Channel, detector: Detector) -> None:
     """Score, or explain, what comes until a chunk of zero, and end the processes of this."""
-    channel.send({"pid": os.getpid(), "forked": forked})
     seconds = 0.0
     while size := (order := channel.receive())["score"]:
         chunk = [channel.receive_trajectory() for _ in range(size)]
         start = time.perf_counter()
         returned = (explain_chunk if order["explain"] else score_chunk)(detector, chunk)
         seconds += 0.0 if order["explain"] else time.perf_counter() - start
-        for place, one in enumerate(returned):
-            if not isinstance(one, np.ndarray):
-                channel.send({"type": type(one).__name__})
-            elif one.nbytes > ROW_BYTES * len(chunk[place]):
-                channel.send({"type": f"an array of shape {one.shape}"})
-            elif one.dtype.hasobject:
+        for trajectory, array in zip(chunk, returned, strict=True):
+            if not isinstance(array, np.ndarray):
+                channel.send({"type": type(array).__name__})
+            elif array.nbytes > ROW_BYTES * len(trajectory):
+                channel.send({"type": f"an array of shape {array.shape}"})
+            elif array.dtype.hasobject:
                 channel.send({"type": "ndarray of object"})
             else:
                 channel.send({"type": "explanation" if order["explain"] else "array"})
-                channel.send_array(np.asarray(one))
+                channel.send_array(np.asarray(array))
     _end_children()
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
 
@@ -269,13 +264,13 @@ def connect(arguments: Sequence[str], *, guarded: bool = True) -> Channel:
     The harness never writes to the lifeline: reading it ends when the harness is no more. Where
     this process is `guarded`, that ends it and whatever it has started, too.
     """
-    reading, writing, lifeline = descriptors = [int(a) for a in arguments]
+    conversation, lifeline = descriptors = [int(a) for a in arguments]
     for descriptor in descriptors:
         os.set_inheritable(descriptor, False)
     if guarded:
         _guard(lifeline)
     faulthandler.enable()
-    return Channel(reading, writing)
+    return Channel(conversation)
 
 
 def _guard(lifeline: int) -> None:
@@ -290,7 +285,7 @@ def _guard(lifeline: int) -> None:
             os.setsid()
             if os.fork() == 0:
                 os.dup2(lifeline, 0)
-                os.closerange(1, 1024)  # The worker's pipes have to end with the worker.
+                os.closerange(1, 1024)  # The worker's channel has to end with the worker.
                 os.read(0, 1)
                 end_all(worker, mark)
         finally:
@@ -318,14 +313,14 @@ def main(arguments: Sequence[str]) -> NoReturn:
 
     Threads and exit handlers of the detector have no say any more: the scores are sent.
     """
-    descriptors, order = arguments[:3], arguments[3:]
+    descriptors, order = arguments[:2], arguments[2:]
     channel = connect(descriptors, guarded=not order)  # A group's process has its worker's mark.
 
     def group() -> None:
         request = json.loads(order[0])
-        detector = _made(request)
+        detector = _make_detector(request)
         _load(detector, request["load"])
-        _score_group(channel, detector, forked=False)
+        _score_group(channel, detector)
 
     if order:
         os._exit(_reported(channel, group) or SCORED)

@@ -98,7 +98,7 @@ class Project:
         templates = files(__name__) / "templates"
 
         def fill(text: str) -> str:
-            return re.sub("@[A-Z]+@", lambda found: names[found[0]], text)
+            return re.sub("@[A-Z]+@", lambda match: names[match[0]], text)
 
         return {
             fill(path): fill((templates / template).read_text(encoding="utf-8"))

@@ -83,11 +83,11 @@ def check_executor(name: str) -> None:
     if name == LOCAL:
         return
     try:
-        place = urlsplit(name)
-        whole = place.scheme == "dask" and place.hostname and place.port
+        address = urlsplit(name)
+        whole = address.scheme == "dask" and address.hostname and address.port
     except ValueError:
         whole = False
-    if not whole or place.path or place.query or place.fragment:
+    if not whole or address.path or address.query or address.fragment:
         raise UsageError(
             f"--executor {name!r}, expected 'local' or 'dask://HOST:PORT', the address of a Dask "
             "scheduler"

@@ -185,8 +185,8 @@ def _scored(order: Message, stop: Stop) -> Message:
         offer = offer_of(unit.plugin, unit.setting.detector)
     except PluginError as error:
         raise ExecutorError(f"on the other side, {error}") from None
-    found = {"version": offer.version, "source": source_digest(offer.module)}
-    for name, here in found.items():
+    digests = {"version": offer.version, "source": source_digest(offer.module)}
+    for name, here in digests.items():
         if here != getattr(unit, name):
             raise ExecutorError(
                 f"plug-in {unit.plugin!r} has the {name} {here!r} there, expected "
@@ -204,9 +204,9 @@ def _scored(order: Message, stop: Stop) -> Message:
 def _environment(path: str, name: str, digest: str, environment: str) -> EnvironmentData:
     """Open one environment of the split with a digest; it stays open for the units to come."""
     looked = []
-    for place in (Path(path), name):
+    for location in (Path(path), name):
         try:
-            split = load_split(place)
+            split = load_split(location)
         except OoddError as error:
             looked.append(str(error))
             continue

@@ -1,55 +1,59 @@
-"""Checks that scores hold when asked for otherwise: again, cut short, at the edges, from a file."""
+"""Tests that scores hold when asked for otherwise: again, cut short, at the edges, from a file.
+
+PYTEST_DONT_REWRITE: messages are whole sentences.
+"""
 
 import contextlib
 import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
+import pytest
 
-from oodd_eval.data.bounded import npy_header
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins import contract
 from oodd_eval.plugins.conformance.side_effects import seeded_generators
 from oodd_eval.plugins.conformance.trial import (
     SENSORS,
-    CheckFailedError,
-    CheckSkipped,
     Trial,
     as_scores,
+    assert_equal,
     doing,
-    must_equal,
     noisy_from,
     offered,
+    shared_trial,
+    trial,
 )
-from oodd_eval.plugins.contract import Detector, StorableDetector
+from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
+
+__all__ = ["shared_trial", "trial"]  # fixtures
 
 _PICKLE_SUFFIXES = frozenset({".pkl", ".pickle", ".joblib", ".dill"})
 
 
-def check_same_seed(trial: Trial) -> None:
+def test_same_seed(trial: Trial) -> None:
     """Two detectors of one seed give the same scores, whatever global generators hold."""
     trial.fitted()
-    what = f"a second detector of seed {trial.seed}, fitted on the same trajectories, "
+    second = f"a second detector of seed {trial.seed}, fitted on the same trajectories,"
     with seeded_generators(1):
         advice = "draw all randomness from the seed"
-        trial.must_agree(trial.fit(), f"{what}has other scores", advice)
+        trial.must_agree(trial.fit(), f"{second} has other scores", advice)
 
 
-def check_deterministic(trial: Trial) -> None:
+def test_deterministic(trial: Trial) -> None:
     """Another seed gives the same scores where the spec says that the detector is deterministic."""
     trial.fitted()
     if not trial.spec.deterministic:
-        raise CheckSkipped("does not say that the seed changes nothing")
+        pytest.skip("does not say that the seed changes nothing")
     what = f"a detector of seed {trial.seed + 1} has other scores than one of seed {trial.seed}"
     trial.must_agree(trial.fit(seed=trial.seed + 1), what, "expected deterministic=False")
 
 
-def check_refit(trial: Trial) -> None:
+def test_refit(trial: Trial) -> None:
     """A second fit forgets the first one, also one of another number of sensors."""
     trial.fitted()
     detector = trial.fit(trial.training(sensors=SENSORS + 2, first=5000))
@@ -60,7 +64,7 @@ def check_refit(trial: Trial) -> None:
     trial.must_agree(detector, what, "fit has to begin anew")
 
 
-def check_order(trial: Trial) -> None:
+def test_order(trial: Trial) -> None:
     """Scores of a trajectory do not depend on what was scored before, nor on shared beginnings."""
     # An anomalous trajectory and its twin are equal up to the onset.
     trajectories = [*trial.nominal(), *trial.anomalous(1)[0][:2]]
@@ -68,42 +72,42 @@ def check_order(trial: Trial) -> None:
     again = [trial.scores(x) for x in reversed(trajectories)][::-1]
     what = "scores of a trajectory change with what was scored before"
     for one, other in zip(first, again, strict=True):
-        must_equal(other, one, what, "score must not keep anything")
+        assert_equal(other, one, what, "score must not keep anything")
 
 
-def check_score_many(trial: Trial) -> None:
+def test_score_many(trial: Trial) -> None:
     """score_many gives the scores of score, in whatever company."""
     if (together := getattr(trial.fitted(), "score_many", None)) is None:
-        raise CheckSkipped("has no score_many")
+        pytest.skip("has no score_many")
     trajectories = [*trial.nominal(), trial.anomalous(1)[0][0]]
     alone = [trial.scores(x) for x in trajectories]
     for chosen in (range(len(trajectories)), (3, 1), (2,)):
         company, n = [trajectories[i] for i in chosen], f"{len(chosen)} trajectories"
         with doing("score_many"):
-            found = list(together(company))
-        if len(found) != len(company):
-            raise CheckFailedError(f"score_many returned {len(found)} score arrays for {n}")
-        for i, x, scores in zip(chosen, company, found, strict=True):
+            returned = list(together(company))
+        assert len(returned) == len(company), (
+            f"score_many returned {len(returned)} score arrays for {n}"
+        )
+        for i, x, scores in zip(chosen, company, returned, strict=True):
             what = f"score_many of {n} differs from score"
-            must_equal(as_scores(scores, x), alone[i], what, tolerance=trial.tolerance)
+            assert_equal(as_scores(scores, x), alone[i], what, tolerance=trial.tolerance)
 
 
-def check_inputs_unchanged(trial: Trial) -> None:
+def test_inputs_unchanged(trial: Trial) -> None:
     """Trajectories, and the list of them, are left as they were."""
     trial.fitted()
     training, nominal = trial.training(), trial.nominal()
-    given, before = list(training), (_bytes(training), _bytes(nominal))
-    detector = trial.fit(given)
+    trajectories, before = list(training), (_bytes(training), _bytes(nominal))
+    detector = trial.fit(trajectories)
     for x in nominal:
         detector.score(x)
-    if [id(x) for x in given] != [id(x) for x in training]:
-        raise CheckFailedError("fit changed the list of trajectories that it was given")
+    same = [id(x) for x in trajectories] == [id(x) for x in training]
+    assert same, "fit changed the list of trajectories that it was given"
     for method, old, new in zip(("fit", "score"), before, (training, nominal), strict=True):
-        if _bytes(new) != old:
-            raise CheckFailedError(f"{method} changed the arrays of a trajectory")
+        assert _bytes(new) == old, f"{method} changed the arrays of a trajectory"
 
 
-def check_read_only(trial: Trial) -> None:
+def test_read_only(trial: Trial) -> None:
     """Trajectories in memory that cannot be written to are accepted."""
     trial.fitted()
     detector = trial.fit([_locked(x) for x in trial.training()])
@@ -125,7 +129,7 @@ def _locked(trajectory: Trajectory) -> Trajectory:
     return locked
 
 
-def check_causality(trial: Trial) -> None:
+def test_causality(trial: Trial) -> None:
     """Another future leaves the scores of the past as they are."""
     trajectory, advice = trial.nominal(1)[0], "a score may use nothing after its time"
     whole = trial.scores(trajectory)
@@ -133,20 +137,20 @@ def check_causality(trial: Trial) -> None:
         what = f"scores before t = {row} change when the episode goes on otherwise from there"
         # The action of the row before was chosen after its observation came.
         actions = np.concatenate([trajectory.actions[: row - 1], -trajectory.actions[row - 1 :]])
-        found = trial.scores(Trajectory(noisy_from(trajectory, row).observations, actions))
-        must_equal(found[:row], whole, what, advice, trial.tolerance)
+        scores = trial.scores(Trajectory(noisy_from(trajectory, row).observations, actions))
+        assert_equal(scores[:row], whole, what, advice, trial.tolerance)
 
 
-def check_prefix(trial: Trial) -> None:
+def test_prefix(trial: Trial) -> None:
     """The scores of a prefix are the prefix of the scores."""
     trajectory = trial.nominal(1)[0]
     whole = trial.scores(trajectory)
     for n in (1, 2, *_rows(trial), len(trajectory) - 1):
         what = f"the first {n} of {len(trajectory)} observations alone have other scores"
-        must_equal(trial.scores(trajectory[:n]), whole, what, tolerance=trial.tolerance)
+        assert_equal(trial.scores(trajectory[:n]), whole, what, tolerance=trial.tolerance)
 
 
-def check_streaming(trial: Trial) -> None:
+def test_streaming(trial: Trial) -> None:
     """Scores one observation at a time are those of the whole episode."""
     detector = offered(trial.fitted(), "reset", "update")
     # The second episode is left in the middle, so that the next one has to begin anew.
@@ -155,36 +159,33 @@ def check_streaming(trial: Trial) -> None:
         whole = trial.scores(trajectory)
         with doing("reset and update"):
             detector.reset()
-            scores = map(detector.update, trajectory.observations, [None, *trajectory.actions])
-            found = np.array(list(scores), dtype=np.float64)
+            rows = map(detector.update, trajectory.observations, [None, *trajectory.actions])
+            scores = np.array(list(rows), dtype=np.float64)
         what = "update differs from score of the whole episode"
-        must_equal(found, whole, what, tolerance=trial.tolerance)
+        assert_equal(scores, whole, what, tolerance=trial.tolerance)
 
 
-def check_explain(trial: Trial) -> None:
+def test_explain(trial: Trial) -> None:
     """Shares of explain add up to 1, onsets are not ahead; prefixes and streams get the same."""
     if not explains(trial.fitted()):
-        raise CheckSkipped("has no explain")
+        pytest.skip("has no explain")
     trajectory = noisy_from(trial.nominal(1)[0], trial.rows // 3)
-    scores, (whole, onsets) = trial.scores(trajectory), _explanation(trial, trajectory)
-    if (wrong := np.isnan(scores) != (onsets < 0)).any():
-        t = int(wrong.argmax())
-        message = f"explain gives the onset {onsets[t]} at t = {t}, where the score is {scores[t]}"
-        raise CheckFailedError(f"{message}: expected -1, and shares of NaN, where it is NaN only")
+    scores, whole = trial.scores(trajectory), _explanation(trial, trajectory)
+    wrong = np.isnan(scores) != (whole.onsets < 0)
+    t = int(wrong.argmax())
+    assert not wrong.any(), (
+        f"explain gives the onset {whole.onsets[t]} at t = {t}, where the score is {scores[t]}: "
+        "expected -1, and shares of NaN, where it is NaN only"
+    )
     for n in _rows(trial):
-        shares, found = _explanation(trial, trajectory[:n])
-        same = np.isclose(shares, whole[:n], 0, contract.TOLERANCE, equal_nan=True)
-        for what, differs in (("shares", ~same), ("onsets", found != onsets[:n])):
-            if differs.mean() > FLIPPED:
-                first = f"the first {n} of {len(trajectory)} observations alone have other {what}"
-                raise CheckFailedError(f"{first}: explain may use nothing after a row's time")
-    if hasattr(trial.fitted(), "explain_last"):
-        _must_explain_last(trial, trajectory, Explanation(whole, onsets))
-
-
-def _must_explain_last(trial: Trial, trajectory: Trajectory, expected: Explanation) -> None:
-    """Raise `CheckFailedError` unless explain_last gives the rows of explain after each update."""
-    detector: Any = offered(trial.fitted(), "reset", "update")
+        different = _difference(_explanation(trial, trajectory[:n]), whole)
+        assert not different, (
+            f"the first {n} of {len(trajectory)} observations alone have other {different[0]}: "
+            "explain may use nothing after a row's time"
+        )
+    if not hasattr(trial.fitted(), "explain_last"):
+        return
+    detector = offered(trial.fitted(), "reset", "update")
     rows = []
     with doing("update and explain_last"):
         detector.reset()
@@ -192,15 +193,11 @@ def _must_explain_last(trial: Trial, trajectory: Trajectory, expected: Explanati
             detector.update(*row)
             rows.append(detector.explain_last())
         shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
-    near = np.isclose(shares, expected.shares, 0, contract.TOLERANCE, equal_nan=True)
-    for what, same in (("shares", near.all(axis=1)), ("onset", onsets == expected.onsets)):
-        # Rounding may turn a few, as with prefixes.
-        if (~same).mean() > FLIPPED:
-            t = int(same.argmin())
-            raise CheckFailedError(
-                f"explain_last gives other {what} than explain, first at t = {t}: expected the "
-                "row of explain for the latest update"
-            )
+    different = _difference(Explanation(shares, onsets), whole)
+    assert not different, (
+        f"explain_last gives other {different[0]} than explain, first at t = {different[1]}: "
+        "expected the row of explain for the latest update"
+    )
 
 
 def _explanation(trial: Trial, trajectory: Trajectory) -> Explanation:
@@ -210,7 +207,18 @@ def _explanation(trial: Trial, trajectory: Trajectory) -> Explanation:
     try:
         return checked_explanation(returned, trajectory)
     except ContractError as error:
-        raise CheckFailedError(str(error)) from None
+        raise AssertionError(str(error)) from None
+
+
+def _difference(rows: Explanation, whole: Explanation) -> tuple[str, int] | None:
+    """Return what differs between the explanation of first rows and the whole, and from where."""
+    n = len(rows.onsets)
+    near = np.isclose(rows.shares, whole.shares[:n], 0, TOLERANCE, equal_nan=True)
+    for what, same in (("shares", near), ("onsets", rows.onsets == whole.onsets[:n])):
+        # Rounding may turn a few.
+        if (~same).mean() > FLIPPED:
+            return what, int(np.argwhere(~same)[0, 0])
+    return None
 
 
 def _rows(trial: Trial) -> tuple[int, ...]:
@@ -218,14 +226,14 @@ def _rows(trial: Trial) -> tuple[int, ...]:
     return trial.horizon + 1, trial.horizon + 2, trial.rows // 2
 
 
-def check_short_trajectories(trial: Trial) -> None:
+def test_short_trajectories(trial: Trial) -> None:
     """Episodes of one and two observations, and as short as the horizon, are scored."""
     for n in sorted({1, 2, trial.horizon, trial.horizon + 1}):
         what = f"an episode of {n} observation{'s' if n > 1 else ''}"
         _must_be_finite(trial, trial.fitted(), trial.episode(7, n), what)
 
 
-def check_constant_trajectory(trial: Trial) -> None:
+def test_constant_trajectory(trial: Trial) -> None:
     """An episode in which nothing moves is scored with finite scores."""
     moving = trial.episode(8)
     rows = np.repeat(moving.observations[:1], len(moving), axis=0)
@@ -233,7 +241,7 @@ def check_constant_trajectory(trial: Trial) -> None:
     _must_be_finite(trial, trial.fitted(), still, "an episode in which nothing moves")
 
 
-def check_constant_sensor(trial: Trial) -> None:
+def test_constant_sensor(trial: Trial) -> None:
     """A sensor that never moved in training is no reason for infinite scores when it does."""
     trial.fitted()
     detector = trial.fit([_with_constant_sensor(x) for x in trial.training()])
@@ -242,7 +250,7 @@ def check_constant_sensor(trial: Trial) -> None:
     _must_be_finite(trial, detector, nominal, f"{what} stood still in training only")
 
 
-def check_unequal_lengths(trial: Trial) -> None:
+def test_unequal_lengths(trial: Trial) -> None:
     """Training episodes may be of unequal length, down to a single observation."""
     trial.fitted()
     lengths = [1, 2, 3, 2 * trial.rows, *(trial.rows - 5 * i for i in range(8))]
@@ -263,39 +271,38 @@ def _must_be_finite(trial: Trial, detector: Detector, trajectory: Trajectory, wh
         scores = trial.scores(trajectory, detector)
         usual = trial.scores(trial.episode(0, len(trajectory)))
     wrong = np.flatnonzero(np.isinf(scores) | (np.isnan(scores) & ~np.isnan(usual)))
-    if wrong.size:
-        t = wrong[0]
-        raise CheckFailedError(f"{what} has the score {scores[t]} at t = {t}: expected finite ones")
+    assert not wrong.size, (
+        f"{what} has the score {scores[wrong[0]]} at t = {wrong[0]}: expected finite ones"
+    )
 
 
-def check_save_and_load(trial: Trial) -> None:
+def test_save_and_load(trial: Trial) -> None:
     """A new detector that loads what was saved gives the same scores, bit for bit."""
-    with _saved(trial.fitted()) as place:
-        trial.must_agree(_loaded(trial, place), "a detector that loaded a saved fit differs")
+    with _saved(trial.fitted()) as directory:
+        trial.must_agree(_loaded(trial, directory), "a detector that loaded a saved fit differs")
 
 
-def check_shared_fit(trial: Trial) -> None:
+def test_shared_fit(trial: Trial) -> None:
     """One saved fit serves all horizons where the spec says that they do not decide the fit."""
     offered(trial.fitted(), "save", "load")
     if trial.spec.horizon_decides_fit:
-        raise CheckSkipped("does not say that fits ignore the horizon")
+        pytest.skip("does not say that fits ignore the horizon")
     other = trial.horizon + 2
     what = f"a fit of horizon {trial.horizon}, loaded for horizon {other}, differs from a fit of "
     advice = "expected horizon_decides_fit=True"
-    with _saved(trial.fitted()) as place:
-        x, loaded = trial.nominal(1)[0], _loaded(trial, place, horizon=other)
-        found, wanted = trial.scores(x, loaded), trial.scores(x, trial.fit(horizon=other))
-        must_equal(found, wanted, f"{what}horizon {other}", advice)
+    with _saved(trial.fitted()) as directory:
+        x, loaded = trial.nominal(1)[0], _loaded(trial, directory, horizon=other)
+        expected = trial.scores(x, trial.fit(horizon=other))
+        assert_equal(trial.scores(x, loaded), expected, f"{what}horizon {other}", advice)
 
 
-def check_saved_files(trial: Trial) -> None:
+def test_saved_files(trial: Trial) -> None:
     """Saved files hold data, not pickled objects, which could run anything when loaded."""
     expected = "expected JSON, npz without objects, or safetensors"
-    with _saved(trial.fitted()) as place:
-        for path in _files(place):
-            if reason := _pickled(path):
-                name = path.relative_to(place)
-                raise CheckFailedError(f"save wrote {name}, {reason}: {expected}")
+    with _saved(trial.fitted()) as directory:
+        for path in _files(directory):
+            reason = _pickled(path)
+            assert not reason, f"save wrote {path.relative_to(directory)}, {reason}: {expected}"
 
 
 @contextlib.contextmanager
@@ -305,15 +312,14 @@ def _saved(detector: Detector) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="oodd-check-") as name:
         with doing("save"):
             storable.save(Path(name))
-        if not _files(Path(name)):
-            raise CheckFailedError("save wrote no file into the directory that it was given")
+        assert _files(Path(name)), "save wrote no file into the directory that it was given"
         yield Path(name)
 
 
-def _loaded(trial: Trial, place: Path, **changes: Any) -> Detector:
+def _loaded(trial: Trial, directory: Path, **changes: Any) -> Detector:
     detector: StorableDetector = offered(trial.make(**changes), "save", "load")
     with doing("load"):
-        detector.load(place)
+        detector.load(directory)
     return detector
 
 
@@ -330,17 +336,14 @@ def _pickled(path: Path) -> str:
             for name in archive.namelist():
                 if Path(name).suffix in _PICKLE_SUFFIXES:
                     return f"which holds the pickle {name}"
-                with archive.open(name) as member:
-                    if name.endswith(".npy") and _holds_objects(member):
-                        return f"which holds Python objects in {name}"
-        return ""
     with path.open("rb") as file:
         # A pickle of protocol 2 or later begins with these two bytes.
-        if file.peek(2)[:2] in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}:
+        if file.read(2) in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}:
             return "a pickle by its first bytes"
-        holds_objects = path.suffix == ".npy" and _holds_objects(file)
-        return "which holds Python objects" if holds_objects else ""
-
-
-def _holds_objects(file: IO[bytes]) -> bool:
-    return npy_header(file)[0].hasobject
+    if path.suffix in {".npy", ".npz"}:
+        try:
+            arrays = np.load(path, allow_pickle=False)
+            [arrays[name] for name in getattr(arrays, "files", ())]
+        except ValueError:
+            return "which holds Python objects"
+    return ""

@@ -1,4 +1,4 @@
-"""Detectors of watchdogs: made by name or given, and fed row by row even if they do not stream."""
+"""Detectors of watchdogs: made by name or passed in, fed row by row even if they do not stream."""
 
 import warnings
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ Row = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class DetectorHandle:
     """A detector, with what it takes to make it again.
 
-    `name` is empty for an instance that was given; `alarm` is the statistic of its alarms, and
-    `actions` tells whether it is shown actions.
+    `name` is empty for an instance that was passed in; `alarm` is the statistic of its alarms, and
+    `actions` tells whether it gets actions.
     """
 
     detector: Detector
@@ -51,20 +51,22 @@ class Made:
             offer = discover().offer(detector)
             offer.require()
             spec = offer.spec
-            made = make_detector(spec.factory, seed=seed, horizon=horizon, parameters=parameters)
+            detector = make_detector(
+                spec.factory, seed=seed, horizon=horizon, parameters=parameters
+            )
             actions = spec.inputs == "observations+actions"
-            return cls(made, spec.name, kind or spec.alarm, actions, seed, horizon, parameters)
+            return cls(detector, spec.name, kind or spec.alarm, actions, seed, horizon, parameters)
         if not isinstance(detector, Detector):
             expected = "a name or an object with the methods fit(nominal) and score(trajectory)"
             raise UsageError(f"detector is {type(detector).__name__}, expected {expected}")
         return cls(detector, "", kind or "cusum", True, seed, horizon, parameters)
 
-    def shown(self, trajectory: Trajectory) -> Trajectory:
+    def visible(self, trajectory: Trajectory) -> Trajectory:
         """Return an episode as the detector may see it."""
         return trajectory if self.actions else trajectory.without_actions()
 
-    def told(self) -> dict[str, Any]:
-        """Return what `of` reads: JSON values."""
+    def state(self) -> dict[str, Any]:
+        """Return what `from_state` reads: JSON values."""
         return {
             "name": self.name,
             "statistic": self.alarm,
@@ -74,19 +76,19 @@ class Made:
         }
 
     @classmethod
-    def of(cls, told: Mapping[str, Any], detector: Detector | None) -> Self:
-        """Make a saved detector again, not fitted; `detector` is it where it has no name."""
-        if not told["name"] and detector is None:
+    def from_state(cls, state: Mapping[str, Any], detector: Detector | None) -> Self:
+        """Make a saved detector again, not fitted; one without a name is `detector`."""
+        if not state["name"] and detector is None:
             raise UsageError(
                 "this watchdog was fitted with an instance: load(directory, detector) needs one "
                 "with the same parameters"
             )
         return cls.make(
-            detector or told["name"],
-            told["statistic"],
-            int(told["seed"]),
-            int(told["horizon"]),
-            told["parameters"],
+            detector or state["name"],
+            state["statistic"],
+            int(state["seed"]),
+            int(state["horizon"]),
+            state["parameters"],
         )
 
 
