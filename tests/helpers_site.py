@@ -13,8 +13,14 @@ from helpers_records import make_record
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import EntryInfo, read_entries
-from oodd_eval.leaderboard.grants import Grant, digest_of, read_grants, write_grants
+from oodd_eval.leaderboard.entry import (
+    EntryInfo,
+    Grant,
+    digest_of,
+    read_entries,
+    read_grants,
+    write_grants,
+)
 from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.leaderboard.site.data import power_of, site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution

@@ -40,7 +40,7 @@ def make_submissions(home):
     full = submit(
         results, home / "full", statement, detectors="persistence", scores=True, split=split
     )
-    return Submissions(split, results, plain.place, full.place)
+    return Submissions(split, results, plain.path, full.path)
 
 
 class Draft:

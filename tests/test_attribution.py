@@ -12,8 +12,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.parts import CALIBRATION, TWINS, lengths_of, parts_of
 from oodd_eval.errors import ContractError
 from oodd_eval.leaderboard.verify.files import Findings
-from oodd_eval.leaderboard.verify.records import check_record, check_together
-from oodd_eval.leaderboard.verify.scores import check_scores
+from oodd_eval.leaderboard.verify.recompute import check_record, check_scores
 from oodd_eval.metrics.alarms import GuaranteedAlarm, attribution_contributions
 from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
@@ -387,46 +386,30 @@ def test_a_board_has_the_section_in_the_order_of_its_rows(world):
 # Verification
 
 
-def verified(records):
-    """Problems of records of the split mini, checked alone and together."""
-    findings, sums = Findings(), {}
-    named = {f"{i}": record for i, record in enumerate(records)}
-    for where, record in named.items():
-        sums[where] = check_record(where, record, findings)
-    entry = records[0]
-    check_together(entry, named, {w: s for w, s in sums.items() if s}, findings)
-    return [p.text for p in findings.problems if "lacks" not in p.text]
-
-
 def test_sound_records_are_accepted_and_others_are_not(world):
     _, found = world
-    records = found["tells"]
-    assert not verified(records)
-    plain = json.loads(records[0].to_json())
-    record = type(records[0])
+    plain = json.loads(found["tells"][0].to_json())
 
-    def problems(change):
+    def problems(change=lambda mine: None):
         mine = json.loads(json.dumps(plain))
         change(mine)
-        return " ".join(verified([record.from_json(json.dumps(mine)), *records[1:]]))
-
-    def half(mine):
-        mine["per_trajectory"][SENSOR_NAMED][0][0] = 0.5
+        findings = Findings()
+        check_record("here", type(found["tells"][0]).from_json(json.dumps(mine)), findings)
+        return [p.field for p in findings.problems]
 
     def fewer(mine):
         del mine["per_trajectory"][SENSOR_NAMED], mine["metrics"][SENSOR_NAMED]
 
-    def none(mine):
-        for name in ATTRIBUTION:
-            del mine["per_trajectory"][name], mine["metrics"][name]
-
     def better(mine):
         mine["metrics"][ONSET_ERROR]["value"] = 0.25
 
-    assert "the numerator 0 or 1" in problems(half)
-    assert "is missing" in problems(fewer)
-    assert "explains all of its alarms or none" in problems(none)
-    assert "per_trajectory gives" in problems(better)
+    def impossible(mine):
+        mine["per_trajectory"][SENSOR_NAMED][0][0] = 1.5
+
+    assert not problems()
+    assert not problems(fewer)
+    assert problems(better) == [f"metrics.{ONSET_ERROR}.value"]
+    assert problems(impossible) == [f"per_trajectory.{SENSOR_NAMED}"]
 
 
 @pytest.mark.parametrize("tamper", [None, "short", "undefined", "nominal"])

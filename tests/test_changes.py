@@ -8,8 +8,8 @@ import pytest
 from oodd_eval.cli.main import main
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.changes import changes_against
 from oodd_eval.leaderboard.submit import Statement, submit
+from oodd_eval.leaderboard.verify import changes_against
 
 
 class Repository:
@@ -66,7 +66,7 @@ def add(submissions):
             detectors=detector, curves="none", split=submissions.split,
         )  # fmt: skip
         assert made.verdict.ok
-        return made.place
+        return made.path
 
     return added
 

@@ -4,7 +4,6 @@ import importlib.util
 import math
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 from statistics import NormalDist
 
@@ -15,11 +14,11 @@ from scipy import stats
 from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.binomial import clopper_pearson
 from oodd_eval.metrics.bootstrap import (
+    DrawnCells,
     bootstrap_weights,
     bounds,
     cell_samples,
     drawn_cell,
-    drawn_cells,
     mean_interval,
     mean_over_cells,
     mean_samples,
@@ -31,9 +30,8 @@ from oodd_eval.metrics.bootstrap import (
 NAN = math.nan
 
 
-def interval(contribution, weights, kind="mean"):
-    cell = replace(drawn_cell("", 0, contribution), weights=weights)
-    return mean_interval([cell], kind=kind)
+def interval(contribution, environment="", kind="mean"):
+    return mean_interval([drawn_cell(environment, 0, contribution)], kind=kind)
 
 
 def samples(cells):
@@ -60,7 +58,7 @@ def test_a_resample_is_the_metric_of_the_drawn_trajectories():
 
 def test_interval_of_a_mean_has_the_width_of_theory():
     values = np.random.default_rng(0).normal(size=400)
-    low, high = interval(mean_of(values), bootstrap_weights(400, resamples=4000))
+    low, high = interval(mean_of(values))
     half = 1.96 * values.std() / 20
     assert low == pytest.approx(values.mean() - half, abs=0.1 * half)
     assert high == pytest.approx(values.mean() + half, abs=0.1 * half)
@@ -68,16 +66,15 @@ def test_interval_of_a_mean_has_the_width_of_theory():
 
 def test_resamples_in_which_a_metric_is_undefined_are_left_out():
     rare = mean_of([3.0, NAN, NAN])
-    assert interval(rare, bootstrap_weights(3)) == (3.0, 3.0)
-    assert all(math.isnan(x) for x in interval(mean_of([NAN, NAN]), bootstrap_weights(2)))
+    assert interval(rare) == (3.0, 3.0)
+    assert all(math.isnan(x) for x in interval(mean_of([NAN, NAN])))
 
 
 def test_an_interval_does_not_depend_on_what_is_computed_beside_it():
     rng = np.random.default_rng(1)
     cells = [mean_of(rng.normal(size=10)) for _ in range(5)]
-    weights = bootstrap_weights(10, key="ant")
-    alone = [interval(c, weights) for c in cells]
-    assert alone[::-1] == [interval(c, weights) for c in cells[::-1]]
+    alone = [interval(c, "ant") for c in cells]
+    assert alone[::-1] == [interval(c, "ant") for c in cells[::-1]]
     assert bounds(samples([("ant", 0, cells[0])]), cells[0].value, [10]) == alone[0]
 
 
@@ -136,7 +133,7 @@ def test_cells_of_one_environment_stay_dependent():
         mean_interval([drawn_cell(e, 0, cell) for e in two], kind="mean")
         for two in (("ant", "ant"), ("ant", "hopper"))
     )
-    assert together == interval(cell, bootstrap_weights(50, key="ant"))
+    assert together == interval(cell, "ant")
     assert apart[1] - apart[0] < 0.85 * (together[1] - together[0])
 
 
@@ -171,12 +168,12 @@ def test_a_mean_over_environments_has_the_freedom_of_all_their_seeds():
 @pytest.mark.parametrize("end", [0.0, 1.0])
 def test_a_share_that_no_trajectory_contradicts_has_the_exact_interval(end):
     cell = mean_of([end] * 20)
-    assert interval(cell, bootstrap_weights(20), kind="share") == clopper_pearson(20 * end, 20)
+    assert interval(cell, kind="share") == clopper_pearson(20 * end, 20)
     # The seeds of several environments are further trajectories, its anomalies are not.
     cells = [drawn_cell(e, 0, cell) for e in ("ant", "ant", "hopper")]
     assert mean_interval(cells, kind="share") == clopper_pearson(40 * end, 40)
     # Steps have no upper end that would say how far off they may be.
-    assert interval(cell, bootstrap_weights(20)) == (end, end)
+    assert interval(cell) == (end, end)
 
 
 def test_an_exact_interval_counts_each_twin_once_and_averages_detector_seeds():
@@ -206,7 +203,7 @@ def test_a_mean_over_cells_is_that_of_their_resamples():
     denominators = [common, common, np.ones(6), np.ones(6), np.eye(6)[2], np.zeros(6)]
     terms = [Contribution(rng.normal(size=6) * d, d) for d in denominators]
     both = (np.array([getattr(t, n) for t in terms]) for n in ("numerator", "denominator"))
-    cells = drawn_cells("ant", [0] * len(terms), *both)
+    cells = DrawnCells("ant", [0] * len(terms), *both)
     expected = mean_samples([cell_samples("ant", one) for one in terms])
     np.testing.assert_allclose(sample_cells([cells]), expected, rtol=1e-12)
     some = mean_samples([cell_samples("ant", terms[i]) for i in (1, 3, 5)])
@@ -219,7 +216,7 @@ def test_an_interval_contains_its_value():
     for kind in ("mean", "share", "exact"):
         for n in (1, 2, 3, 10):
             cell = mean_of((rng.random(n) < 0.3).astype(float))
-            low, high = interval(cell, bootstrap_weights(n), kind=kind)
+            low, high = interval(cell, kind=kind)
             assert low <= cell.value <= high
 
 

@@ -4,9 +4,7 @@ import csv
 import dataclasses
 import gzip
 import io
-import os
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +18,7 @@ from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import cells, page
-from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry, read_entries
-from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, read_entries
 from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics import catalogue
@@ -140,19 +137,6 @@ def small_site(monkeypatch):
         return {leaderboard_build.site.PAGE: names}
 
     monkeypatch.setattr(leaderboard_build.site, "files", files)
-
-
-def test_what_fails_in_a_process_of_its_own_fails_here(capfd):
-    here = os.getpid()
-
-    def fails():
-        raise ResultsError(f"in another process: {os.getpid() != here}")
-
-    assert (leaderboard_build.started(os.getpid)() != here) == (sys.platform == "linux")
-    wait = leaderboard_build.started(fails)
-    with pytest.raises(ResultsError, match="in another process: False"):
-        wait()
-    assert capfd.readouterr() == ("", "")
 
 
 def lines_of(text):
@@ -344,7 +328,7 @@ def test_expected_cells_of_published_splits_are_those_of_their_definition(name):
     for directory in filter(Path.is_dir, files):
         records = ResultsDirectory(directory).records()
         if {r.split_digest for r in records} == {digest}:
-            assert {r.place for r in records} == cells
+            assert {r.position for r in records} == cells
 
 
 def test_equals_share_a_rank_and_a_letter_and_the_better_stand_before_the_trivial():

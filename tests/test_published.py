@@ -13,8 +13,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.files import compress, decompress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard import published
-from oodd_eval.leaderboard.entry import EntryInfo, SubmittedEntry
-from oodd_eval.leaderboard.grants import Grant
+from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry
 from oodd_eval.leaderboard.placing import neighbours, placement, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
@@ -219,7 +218,7 @@ def test_a_row_with_too_few_seeds_shows_the_rank_that_it_would_have(shipped):
 def test_rows_with_few_cells_are_compared_on_these_and_what_they_lack_is_named(shipped):
     placed = placement(row("mine", 0.7, places=PLACES[:3], seeds=(0, 1)), shipped)
     assert placed.cells == set(PLACES[:3])
-    assert {r.place for r in placed.ranks.board.records} == set(PLACES[:3])
+    assert {r.position for r in placed.ranks.board.records} == set(PLACES[:3])
     assert placed.lacking == {
         Setting("mine"): "1 of 4 cells with seed 0 (hopper/gravity) and 1 of 4 cells with seed 1 "
         "(hopper/gravity) and 1 of 3 detector seeds"

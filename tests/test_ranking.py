@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics import pairs
+from oodd_eval.metrics import ranking as ranking_module
 from oodd_eval.metrics.auc import Contribution, mean_of
-from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds, drawn_cell, sample_cells
+from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.ranking import ALPHA, Ranking, holm, rank, tie_groups, win_rates
 
 CELLS = [("ant", "iid"), ("ant", "gravity"), ("hopper", "iid")]
@@ -288,66 +288,38 @@ def test_without_a_primary_row_every_variant_is_first():
     assert rank(ladder("ab"), primary=()).ranks == {"a": 1, "b": 1}
 
 
-def test_rare_differences_have_all_resamples_and_others_the_first(monkeypatch):
-    rng = np.random.default_rng(5)
-    cells = [(f"e{i}", "iid") for i in range(4)]
-    rows = {
+def noisy(count, step, seed, environments=4):
+    """Rows whose means rise by a step each, of one to three detector seeds."""
+    rng = np.random.default_rng(seed)
+    cells = [(f"e{i}", "iid") for i in range(environments)]
+    return {
         f"r{i}": {
-            seed: {c: mean_of(0.004 * i + 0.02 * rng.normal(size=10)) for c in cells}
+            seed: {c: mean_of(step * i + 0.02 * rng.normal(size=10)) for c in cells}
             for seed in range(1 + i % 3)
         }
-        for i in range(6)
+        for i in range(count)
     }
-    monkeypatch.setattr(pairs, "FIRST", 20_000)
-    whole = rank(rows, resamples=20_000).comparisons
-    monkeypatch.setattr(pairs, "FIRST", 4_000)
-    few = rank(rows, resamples=20_000).comparisons
-    rare = [c.p * 4_001 < 60 for c in whole]
-    assert 3 < sum(rare) < len(rare) - 3
-    for one, other, small in zip(few, whole, rare, strict=True):
-        assert one.p == (other.p if small else pytest.approx(other.p, rel=0.3))
 
 
-def test_neither_single_precision_nor_threads_change_what_is_beyond(monkeypatch):
-    rng = np.random.default_rng(9)
-    cells = [(f"e{i}", "iid") for i in range(5)]
-    rows = {
-        f"r{i}": {
-            seed: {c: mean_of(0.003 * i + 0.02 * rng.normal(size=10)) for c in cells}
-            for seed in range(1 + i % 3)
-        }
-        for i in range(7)
-    }
-    rows |= {"r0-again": rows["r0"], "constant": {0: {c: mean_of([0.5] * 10) for c in cells}}}
-    found = rank(rows, resamples=12_000).comparisons
-    monkeypatch.setattr(pairs, "_WEAK", math.inf)  # every one is too weak: all in double precision
-    assert rank(rows, resamples=12_000).comparisons == found
-    monkeypatch.undo()
-    for threads, block in ((1, 12_000), (5, 700)):
-        monkeypatch.setattr(pairs.os, "cpu_count", lambda threads=threads: threads)
-        monkeypatch.setattr(pairs, "_BLOCK", block)
-        assert rank(rows, resamples=12_000).comparisons == found
+def test_p_values_too_small_to_be_counted_are_nearly_those_of_more_resamples(monkeypatch):
+    rows = noisy(9, 0.004, seed=5)
+    counted = rank(rows, resamples=400_000).comparisons
+    monkeypatch.setattr(ranking_module, "RESAMPLES_PER_PAIR", 5_000)
+    few = rank(rows).comparisons
+    small = [(one.p, other.p) for one, other in zip(few, counted, strict=True)
+             if 1e-4 < other.p < ranking_module.ENOUGH / 30_000]  # fmt: skip
+    assert len(small) > 3
+    for p, expected in small:
+        assert 1 / 3 < p / expected < 3
+    # Further away they go on falling, where counting ends at 1 / (R + 1).
+    assert min(c.p for c in few) < 1e-5
 
 
-def test_pairs_share_draws(monkeypatch):
-    pairs._draws.cache_clear()
-    drawn = []
-
-    def weights(n, *, key, resamples):
-        drawn.append(key)
-        return bootstrap_weights(n, key=key, resamples=resamples)
-
-    monkeypatch.setattr(pairs, "bootstrap_weights", weights)
-    monkeypatch.setattr(pairs, "FIRST", 2_000)
-    cells = [(f"e{i}", "iid") for i in range(7)]
-    rng = np.random.default_rng(6)
-    rows = {
-        f"r{i}": {
-            seed: {c: mean_of(0.01 * i + 0.02 * rng.normal(size=10)) for c in cells}
-            for seed in range(3)
-        }
-        for i in range(12)
-    }
-    rank(rows, resamples=6_000)
-    # Rows with as many seeds have draws of their own: their seeds are not paired.
-    assert len(drawn) == len(set(drawn)) == len(cells) + len(rows)
+def test_blocks_of_resamples_do_not_change_what_is_beyond(monkeypatch):
+    rows = noisy(7, 0.003, seed=9)
+    constant = {0: {cell: mean_of([0.5] * 10) for cell in rows["r0"][0]}}
+    rows |= {"r0-again": rows["r0"], "constant": constant}
+    comparisons = rank(rows, resamples=3_000).comparisons
+    for block in (3_000, 700):
+        monkeypatch.setattr(ranking_module, "_BLOCK", block)
+        assert rank(rows, resamples=3_000).comparisons == comparisons

@@ -13,8 +13,14 @@ from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import read_entry
-from oodd_eval.leaderboard.rerun import ORDER, definition_of, draw, environments_of, read_order
 from oodd_eval.leaderboard.verify import verify_entry
+from oodd_eval.leaderboard.verify.rerun import (
+    ORDER,
+    definition_of,
+    draw,
+    environments_of,
+    read_order,
+)
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
 

@@ -11,8 +11,7 @@ import pytest
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.grants import read_grants
+from oodd_eval.leaderboard.entry import read_entries, read_grants
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting

@@ -1,7 +1,6 @@
 """The site as text: what is in the page, that it is safe, and that numbers are the board's."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -20,12 +19,17 @@ from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.site import gridded, packed
-from oodd_eval.leaderboard.site.data import WITH_INTERVALS, part_name, selections, site_data
-from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
+from oodd_eval.leaderboard.site.data import (
+    WITH_INTERVALS,
+    part_name,
+    selections,
+    shipped_split,
+    shown_episodes,
+    site_data,
+)
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.results.curve_file import read_curves
 
-GOLDEN = Path(__file__).parent / "golden" / "site-index.html"
 STATIC = Path(site.__file__).parent / "static"
 
 
@@ -75,14 +79,10 @@ def graded(tmp_path_factory):
 # -- the page -------------------------------------------------------------------------------------
 
 
-def test_page_is_the_golden_file(page):
-    """All but scripts and styles, which have files of their own."""
-    text = page.replace(f"Made by oodd-eval {__version__}.", "Made by oodd-eval 0.0.0.")
-    text = re.sub("(<script>|<style>).*?(?=</)", r"\1", text, flags=re.DOTALL)
-    text = re.sub("sha256-[^']*", "sha256-", text)
-    if "OODD_EVAL_WRITE_GOLDEN" in os.environ:
-        GOLDEN.write_text(text, encoding="utf-8")
-    assert text == GOLDEN.read_text(encoding="utf-8")
+def test_every_part_of_the_page_is_filled_in(page):
+    assert f"Made by oodd-eval {__version__}." in page
+    assert not re.search("@[a-z-]+@", re.sub("<(script|style).*?</", "", page, flags=re.DOTALL))
+    assert page.count("'sha256-") == 2
 
 
 def test_the_same_entries_give_the_same_files_in_any_order(entries, files):

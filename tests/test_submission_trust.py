@@ -11,11 +11,10 @@ from helpers_submission import Draft, assert_refused
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import PROTOCOL
-from oodd_eval.leaderboard.entry import read_entry
-from oodd_eval.leaderboard.grants import GRANTS
+from oodd_eval.leaderboard.entry import GRANTS, read_entry
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import verify_entry
-from oodd_eval.leaderboard.verify.trust import COMPARED, LEVEL, by_chance
+from oodd_eval.leaderboard.verify.rerun import COMPARED, LEVEL, by_chance
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
 
@@ -28,7 +27,7 @@ def entry(tmp_path_factory):
     home = tmp_path_factory.mktemp("entry")
     split = make_split(home / "split", THREE, calibration=20, name="three")
     evaluate("persistence", split, output=home / "out")
-    return submit(home / "out", home / "results", Statement(submitter="A. Tester")).place
+    return submit(home / "out", home / "results", Statement(submitter="A. Tester")).path
 
 
 @pytest.fixture(scope="module")

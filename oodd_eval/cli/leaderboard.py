@@ -13,15 +13,13 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expre
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.build import STALE, differences, stale, started, suite_parts
+from oodd_eval.leaderboard.build import STALE, differences, stale, suite_parts
 from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.changes import changes_against
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.grants import GRANTS
-from oodd_eval.leaderboard.rerun import read_order
+from oodd_eval.leaderboard.entry import GRANTS, read_entries
+from oodd_eval.leaderboard.verify import EntryVerdict, changes_against, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
-from oodd_eval.leaderboard.verify.trust import EntryVerdict, grant
+from oodd_eval.leaderboard.verify.rerun import read_order
 from oodd_eval.results.directory import ResultsDirectory
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
@@ -47,13 +45,12 @@ def build(options: Options) -> int:
     """
     output = options.output
     with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
-        suites = started(lambda: suite_parts(output))
         show("entries")
         entries = read_entries(options.results)
         if not entries:
             return say(f"no entries in {options.results}", 5)
         target = Path(fresh) if options.check else output
-        written = build_board(entries, target, suites, on_part=show)
+        written = build_board(entries, target, lambda: suite_parts(output), on_part=show)
         lines = differences(target, output) if options.check else []
     if not options.check:
         if options.verbosity >= 0:
@@ -117,7 +114,7 @@ def submit(options: Options) -> int:
     chosen = ("detectors", "complete", "scores", "curves", "split")
     how = {name: getattr(options, name) for name in chosen} | {"cells": options.expression}
     submitted = submission.submit(options.directory, options.results, statement, **how)
-    console, path = make_console(), submitted.place
+    console, path = make_console(), submitted.path
     for line in submitted.left_out if options.verbosity >= 0 else ():
         console.print(f"left out: {line}")
     report(console, submitted.verdict, options.verbosity)

@@ -1,16 +1,13 @@
 """The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
 
 import contextlib
-import multiprocessing
-import os
 import re
-import sys
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS
@@ -37,8 +34,6 @@ from oodd_eval.results.render.text import escape, markdown_body, markdown_list, 
 from oodd_eval.results.report import Section
 from oodd_eval.results.standings import primary_settings
 from oodd_eval.results.tables import Table, layout
-
-Result = TypeVar("Result")
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -108,7 +103,6 @@ def build(
     by_board = sections(entries)
     on_part("suites")
     further = suites()
-    beside = started(lambda: site.files(by_board, further.power, project=repository()))
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
     files: dict[str, str | bytes] = {PAGE: page(by_board, further.page, site=address)}
@@ -120,7 +114,8 @@ def build(
     files[PUBLISHED] = published_bytes(by_board, further.published)
     files[CELLS] = cells(by_board, further.cells)
     on_part("site")
-    files |= {f"{SITE}/{name}": content for name, content in beside().items()}
+    parts = site.files(by_board, further.power, project=repository())
+    files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
             write_text(output / name, content)
@@ -129,37 +124,6 @@ def build(
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
-
-
-def started(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Run a function in a forked process; return a function that waits for its result.
-
-    Where no process can be forked, or the function fails there, waiting calls it in this process,
-    which raises its error.
-    """
-    if sys.platform != "linux":
-        return function
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-
-    def work() -> None:
-        with contextlib.suppress(BaseException):
-            sender.send(function())
-        os._exit(0)  # what this process has begun is not to be finished twice
-
-    process = context.Process(target=work, daemon=True)
-    process.start()
-    sender.close()
-
-    def wait() -> Result:
-        try:
-            result: Result = receiver.recv()
-        except EOFError:
-            result = function()
-        process.join()
-        return result
-
-    return wait
 
 
 def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:

@@ -11,21 +11,25 @@ Records or curves of more than a megabyte are compressed: ``records.jsonl.xz``, 
 
 Entries are read here after they were verified (`oodd_eval.leaderboard.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.
+
+Levels of trust are granted by maintainers in one file, ``trust.json``, which lies beside the
+directory of the entries, so that no entry can write it. A grant names the digest of an
+``entry.json``, which has the digests of all other files: a changed entry has lost its grant.
 """
 
+import hashlib
 import json
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Literal, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.files import find_file
+from oodd_eval.data.files import find_file, write_text
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard.grants import Grant, Trust, digest_of, read_grants
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -35,6 +39,11 @@ SCHEMA: Final = 3  # version of the layout of an entry; a reader refuses others
 ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
 SCORES: Final = "scores"
+GRANTS: Final = "trust.json"
+
+Means = dict[str, dict[str, tuple[float, float]]]
+Trust = Literal["reported", "re-scored", "re-run"]
+TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest first
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +83,32 @@ class EntryInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class Grant:
+    """A level of trust above ``"reported"``, of the entry whose ``entry.json`` has a digest.
+
+    `by` is who granted it, `day` when (ISO 8601), and `how` what was compared with what. `means`
+    are over the cells that a re-run has, by row and metric: the entry's, and the re-run's.
+    """
+
+    entry: str
+    trust: Literal["re-scored", "re-run"]
+    by: str
+    day: str
+    how: str
+    means: Means = field(default_factory=dict)
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
+
+
+@dataclass(frozen=True, slots=True)
+class _GrantsLayout:
+    schema: Literal[1]  # version of the layout; others are refused
+    grants: dict[str, Grant]
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
+
+
+@dataclass(frozen=True, slots=True)
 class SubmittedEntry:
     """An entry that was read: `meta` is ``entry.json``, `path` its directory, `grant` its trust."""
 
@@ -103,14 +138,14 @@ def commands_of(records: Sequence[Record]) -> list[str]:
 
     Detectors share a command when their environments, anomalies, seeds and parameters are the same.
     """
-    found: dict[Setting, tuple[set[str], set[int], set[str]]] = {}
+    rows: dict[Setting, tuple[set[str], set[int], set[str]]] = {}
     for record in records:
-        environments, seeds, anomalies = found.setdefault(record.setting, (set(), set(), set()))
+        environments, seeds, anomalies = rows.setdefault(record.setting, (set(), set(), set()))
         environments.add(record.environment)
         seeds.add(record.seed)
         anomalies.add(record.condition)
     alike: dict[tuple[str, ...], list[str]] = {}
-    for setting, (environments, seeds, anomalies) in sorted(found.items(), key=_in_order):
+    for setting, (environments, seeds, anomalies) in sorted(rows.items(), key=_in_order):
         whole = environments == set(ENVIRONMENTS)
         options = ["--env", "all" if whole else ",".join(sorted(environments))]
         if anomalies != set(TABLE1):
@@ -146,8 +181,9 @@ def read_entry(path: Path | str) -> SubmittedEntry:
         raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ResultsError(f"{str(file)!r} is no entry: {place}: {first['msg']}") from None
+        path_in_file = ".".join(map(str, first["loc"]))
+        message = f"{path_in_file}: {first['msg']}"
+        raise ResultsError(f"{str(file)!r} is no entry: {message}") from None
     if meta.schema != SCHEMA:
         raise ResultsError(
             f"{str(file)!r}: schema is {meta.schema}, expected {SCHEMA}: it was written by another "
@@ -162,7 +198,7 @@ def read_entry(path: Path | str) -> SubmittedEntry:
 def _has_its_files(directory: Path, meta: EntryInfo) -> bool:
     """Tell whether the files that an entry names are as it says: a grant is of these."""
     named = {directory / name: known.get("sha256") for name, known in meta.files.items()}
-    return all(p.is_file() and digest_of(p.read_bytes()) == own for p, own in named.items())
+    return all(p.is_file() and digest_of(p.read_bytes()) == digest for p, digest in named.items())
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
@@ -173,8 +209,8 @@ def read_entries(root: Path | str) -> list[SubmittedEntry]:
     if (root / ENTRY).exists():
         return [read_entry(root)]
     # A name with a leading dot is an entry that is being written.
-    found = sorted(p.parent for p in root.glob(f"*/{ENTRY}") if not p.parent.name.startswith("."))
-    return [read_entry(path) for path in found]
+    paths = sorted(p.parent for p in root.glob(f"*/{ENTRY}") if not p.parent.name.startswith("."))
+    return [read_entry(path) for path in paths]
 
 
 def row_of(record: Record) -> tuple[Setting, str, int, int | None]:
@@ -184,12 +220,43 @@ def row_of(record: Record) -> tuple[Setting, str, int, int | None]:
 
 def recorded_versions(records: Iterable[Record]) -> dict[str, str]:
     """Return the versions that made records, by package and for ``python``, joined by ``+``."""
-    found: dict[str, set[str]] = {}
+    by_package: dict[str, set[str]] = {}
     for record in records:
         origin = record.provenance
         named = {"python": origin.get("python", ""), "oodd-eval": origin.get("oodd_eval", "")}
         # Records without a list of packages name the version of one.
         named |= origin.get("packages", {"numpy": origin.get("numpy", "")})
         for name, version in named.items():
-            found.setdefault(name, set()).add(str(version))
-    return {name: "+".join(sorted(versions)) for name, versions in sorted(found.items())}
+            by_package.setdefault(name, set()).add(str(version))
+    return {name: "+".join(sorted(versions)) for name, versions in sorted(by_package.items())}
+
+
+def digest_of(content: bytes) -> str:
+    """Return the SHA-256 digest of the bytes of a file, as grants and entries name it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_grants(results: Path) -> dict[str, Grant]:
+    """Return the grants beside a directory of entries, by the entry's name.
+
+    `ResultsError`: the file is not of its format.
+    """
+    file = results.absolute().parent / GRANTS
+    if not file.exists():
+        return {}
+    try:
+        return TypeAdapter(_GrantsLayout).validate_json(file.read_bytes()).grants
+    except (OSError, ValidationError) as error:
+        first = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
+        raise ResultsError(
+            f"{str(file)!r} holds no grants: {why}; restore it from the history"
+        ) from None
+
+
+def write_grants(results: Path, grants: Mapping[str, Grant]) -> Path:
+    """Write the grants beside a directory of entries, and return the file."""
+    file = results.absolute().parent / GRANTS
+    layout = _GrantsLayout(1, dict(sorted(grants.items())))
+    write_text(file, json.dumps(asdict(layout), indent=1, sort_keys=True) + "\n")
+    return file

@@ -59,7 +59,7 @@ def placement(
     new = {row: records for row, records in by_row.items() if row not in same}
     replaced = new.keys() & on_board.keys()
     expected = expected_cells(board.records)
-    has = [{r.place for r in records if r.ok} & expected for records in new.values()]
+    has = [{r.position for r in records if r.ok} & expected for records in new.values()]
     cells = set.intersection(*has) if has and expected not in has else expected
     if not cells:
         raise UsageError(
@@ -73,7 +73,7 @@ def placement(
     chosen |= {row.detector: row for row in new if str(row) in primary and row.detector in chosen}
     # With too few seeds a primary row has no rank. A variant has the one that it would have.
     first = first | {row for row in chosen.values() if not has_few_seeds(new[row])}
-    used = [r for rows in (on_board | new).values() for r in rows if r.place in cells]
+    used = [r for rows in (on_board | new).values() for r in rows if r.position in cells]
     lacking = {row: _lacking(rows, expected) for row, rows in new.items()}
     return Placement(
         ranks=ranked(used, first, board.rerun and board.rerun | new.keys(), expected=cells),
@@ -88,8 +88,8 @@ def placement(
 
 def _within(records: Sequence[Record], others: Sequence[Record]) -> bool:
     """Tell whether all numbers of a row are among those of another."""
-    known = {(r.place, r.seed, r.status): r.per_trajectory for r in others}
-    keys = [(r.place, r.seed, r.status) for r in records]
+    known = {(r.position, r.seed, r.status): r.per_trajectory for r in others}
+    keys = [(r.position, r.seed, r.status) for r in records]
     return all(
         key in known and same_terms(known[key], r.per_trajectory)
         for key, r in zip(keys, records, strict=True)
@@ -102,7 +102,7 @@ def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
     sizes = grouped(expected, lambda cell: cell[0])
     parts = []
     for seed, of_seed in sorted(seeds.items()):
-        missing = grouped(sorted(expected - {r.place for r in of_seed if r.ok}), lambda c: c[0])
+        missing = grouped(sorted(expected - {r.position for r in of_seed if r.ok}), lambda c: c[0])
         named = [
             e if len(cells) == len(sizes[e]) else ", ".join(map("/".join, cells))
             for e, cells in missing.items()

@@ -71,9 +71,9 @@ class Published(NamedTuple):
     @property
     def suites(self) -> dict[str, Board]:
         """The boards of further suites with several strengths, by name; reading them takes long."""
-        records = read_records(self.file, wanted=lambda line: _OF_SUITE in line)
+        records = read_records(self.file, matches=lambda line: _OF_SUITE in line)
         by_suite = grouped(records, lambda r: str(r.provenance["suite"]))
-        return {name: Board(own) for name, own in by_suite.items()}
+        return {name: Board(records) for name, records in by_suite.items()}
 
 
 def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
@@ -113,26 +113,28 @@ def published_file() -> Path:
     `ResultsError`: there is none.
     """
     here = Path(__file__)
-    found = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
-    for place in found:
-        if place.is_file():
-            return place
+    candidates = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
+    for path in candidates:
+        if path.is_file():
+            return path
     raise ResultsError(
-        f"this installation has no published board: expected {str(found[0])!r}; install oodd-eval "
-        "from its wheel, or run leaderboard build in its checkout"
+        f"this installation has no published board: expected {str(candidates[0])!r}; install "
+        "oodd-eval from its wheel, or run leaderboard build in its checkout"
     )
 
 
 def read_published(file: Path | None = None) -> Published:
     """Read the boards of the file, by default the one of this installation."""
     file = file or published_file()
-    found = []
-    for board in boards(read_records(file, wanted=lambda line: _OF_SUITE not in line)):
+    published = []
+    for board in boards(read_records(file, matches=lambda line: _OF_SUITE not in line)):
         origin = {r.setting: r.provenance for r in board.records}
-        entries, trust = ({row: own[k] for row, own in origin.items()} for k in ("entry", "trust"))
-        primary = {row for row, own in origin.items() if own["primary"]}
-        found.append(PublishedBoard(board.records, entries, trust, primary))
-    return Published(found, file)
+        entries, trust = (
+            {row: about[k] for row, about in origin.items()} for k in ("entry", "trust")
+        )
+        primary = {row for row, about in origin.items() if about["primary"]}
+        published.append(PublishedBoard(board.records, entries, trust, primary))
+    return Published(published, file)
 
 
 def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:

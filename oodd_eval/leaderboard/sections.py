@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard.entry import SubmittedEntry, row_of
-from oodd_eval.leaderboard.grants import Trust
+from oodd_eval.leaderboard.entry import SubmittedEntry, Trust, row_of
 from oodd_eval.results.board import Board, boards, expected_cells, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
@@ -121,7 +120,7 @@ def _primary(
     primary = {row.detector: row for row in primary_settings(records, rerun)}
     expected = expected_cells(records)
     by_row = grouped(records, lambda r: r.setting)
-    cells = {row: expected & {r.place for r in rows} for row, rows in by_row.items()}
+    cells = {row: expected & {r.position for r in rows} for row, rows in by_row.items()}
     declared: dict[str, Setting] = {}
     for row, entry in sources.items():
         if str(row) not in entry.meta.primary:

@@ -15,10 +15,15 @@ from oodd_eval.data.files import compress_large, digests
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
-from oodd_eval.leaderboard.verify import Seen, check_clashes, find_split, formats, verify_entry
+from oodd_eval.leaderboard.verify import (
+    EntryVerdict,
+    Seen,
+    check_clashes,
+    find_split,
+    formats,
+    verify_entry,
+)
 from oodd_eval.leaderboard.verify.files import Findings
-from oodd_eval.leaderboard.verify.scores import first_seeds
-from oodd_eval.leaderboard.verify.trust import EntryVerdict
 from oodd_eval.names import expression, select
 from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
@@ -45,12 +50,12 @@ class Statement:
 
 
 class Submission(NamedTuple):
-    """The place of an entry and its verdict; nothing is left there with a problem.
+    """The directory of an entry and its verdict; nothing is left there with a problem.
 
     `left_out` has a line for each seed of a row that was left out as incomplete.
     """
 
-    place: Path
+    path: Path
     verdict: EntryVerdict
     left_out: list[str]
 
@@ -67,16 +72,16 @@ def submit(
     curves: Extent = "rows",
     split: str | Path | None = None,
 ) -> Submission:
-    """Write an entry from a results directory, verify it, and move it to its place in `root`."""
+    """Write an entry from a results directory, verify it, and move it into `root`."""
     source, root = ResultsDirectory(results), Path(root)
     records, left_out = selected(source.records(), detectors, cells, complete=complete)
     _check_publishable(records)
     entry = _info(records, statement)
-    place = root / entry.id
-    if os.path.lexists(place):
+    path = root / entry.id
+    if os.path.lexists(path):
         advice = "name another with --id, or remove it first if this one replaces it"
         raise UsageError(f"entry {entry.id!r} is there already, in {str(root)!r}: {advice}")
-    with _written(place) as directory:
+    with _written(path) as directory:
         text = "".join(record.to_json() + "\n" for record in records)
         (directory / RECORDS).write_text(text, encoding="utf-8")
         compress_large(directory / RECORDS)
@@ -107,8 +112,8 @@ def submit(
                 check_clashes(other.meta.id, numbered, seen, Findings())
             check_clashes(verdict.name, verdict.records, seen, verdict.findings)
         if verdict.ok:
-            directory.rename(place)
-    return Submission(place, verdict, left_out)
+            directory.rename(path)
+    return Submission(path, verdict, left_out)
 
 
 def selected(
@@ -118,8 +123,8 @@ def selected(
     if not records:
         raise UsageError("these results have no records: expected those of a finished run")
     names = select("detector of these results", detectors, sorted({r.detector for r in records}))
-    wanted = expression(cells) if cells else lambda _: True
-    chosen = [r for r in records if r.detector in names and wanted(str(r.cell))]
+    matches = expression(cells) if cells else lambda _: True
+    chosen = [r for r in records if r.detector in names and matches(str(r.cell))]
     if not chosen:
         raise UsageError(f"-k {cells!r} selects none of the {len(records)} records")
     left_out: list[str] = []
@@ -127,8 +132,9 @@ def selected(
         chosen, left_out = _complete(chosen)
     environments = in_order((r.environment for r in chosen), ENVIRONMENTS)
     anomalies = in_order((r.anomaly for r in chosen), ANOMALIES)
-    places = environments.index, anomalies.index
-    chosen.sort(key=lambda r: (places[0](r.environment), places[1](r.anomaly), r.strength))
+    chosen.sort(
+        key=lambda r: (environments.index(r.environment), anomalies.index(r.anomaly), r.strength)
+    )
     chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
     return [_publishable(r) for r in chosen], left_out
 
@@ -137,9 +143,9 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Leave out the seeds of rows that lack cells which any row here has."""
     cells: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for r in records:
-        cells[r.cell.label].add(r.place)
+        cells[r.cell.label].add(r.position)
     every = set().union(*cells.values())
-    partial = {label: len(own) for label, own in sorted(cells.items()) if own != every}
+    partial = {label: len(has) for label, has in sorted(cells.items()) if has != every}
     if len(partial) == len(cells):
         raise UsageError(
             f"--complete: no row of these results has all {len(every)} cells that occur in them; "
@@ -160,6 +166,15 @@ def _publishable(record: Record) -> Record:
     if formats.complaint(formats.FreeValue, origin.get("command", "")):
         del origin["command"]
     return replace(record, reason=reason, provenance=origin)
+
+
+def first_seeds(records: Iterable[Record]) -> dict[Setting, int]:
+    """Return the lowest seed of each row that has an evaluated cell."""
+    seeds: dict[Setting, int] = {}
+    for record in records:
+        if record.ok:
+            seeds[record.setting] = min(seeds.get(record.setting, record.seed), record.seed)
+    return seeds
 
 
 def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
@@ -204,7 +219,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
         raise UsageError("the names of these detectors make no short id: choose one with --id")
     if complaint:
         raise UsageError(f"--id {complaint}")
-    shown = ", ".join(detectors[:3]) + (f" and {len(detectors) - 3} more" * (len(detectors) > 3))
+    title = ", ".join(detectors[:3]) + (f" and {len(detectors) - 3} more" * (len(detectors) > 3))
     plugins = []
     for plugin, *source in sorted(
         {(r.plugin, r.detector_version, r.plugin_source) for r in records}
@@ -221,7 +236,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     }
     stated = asdict(statement) | {
         "id": name,
-        "title": statement.title or f"{shown} on {first.split}",
+        "title": statement.title or f"{title} on {first.split}",
         "primary": [str(Setting.parse(row)) for row in statement.primary],
     }
     return EntryInfo(
@@ -247,13 +262,13 @@ def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: s
 
 
 @contextmanager
-def _written(place: Path) -> Iterator[Path]:
-    """Give a directory to write, beside the place; it is gone afterwards unless it was moved."""
-    directory = place.with_name(f".{place.name}.{os.getpid()}")
+def _written(path: Path) -> Iterator[Path]:
+    """Yield a directory beside the path, which is removed afterwards unless it was moved."""
+    directory = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         directory.mkdir(parents=True)
         yield directory
     except OSError as error:
-        raise OutputError(f"{str(place)!r} cannot be written: {error}") from error
+        raise OutputError(f"{str(path)!r} cannot be written: {error}") from error
     finally:
         shutil.rmtree(directory, ignore_errors=True)

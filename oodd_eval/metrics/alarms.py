@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, LEVELS
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
 from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
 Floats = NDArray[np.float64]
@@ -72,6 +72,11 @@ class GuaranteedAlarm:
             score itself, for a detector that accumulates by itself; the threshold is from all.
         confidence
             See `quantile_rank`.
+
+        Returns
+        -------
+        GuaranteedAlarm
+            Its threshold is infinite where there are too few episodes for the level.
         """
         return cls.fits(calibration, [level], kind, confidence)[0]
 
@@ -159,6 +164,11 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     kind
         The statistic: with the CUSUM half of them standardize the scores.
 
+    Returns
+    -------
+    dict
+        Share of nominal episodes with an alarm by suffix, the largest first.
+
     Examples
     --------
     >>> list(offered_levels(40, "cusum")), list(offered_levels(40, "score"))
@@ -193,17 +203,22 @@ def guaranteed_contributions(
         The first row of each anomalous trajectory that differs from its twin.
     rule
         Made by `GuaranteedAlarm.fit`.
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
     """
     loud, quiet = ([rule.first(scores) for scores in part] for part in (anomalous, twins))
-    found = {"false_episodes": mean_of([float(first is not None) for first in quiet])}
+    alarms = [float(first is not None) for first in quiet]
+    contributions = {"false_episodes": mean_of(alarms)}
     lengths = [[len(scores) for scores in part] for part in (anomalous, twins)]
     ends = list(map(min, *lengths))
-    own = _from_effect(loud, lengths[0], ends, effects)
     nulls = _from_effect(quiet, lengths[1], ends, effects)
-    for name, contribution in own.items():
-        found[name] = contribution
-        found[f"{name}_null"] = nulls[name]
-    return found
+    for name, contribution in _from_effect(loud, lengths[0], ends, effects).items():
+        contributions[name] = contribution
+        contributions[f"{name}_null"] = nulls[name]
+    return {name: contributions[name] for name in GUARANTEED}
 
 
 def _from_effect(
@@ -228,12 +243,12 @@ def _from_effect(
         delays.append(delay if defined else nothing)
         missed.append(float(first is None) if defined else nothing)
         censored.append((remainder if first is None else delay) if defined else nothing)
-        for k, found in within.items():
+        for k, shares in within.items():
             seen = first is not None and first < end and delay < k
-            found.append(float(seen) if defined and effect < end else nothing)
+            shares.append(float(seen) if defined and effect < end else nothing)
     values = {"early": early, "delay": delays, "missed": missed, "delay_censored": censored}
-    values |= {f"found_within_{k}": found for k, found in within.items()}
-    return {name: mean_of(own) for name, own in values.items()}
+    values |= {f"found_within_{k}": shares for k, shares in within.items()}
+    return {name: mean_of(terms) for name, terms in values.items()}
 
 
 def attribution_contributions(
@@ -261,6 +276,11 @@ def attribution_contributions(
         The first row of each trajectory that differs from its twin.
     rule
         Made by `GuaranteedAlarm.fit`.
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
     """
     named, errors = np.full((2, len(anomalous)), np.nan)
     for i, (scores, effect) in enumerate(zip(anomalous, effects, strict=True)):

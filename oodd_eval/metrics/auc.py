@@ -8,7 +8,7 @@ Time runs over observation rows. The ``onset`` is the row from which on an anoma
 ``effect`` is the first row that differs from the nominal twin's, at the onset or after it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, Standardization, cusum
 
 Floats = NDArray[np.float64]
@@ -26,9 +27,14 @@ FAR_START: Final = 20  # first row that ``far`` counts: horizons and warm-ups en
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """A ratio of sums: numerators and denominators of n test trajectories, 0 / 0 if undefined.
+    """A ratio of sums over n test trajectories, or a median of theirs.
 
-    Where it is a `median`, denominators are 1, and the value is the median of the numerators.
+    Parameters
+    ----------
+    numerator, denominator
+        Float64 arrays of shape (n,), both 0 for a trajectory in which the metric is undefined.
+    median
+        Whether the value is the median of the numerators; then denominators are 1 or 0.
 
     Examples
     --------
@@ -110,18 +116,26 @@ def smoothed(x: Floats, weight: float = SMOOTHING) -> Floats:
     >>> smoothed(np.array([np.nan, 1.0, 1.0]), weight=0.5).tolist()
     [nan, 0.5, 0.75]
     """
-    found = np.full(len(x), np.nan)
+    averages = np.full(len(x), np.nan)
     level = 0.0
     for t, value in enumerate(x.tolist()):
         if value == value:  # noqa: PLR0124  # not NaN
             level = (1 - weight) * level + weight * value
-            found[t] = level
-    return found
+            averages[t] = level
+    return averages
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmRule:
-    """Standardization, drift and threshold that turn scores into the paper's alarms."""
+    """The rule that turns scores into the paper's alarms.
+
+    Parameters
+    ----------
+    standardization
+        Mean and standard deviation of calibration scores.
+    drift, threshold
+        Those of `oodd_eval.metrics.cusum.cusum`, in the unit of standardized scores.
+    """
 
     standardization: Standardization
     drift: float = DRIFT
@@ -139,6 +153,57 @@ def first_delay(alarms: NDArray[np.bool_], onset: int) -> float:
     return float(late[0]) if late.size else float("nan")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EpisodePair:
+    """Scores of an anomalous episode, of its nominal twin and of the next seed's twin.
+
+    Attributes
+    ----------
+    anomalous, twin, next_twin
+        One float64 score a row; `next_twin` is empty where there is one twin alone.
+    onset, effect
+        The row from which the anomaly is in force, and the first that differs from the twin's.
+    standardization
+        That of the calibration scores.
+    """
+
+    anomalous: Floats
+    twin: Floats
+    next_twin: Floats
+    onset: int
+    effect: int
+    standardization: Standardization
+
+    @property
+    def stop(self) -> int:
+        """Number of rows that both episodes have."""
+        return min(len(self.anomalous), len(self.twin))
+
+    @property
+    def common_stop(self) -> int:
+        """Number of rows that all three episodes have."""
+        return min(self.stop, len(self.next_twin))
+
+
+def _auc_smoothed(pair: EpisodePair) -> float:
+    anomalous, twin = (
+        smoothed(pair.standardization(scores[: pair.stop]))
+        for scores in (pair.anomalous, pair.twin)
+    )
+    return auc_same_times(anomalous, twin, pair.effect, pair.stop)
+
+
+AUCS: Final[Mapping[str, Callable[[EpisodePair], float]]] = {
+    "auc": lambda p: auc_onset(p.anomalous, p.onset),
+    "auc_null": lambda p: auc_onset(p.twin, p.onset),
+    "auc_matched": lambda p: auc_same_times(p.anomalous, p.twin, p.effect, p.stop),
+    "auc_placebo": lambda p: auc_same_times(p.twin, p.next_twin, p.effect, p.common_stop),
+    "auc_unpaired": lambda p: auc_same_times(p.anomalous, p.next_twin, p.effect, p.common_stop),
+    "auc_smoothed": _auc_smoothed,
+}
+"""Functions of one episode, by the name that the catalogue has for their mean over episodes."""
+
+
 def auc_contributions(
     anomalous: Sequence[Floats],
     twins: Sequence[Floats],
@@ -146,41 +211,37 @@ def auc_contributions(
     effects: Sequence[int],
     standardization: Standardization,
 ) -> dict[str, Contribution]:
-    """Return the AUCs of one cell, from scores of the anomalous trajectories and of their twins.
-
-    The standardization, of the calibration scores, is for ``auc_smoothed``.
+    """Return the AUCs of one cell.
 
     ``auc`` and ``auc_null`` compare rows from the onset on with rows before it. The others compare
     two trajectories at the same times, from the effect to the end of the shortest of those that
     are involved: with more times of one than of the other, their phase would be compared.
     ``auc_placebo`` compares twin i with twin i + 1 (the last with the first), ``auc_unpaired`` the
     anomalous trajectory i with twin i + 1.
+
+    Parameters
+    ----------
+    anomalous, twins
+        Scores of the n anomalous trajectories and of their nominal twins.
+    onsets, effects
+        For each, the first row in which the anomaly is in force, and the first that differs from
+        the twin's.
+    standardization
+        That of the calibration scores, for ``auc_smoothed``.
+
+    Returns
+    -------
+    dict
+        The metrics of `AUCS` by name.
     """
-    found: dict[str, list[float]] = {
-        name: []
-        for name in (
-            "auc",
-            "auc_null",
-            "auc_matched",
-            "auc_placebo",
-            "auc_unpaired",
-            "auc_smoothed",
+    next_twins = [*twins[1:], twins[0]] if len(twins) > 1 else [np.zeros(0)] * len(twins)
+    pairs = [
+        EpisodePair(a, b, c, int(onset), int(effect), standardization)
+        for a, b, c, onset, effect in zip(
+            anomalous, twins, next_twins, onsets, effects, strict=True
         )
-    }
-    for i, (a, b, onset, effect) in enumerate(
-        zip(anomalous, twins, map(int, onsets), map(int, effects), strict=True)
-    ):
-        stop = min(len(a), len(b))
-        other = twins[(i + 1) % len(twins)] if len(twins) > 1 else np.zeros(0)
-        both = min(stop, len(other))
-        mean_a, mean_b = (smoothed(standardization(s[:stop])) for s in (a, b))
-        found["auc"].append(auc_onset(a, onset))
-        found["auc_null"].append(auc_onset(b, onset))
-        found["auc_matched"].append(auc_same_times(a, b, effect, stop))
-        found["auc_placebo"].append(auc_same_times(b, other, effect, both))
-        found["auc_unpaired"].append(auc_same_times(a, other, effect, both))
-        found["auc_smoothed"].append(auc_same_times(mean_a, mean_b, effect, stop))
-    return {name: mean_of(values) for name, values in found.items()}
+    ]
+    return {name: mean_of([function(p) for p in pairs]) for name, function in AUCS.items()}
 
 
 def alarm_contributions(
@@ -215,9 +276,18 @@ def cell_contributions(
     effects: Sequence[int],
     rule: AlarmRule,
 ) -> dict[str, Contribution]:
-    """Return all metrics of one cell that need no level, in the order of the catalogue."""
-    found = auc_contributions(anomalous, twins, onsets, effects, rule.standardization)
-    return found | alarm_contributions(anomalous, twins, onsets, rule)
+    """Return all metrics of one cell that need no level, in the order of the catalogue.
+
+    Parameters
+    ----------
+    anomalous, twins, onsets, effects
+        As those of `auc_contributions`.
+    rule
+        The paper's alarms.
+    """
+    contributions = auc_contributions(anomalous, twins, onsets, effects, rule.standardization)
+    contributions |= alarm_contributions(anomalous, twins, onsets, rule)
+    return {name: contributions[name] for name in METRICS}
 
 
 def _rate(pairs: Sequence[tuple[NDArray[np.bool_], Floats]]) -> Contribution:

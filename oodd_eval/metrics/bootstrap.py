@@ -15,7 +15,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Final, NamedTuple
 
@@ -66,6 +66,11 @@ def resampled(contribution: Contribution, weights: Weights) -> Samples:
     return numerator / _total(contribution.denominator, weights)
 
 
+def cell_samples(environment: str, contribution: Contribution) -> Samples:
+    """Return the resamples of one cell, with the weights that its environment shares."""
+    return resampled(contribution, shared_weights(environment, len(contribution.numerator)))
+
+
 def _total(denominator: Floats, weights: Weights) -> Samples:
     """Return a denominator in every resample, NaN for 0."""
     total = np.einsum("rn,n->r", weights, denominator)
@@ -94,102 +99,72 @@ class CellSum(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnCells:
-    """A metric of cells of one environment, with its weights.
+    """A metric of cells of one environment, which share its weights.
 
-    `seeds` are their detector seeds, `values` the metric of each, NaN where it is undefined.
-    Numerators and denominators have shape (cells, n), see `Contribution`; denominators are 1 or 0
-    where values are `median`s.
+    Attributes
+    ----------
+    environment, seeds
+        The environment, and the detector seed of each cell.
+    numerators, denominators
+        Terms of shape (cells, n), see `Contribution`.
+    median
+        Whether values are medians; then denominators are 1 or 0.
     """
 
     environment: str
     seeds: Sequence[int]
     numerators: Floats
     denominators: Floats
-    values: Sequence[float]
-    weights: Weights
     median: bool = False
 
     @functools.cached_property
+    def values(self) -> list[float]:
+        """The metric of each cell, NaN where it is undefined."""
+        if self.median:
+            terms = zip(self.numerators, self.denominators, strict=True)
+            return [Contribution(*both, self.median).value for both in terms]
+        totals = self.denominators.sum(axis=1)
+        values: list[float] = (
+            self.numerators.sum(axis=1) / np.where(totals == 0, np.nan, totals)
+        ).tolist()
+        return values
+
+    @property
     def sizes(self) -> list[int]:
         """The number of trajectories that contribute to each cell."""
-        found: list[int] = np.count_nonzero(self.denominators, axis=1).tolist()
-        return found
+        sizes: list[int] = np.count_nonzero(self.denominators, axis=1).tolist()
+        return sizes
 
-    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded: an old one is let go
-    def only(self, places: tuple[int, ...]) -> "DrawnCells":
-        """Return some of the cells."""
-        at = list(places)
-        return replace(
-            self,
-            seeds=[self.seeds[i] for i in at],
-            values=[self.values[i] for i in at],
-            numerators=self.numerators[at],
-            denominators=self.denominators[at],
-        )
+    def only(self, cells: Sequence[int]) -> "DrawnCells":
+        """Return the cells at some indices."""
+        seeds = [self.seeds[i] for i in cells]
+        terms = self.numerators[list(cells)], self.denominators[list(cells)]
+        return DrawnCells(self.environment, seeds, *terms, self.median)
 
-    @functools.lru_cache(maxsize=512)  # noqa: B019  bounded: means over several environments share
+    @functools.cached_property
     def sums(self) -> list[CellSum]:
-        """Return sums over cells of each seed in every resample.
+        """Sums over cells of each seed in every resample.
 
         Ratios with the same denominators are added before they are resampled: many metrics have
         those of all anomalies in common.
         """
         groups: dict[object, list[int]] = {}
         for i, seed in enumerate(self.seeds):
-            own = i if self.median else (seed, self.denominators[i].tobytes())
-            groups.setdefault(own, []).append(i)
-        if self.median:
-            terms = zip(self.numerators, self.denominators, strict=True)
-            found = [_medians(Contribution(*both), self.weights) for both in terms]
-        else:
-            added = np.array([self.numerators[places].sum(axis=0) for places in groups.values()])
-            drawn = np.einsum("rn,gn->gr", self.weights, added)
-            found = [
-                own / self._total(self.denominators[places[0]])
-                for own, places in zip(drawn, groups.values(), strict=True)
-            ]
-        return [
-            CellSum(self.seeds[places[0]], own, len(places))
-            for own, places in zip(found, groups.values(), strict=True)
-        ]
-
-    def _total(self, denominator: Floats) -> Samples:
-        if self.weights is shared_weights(self.environment, len(denominator)):
-            return _shared(self.environment, denominator.tobytes())
-        return _total(denominator, self.weights)
-
-
-@functools.lru_cache(maxsize=2048)
-def _shared(environment: str, terms: bytes) -> Samples:
-    """Return a denominator in every resample, which metrics of one level have in common."""
-    own = np.frombuffer(terms)
-    return _total(own, shared_weights(environment, len(own)))
-
-
-def drawn_cells(
-    environment: str,
-    seeds: Sequence[int],
-    numerators: Floats,
-    denominators: Floats,
-    *,
-    median: bool = False,
-) -> DrawnCells:
-    """Return cells with the weights that their environment shares."""
-    values: Sequence[float]
-    if median:
-        both = zip(numerators, denominators, strict=True)
-        values = [Contribution(*terms, median).value for terms in both]
-    else:
-        totals = denominators.sum(axis=1)
-        values = (numerators.sum(axis=1) / np.where(totals == 0, np.nan, totals)).tolist()
-    weights = shared_weights(environment, numerators.shape[1])
-    return DrawnCells(environment, seeds, numerators, denominators, values, weights, median)
+            key = i if self.median else (seed, self.denominators[i].tobytes())
+            groups.setdefault(key, []).append(i)
+        added = np.array([self.numerators[cells].sum(axis=0) for cells in groups.values()])
+        sums = []
+        for numerator, cells in zip(added, groups.values(), strict=True):
+            terms = Contribution(numerator, self.denominators[cells[0]], self.median)
+            samples = cell_samples(self.environment, terms)
+            sums.append(CellSum(self.seeds[cells[0]], samples, len(cells)))
+        return sums
 
 
 def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCells:
-    """Return a cell of a detector seed with the weights that its environment shares."""
+    """Return one cell of a detector seed."""
     terms = contribution.numerator[None], contribution.denominator[None]
-    return drawn_cells(environment, [seed], *terms, median=contribution.median)
+    return DrawnCells(environment, [seed], *terms, median=contribution.median)
 
 
 def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[float, float]:
@@ -257,10 +232,10 @@ def bounds(values: Samples, value: float, sizes: Sequence[int]) -> tuple[float, 
 
 def _percentile(ordered: Samples, share: float) -> float:
     """Return a percentile as NumPy's default does, which takes longer for a few thousand values."""
-    place = share * (len(ordered) - 1)
-    first = min(int(place), len(ordered) - 1)
+    rank = share * (len(ordered) - 1)
+    first = min(int(rank), len(ordered) - 1)
     low, high = ordered[first], ordered[min(first + 1, len(ordered) - 1)]
-    return float(low + (place - first) * (high - low))
+    return float(low + (rank - first) * (high - low))
 
 
 def _corrected(quantile: float, bias: float, acceleration: float) -> float:
@@ -313,15 +288,6 @@ def mean_over_cells(values: Iterable[tuple[int, float]]) -> float:
     return nan_mean(map(nan_mean, by_seed.values()))
 
 
-def cell_samples(environment: str, contribution: Contribution) -> Samples:
-    """Return the resamples of one cell, with the weights that its environment shares."""
-    weights = shared_weights(environment, len(contribution.numerator))
-    if contribution.median:
-        return _medians(contribution, weights)
-    numerator: Samples = np.einsum("rn,n->r", weights, contribution.numerator)
-    return numerator / _shared(environment, contribution.denominator.tobytes())
-
-
 def mean_samples(parts: Sequence[Samples]) -> Samples:
     """Return the mean of several numbers in every resample, over those that are defined there."""
     stacked = np.array(parts)
@@ -365,7 +331,7 @@ def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
     several detectors or anomalies are paired.
     """
     by_seed: dict[int, list[CellSum]] = {}
-    for one in itertools.chain.from_iterable(c.sums() for c in cells):
+    for one in itertools.chain.from_iterable(c.sums for c in cells):
         by_seed.setdefault(one.seed, []).append(one)
     return mean_over_seeds([_mean_of(by_seed[seed]) for seed in sorted(by_seed)])
 

@@ -37,32 +37,40 @@ UNDEFINED: Final = "\N{EN DASH}"  # printed for NaN
 
 @dataclass(frozen=True, slots=True)
 class MetricInfo:
-    """Facts about one metric.
+    """Facts about one metric, as ``catalogue.toml`` has them.
 
-    Its unit is ``"percent"`` for a share that is printed in percent, ``"steps"`` for observation
-    rows, ``"rate"`` for a plain number, such as alarms per step. `better` is empty where a metric
-    describes a benchmark or a setting, `null` is the metric that says what chance or false alarms
-    alone give, and `level` is the level of guaranteed alarms, such as ``"5 %"``. A cell's value is
-    a mean over trajectories, unless it is a `median`.
+    Attributes
+    ----------
+    name, title, summary
+        Name in records, heading of a column, and meaning in one line.
+    unit
+        ``"percent"`` for a share that is printed in percent, ``"steps"`` for observation rows,
+        ``"rate"`` for a plain number, such as alarms per step.
+    range
+        Least and largest value of a trajectory, in the unit of records: shares are within [0, 1].
+    interval
+        Kind of the interval, see `oodd_eval.metrics.bootstrap.mean_interval`; empty for a metric
+        that is no ratio of sums over trajectories.
+    better
+        The better side; empty where a metric describes a benchmark or a setting.
+    null
+        The metric that says what chance or false alarms alone give.
+    level
+        The level of guaranteed alarms, such as ``"5 %"``.
+    median
+        Whether a cell's value is the median over trajectories and not their mean.
     """
 
     name: str
     title: str
     summary: str
     unit: Unit
+    range: tuple[float, float]
+    interval: IntervalKind
     better: Better = ""
     null: str = ""
     level: str = ""
     median: bool = False
-
-    @property
-    def interval(self) -> IntervalKind:
-        """Kind of its interval, see `oodd_eval.metrics.bootstrap`; empty for a threshold."""
-        if self.name.startswith("threshold"):
-            return ""
-        if self.name.startswith("false_episodes"):
-            return "exact"
-        return "mean" if self.unit == "steps" else "share"
 
     def text(self, value: float) -> str:
         """Return a value as printed: percent and steps with one decimal, rates with three."""
@@ -75,15 +83,22 @@ class MetricInfo:
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
-METRICS: Final = MappingProxyType({row["name"]: MetricInfo(**row) for row in _TABLES["metric"]})
+
+def _facts(table: str) -> dict[str, MetricInfo]:
+    """Return the metrics of a table of the catalogue by name, in its order."""
+    rows = (row | {"range": tuple(row["range"])} for row in _TABLES[table])
+    return {row["name"]: MetricInfo(**row) for row in rows}
+
+
+METRICS: Final = MappingProxyType(_facts("metric"))
 """Metrics without a level, in the order of records."""
 
-_BY_LEVEL: Final = {row["name"]: MetricInfo(**row) for row in _TABLES["alarm"]}
+_BY_LEVEL: Final = _facts("alarm")
 
-GUARANTEED: Final = tuple(name for name in _BY_LEVEL if name != "threshold")
-"""Metrics of guaranteed alarms, which have a suffix for each level."""
+GUARANTEED: Final = tuple(name for name, info in _BY_LEVEL.items() if info.interval)
+"""Metrics of guaranteed alarms over trajectories, which have a suffix for each level."""
 
-_EXPLAINED: Final = {row["name"]: MetricInfo(**row) for row in _TABLES["attribution"]}
+_EXPLAINED: Final = _facts("attribution")
 
 ATTRIBUTION: Final = tuple(f"{name}_{HEADLINE}" for name in _EXPLAINED)
 """Metrics of detectors that explain, at the headline level alone."""
@@ -93,38 +108,45 @@ NAMES: Final = (
     *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL),
     *ATTRIBUTION,
 )
-"""Every metric that a record can have."""
+"""Every metric that a record can have. A record may lack any, as one of an earlier version does."""
 
 
 @functools.cache
 def metric_info(name: str) -> MetricInfo:
     """Return the facts about a metric that records can have, with or without a level's suffix.
 
+    Parameters
+    ----------
+    name
+        See ``oodd-eval list metrics``.
+
+    Returns
+    -------
+    MetricInfo
+
+    Raises
+    ------
+    UnknownNameError
+        When the catalogue has no such metric.
+
+    Examples
+    --------
     >>> metric_info("missed_at_5pct").title
     'Missed at 5 %'
     """
     check_known("metric", NAMES, name)
     if name in METRICS:
         return METRICS[name]
-    base, suffix = split_name(name)
+    base, _, level = name.rpartition("_at_")
+    suffix = f"at_{level}"
     info = _BY_LEVEL.get(base) or _EXPLAINED[base]
-    level = f"{100 * LEVELS[suffix]:g} %"
+    percent = f"{100 * LEVELS[suffix]:g} %"
     return replace(
         info,
         name=name,
-        title=f"{info.title} at {level}",
-        summary=f"{info.summary}; at a threshold that promises an alarm in at most {level} of "
+        title=f"{info.title} at {percent}",
+        summary=f"{info.summary}; at a threshold that promises an alarm in at most {percent} of "
         "nominal episodes",
         null=f"{info.null}_{suffix}" if info.null else "",
-        level=level,
+        level=percent,
     )
-
-
-def split_name(name: str) -> tuple[str, str]:
-    """Return a metric's name without the suffix of its level, and that suffix or nothing.
-
-    >>> split_name("delay_null_at_5pct"), split_name("delay_null")
-    (('delay_null', 'at_5pct'), ('delay_null', ''))
-    """
-    base, separator, level = name.rpartition("_at_")
-    return (base, f"at_{level}") if separator else (name, "")

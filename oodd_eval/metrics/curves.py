@@ -152,7 +152,7 @@ def example(
     onset = int(onsets[index])
     start = max(0, onset - BEFORE)
     matched = None if math.isnan(area) else area
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "index": index,
         "auc_matched": matched,
         "onset": onset,
@@ -162,11 +162,11 @@ def example(
     for prefix, scores, name in (("", anomalous[index], "scores"), ("twin_", twins[index], "twin")):
         x = rule.standardization(scores)
         statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
-        shown = slice(start, onset + AFTER)
-        found[name] = [None if math.isnan(v) else v for v in (x[shown] / UNIT).tolist()]
-        found[f"{prefix}cusum"] = statistic[shown].tolist()
-        found[f"{prefix}alarms"] = (start + np.flatnonzero(alarms[shown])).tolist()
-    return found
+        rows = slice(start, onset + AFTER)
+        content[name] = [None if math.isnan(v) else v for v in (x[rows] / UNIT).tolist()]
+        content[f"{prefix}cusum"] = statistic[rows].tolist()
+        content[f"{prefix}alarms"] = (start + np.flatnonzero(alarms[rows])).tolist()
+    return content
 
 
 def cell_curves(
@@ -179,14 +179,14 @@ def cell_curves(
     """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
     tpr = mean_matched_roc(anomalous, sweep.twins, effects)
     defined = not np.isnan(tpr).any()
-    found: dict[str, Any] = rounded(
+    curves: dict[str, Any] = rounded(
         {
             "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
             "delay_far": delay_far(sweep, anomalous, onsets),
             "example": example(anomalous, sweep.twins, onsets, effects, rule),
         }
     )
-    return found
+    return curves
 
 
 def rounded(value: Any) -> Any:

@@ -23,9 +23,14 @@ THRESHOLD: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Standardization:
-    """Mean and standard deviation (ddof 0) of all defined calibration scores; NaN without any.
+    """Mean and standard deviation of all defined calibration scores; NaN without any.
 
     Scores that are all equal have that mean and the standard deviation 0, without rounding.
+
+    Parameters
+    ----------
+    mean, std
+        Mean and standard deviation (ddof 0), in the unit of the scores.
     """
 
     mean: float

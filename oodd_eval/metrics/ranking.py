@@ -5,40 +5,56 @@ correction. Ranks count the primary rows that are better: one row a detector, so
 one detector push nobody down. Primary rows that share a tie group cannot be told apart.
 
 Rows are given as the numerators and denominators of a metric, per detector seed and cell. Higher
-is better.
+is better. They are tested by the influences of test seeds on their means: all pairs share the draws
+of test seeds. Matrix libraries differ in the last bits between machines, so that a count of
+resamples takes what is equal up to rounding as equal.
 """
 
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.pairs import NOISE, Influences, PairTests
+from oodd_eval.metrics.binomial import incomplete_beta
+from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds
 
 ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
 
 MIN_RESAMPLES: Final = 10_000  # least number of bootstrap resamples
-RESAMPLES_PER_PAIR: Final = 50  # no p-value is below 1 / (R + 1): R has to grow with the pairs
-OWN_SEEDS: Final = "detector seeds"  # source of noise that a row's own detector seeds are
+MOST_RESAMPLES: Final = 30_000
+RESAMPLES_PER_PAIR: Final = 50  # no counted p-value is below 1 / (R + 1): R grows with the pairs
+ENOUGH: Final = 100  # resamples beyond the difference that a counted p-value has where R is bounded
+NOISE: Final = 1e-12  # larger differences are no rounding: equal rows are equal anywhere
+DETECTOR_SEEDS: Final = "detector seeds"  # source of noise that a row's detector seeds are
+
+_BLOCK: Final = 1024  # resamples at a time
+_ROUNDING: Final = 1e-9  # relative; statistics that differ by less are equal
 
 Floats = NDArray[np.float64]
-Place = tuple[str, str]  # environment and anomaly; cells of one environment share their resamples
-Row = Mapping[int, Mapping[Place, Contribution]]  # by detector seed and cell
+Position = tuple[str, str]  # environment and anomaly; cells of one environment share resamples
+Row = Mapping[int, Mapping[Position, Contribution]]  # by detector seed and cell
 
 
 @dataclass(frozen=True, slots=True)
 class PairTest:
     """The test of one ordered pair of rows: whether the first is better than the second.
 
-    The difference is that of their means over all cells, with its paired 95 % interval; `p` is the
-    one-sided p-value of "not better", and `p_holm` the same after Holm's correction.
+    Attributes
+    ----------
+    first, second
+        Names of the rows.
+    difference, low, high
+        Of the first's mean over all cells to the second's, with its paired 95 % interval.
+    p, p_holm
+        One-sided p-value of "not better", and the same after Holm's correction.
     """
 
     first: str
@@ -57,10 +73,18 @@ class PairTest:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Ranked rows of one table: ranks by row, tie groups of primary rows, and the tests.
+    """Ranked rows of one table.
 
-    A rank is 1 + the number of primary rows that are significantly better. Tests are of all ordered
-    pairs with a primary row.
+    Attributes
+    ----------
+    ranks
+        By row, best first: 1 + the number of primary rows that are significantly better.
+    groups
+        Tie groups of primary rows.
+    comparisons
+        Tests of all ordered pairs with a primary row.
+    resamples
+        Number of bootstrap resamples.
     """
 
     ranks: dict[str, int]
@@ -87,7 +111,12 @@ def rank(
         Names of the rows that push others down; None means all. The other rows are variants, which
         are compared with primary rows only.
     resamples
-        Number of bootstrap resamples R; by default at least 10 000 and 50 per ordered pair.
+        Number of bootstrap resamples R; by default 50 per ordered pair, at least 10 000 and at most
+        30 000.
+
+    Returns
+    -------
+    Ranking
 
     Raises
     ------
@@ -104,6 +133,10 @@ def rank(
     ``2 ** -N`` with N test seeds in all environments together: if neither row is better, each
     seed's difference might as well have the other sign.
 
+    Holm's correction for the pairs of many rows needs smaller p-values than 30 000 resamples can
+    count. With more than 24 primary rows, one of fewer than 100 resamples is extrapolated from
+    the 1000th and the 100th largest ``(d* - d) / s*`` along the tail of Student's t distribution.
+
     Holm's correction is over all ordered pairs of primary rows. A variant's tests are corrected as
     if it were the one further primary row, so that its rank is the one that it would have.
 
@@ -115,29 +148,27 @@ def rank(
     _check_shape(rows)
     first = [name for name in names if primary is None or name in primary]
     variants = [name for name in names if name not in first]
-    most = math.comb(len(first), 2) + (len(first) if variants else 0)
-    count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * most)
-    influences = {name: _influences(name, rows[name]) for name in names}
-    engine = PairTests(influences, count)
+    pairs = math.comb(len(first), 2) + (len(first) if variants else 0)
+    expected = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * pairs)
+    count = min(expected, max(MOST_RESAMPLES, resamples or 0))
     means = {name: _mean(rows[name]) for name in names}
+    bootstrap = _PairBootstrap(
+        {name: _influences(name, rows[name]) for name in names}, count, extended=expected > count
+    )
 
-    def tests(of: Sequence[tuple[str, Sequence[str]]]) -> list[list[PairTest]]:
-        apart = [np.array([means[one] - means[other] for other in others]) for one, others in of]
-        groups = [(*names, own) for names, own in zip(of, apart, strict=True)]
-        found: list[list[PairTest]] = []
-        for (one, others, differences), tested in zip(groups, engine.test(groups), strict=True):
-            found.append([])
-            for other, d, t in zip(others, differences.tolist(), tested, strict=True):
-                found[-1].append(PairTest(one, other, d, t.low, t.high, t.p, math.nan))
-                found[-1].append(PairTest(other, one, -d, -t.high, -t.low, t.p_reverse, math.nan))
-        return found
+    def tests(name: str, others: Sequence[str]) -> list[PairTest]:
+        results = []
+        differences = np.array([means[name] - means[other] for other in others])
+        tested = bootstrap.test(name, others, differences) if others else []
+        for other, d, t in zip(others, differences.tolist(), tested, strict=True):
+            results.append(PairTest(name, other, d, t.low, t.high, t.p, math.nan))
+            results.append(PairTest(other, name, -d, -t.high, -t.low, t.p_reverse, math.nan))
+        return results
 
-    primaries = [(name, first[i + 1 :]) for i, name in enumerate(first[:-1])]
-    found = tests([*primaries, *((name, first) for name in variants if first)])
-    among = [test for own in found[: len(primaries)] for test in own]
+    among = [test for i, name in enumerate(first) for test in tests(name, first[i + 1 :])]
     comparisons = _corrected(among, [])
-    for own in found[len(primaries) :]:
-        comparisons += _corrected(own, among)
+    for name in variants:
+        comparisons += _corrected(tests(name, first), among)
     better = {(c.first, c.second) for c in comparisons if c.better}
     ranks = {name: 1 + sum((other, name) in better for other in first) for name in names}
     order = sorted(names, key=lambda name: (ranks[name], -means[name], name))
@@ -147,10 +178,153 @@ def rank(
     return Ranking(ranks, groups, comparisons, count)
 
 
+class _Influences(NamedTuple):
+    """Shifts of a row's mean by each test seed and each detector seed, centred on 0.
+
+    `of_tests` is by environment, `of_detectors` is empty where there is one detector seed; `key`
+    names the draws of these.
+    """
+
+    of_tests: Mapping[str, Floats]
+    of_detectors: Floats
+    key: str
+
+
+class _Tested(NamedTuple):
+    """The 95 % interval of a difference, and the p-values of "not better" and of "not worse"."""
+
+    low: float
+    high: float
+    p: float
+    p_reverse: float
+
+
+class _PairBootstrap:
+    """The bootstrap of pairs of rows with R resamples.
+
+    Where it is `extended`, p-values that are too small to be counted follow Student's tail.
+    """
+
+    def __init__(
+        self, rows: Mapping[str, _Influences], resamples: int, *, extended: bool = False
+    ) -> None:
+        self.resamples, self.extended = resamples, extended
+        self._index = {name: i for i, name in enumerate(rows)}
+        self._rows = list(rows.values())
+        shared = self._rows[0].of_tests if rows else {}
+        self._sizes = {environment: z.size for environment, z in shared.items()}
+        ends = itertools.accumulate(self._sizes.values(), initial=0)
+        self._columns = [slice(*both) for both in itertools.pairwise(ends)]
+        self._n = np.repeat([*self._sizes.values()], [*self._sizes.values()])
+        self._influences = np.array([np.concatenate([*r.of_tests.values()]) for r in self._rows])
+        self._drawn = np.concatenate(
+            [np.zeros((0, resamples)), *(_draws(e, n, resamples) for e, n in self._sizes.items())]
+        )
+        # Sums are taken in a fixed order, so that an interval depends on its two rows alone.
+        self._shifts = np.zeros((len(rows), resamples))
+        self._variances = np.zeros((len(rows), resamples))
+        for i, row in enumerate(self._rows):
+            self._shifts[i] = np.einsum("n,nr->r", self._influences[i] / self._n, self._drawn)
+            if n := row.of_detectors.size:
+                drawn = _draws(row.key, n, resamples)
+                mean = np.einsum("n,nr->r", row.of_detectors, drawn) / n
+                square = np.einsum("n,nr->r", row.of_detectors**2, drawn) / n
+                self._shifts[i] += mean
+                self._variances[i] = np.maximum(square - mean * mean, 0.0) / (n - 1)
+
+    def test(self, name: str, others: Sequence[str], differences: Floats) -> list[_Tested]:
+        """Test a row against others, given the differences of its mean to theirs."""
+        row, columns = self._index[name], np.array([self._index[other] for other in others])
+        effects = self._influences[row] - self._influences[columns]
+        # Rounding alone must not look like a difference between seeds.
+        effects = np.where(np.abs(effects) > NOISE, effects, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            observed = differences / np.sqrt(self._observed_variances(row, columns, effects))
+        observed = np.where(np.abs(differences) > NOISE, observed, 0.0)
+        # These products are small: threads of a matrix library would wait for one another.
+        with threadpool_limits(1, user_api="blas"):
+            studentized = self._studentized(row, columns, effects)
+        signs, sizes = np.sign(observed)[:, None], np.abs(observed)[:, None]
+        studentized = np.where(signs < 0, -studentized, studentized)
+        # A resample at the observed difference is beyond it for both sides.
+        beyond = np.count_nonzero(studentized >= sizes * (1 - _ROUNDING), axis=1)
+        within = np.count_nonzero(~(studentized >= sizes * (1 + _ROUNDING)), axis=1)
+        counts = np.where(observed == 0, self.resamples, [beyond, within])
+        p = (1 + counts) / (self.resamples + 1)
+        if self.extended:
+            for rare in np.flatnonzero(counts[0] < ENOUGH):
+                p[0, rare] = self._extended(studentized[rare], abs(observed[rare]))
+        # No p-value is below the chance that all seeds have the signs that they have.
+        p = np.maximum(p, 2.0 ** -len(self._n))
+        tests = []
+        for i, (d, sides) in enumerate(zip(differences, p.T.tolist(), strict=True)):
+            samples = d + (self._shifts[row] - self._shifts[columns[i]])
+            low, high = bounds(samples, d, list(self._sizes.values()))
+            tests.append(_Tested(low, high, *(sides if observed[i] >= 0 else sides[::-1])))
+        return tests
+
+    def _observed_variances(self, row: int, columns: NDArray[np.intp], effects: Floats) -> Floats:
+        """Return the variances of differences; infinite where one test seed says nothing of it."""
+        if 1 in self._sizes.values():
+            return np.full(len(columns), np.inf)
+        variances = np.zeros(len(columns))
+        for n, part in zip(self._sizes.values(), self._columns, strict=True):
+            variances += effects[:, part].var(axis=1) / (n - 1)
+        for i, column in enumerate(columns):
+            for z in (self._rows[row].of_detectors, self._rows[column].of_detectors):
+                variances[i] += float(z.var()) / (z.size - 1) if z.size else 0.0
+        return variances
+
+    def _studentized(self, row: int, columns: NDArray[np.intp], effects: Floats) -> Floats:
+        """Return shifts over their standard errors in every resample: shape (columns, R)."""
+        freedom = np.maximum(self._n - 1, 1)
+        squares = effects**2 / (self._n * freedom)
+        means = effects / (self._n * np.sqrt(freedom))
+        studentized = np.empty((len(columns), self.resamples))
+        for start in range(0, self.resamples, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            variances = squares @ self._drawn[:, block]
+            for part in self._columns:
+                mean = means[:, part] @ self._drawn[part, block]
+                mean *= mean
+                variances -= mean
+            variances = np.maximum(variances, 0.0)
+            variances += self._variances[row, block] + self._variances[columns, block]
+            shifts = self._shifts[row, block] - self._shifts[columns, block]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                # Where all seeds agree to the last digit, no shift over no spread is no shift.
+                ratios = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
+            studentized[:, block] = ratios
+        return studentized
+
+    def _extended(self, studentized: Floats, observed: float) -> float:
+        """Return a p-value too small to be counted.
+
+        Between the p-values at the `ENOUGH`-th and the ten times `ENOUGH`-th largest resample, its
+        logarithm is taken to be linear in that of Student's tail, but never steeper than this.
+        """
+        last = len(studentized) - 1
+        places = [last - ENOUGH, last - 10 * ENOUGH]
+        near, far = (self._tail(t) for t in np.partition(studentized, places)[places])
+        slope = min(math.log(10) / math.log(far / near), 1.0) if far > near else 1.0
+        share: float = (self._tail(observed) / near) ** slope
+        return share * (1 + ENOUGH) / (self.resamples + 1)
+
+    def _tail(self, t: float) -> float:
+        """Return the chance of more than t, from 0 on, in Student's distribution."""
+        freedom = max(len(self._n) - len(self._sizes), 1)
+        return incomplete_beta(freedom / 2, 0.5, freedom / (freedom + t * t)) / 2
+
+
+def _draws(key: str, n: int, resamples: int) -> Floats:
+    """Return how often each of n is drawn: shape (n, R)."""
+    return np.ascontiguousarray(bootstrap_weights(n, key=key, resamples=resamples).T)
+
+
 def _corrected(tests: Sequence[PairTest], others: Sequence[PairTest]) -> list[PairTest]:
     """Return tests with Holm's correction over them and others together."""
     p = holm(np.array([c.p for c in (*tests, *others)]))
-    return [replace(c, p_holm=float(own)) for c, own in zip(tests, p, strict=False)]
+    return [replace(c, p_holm=float(corrected)) for c, corrected in zip(tests, p, strict=False)]
 
 
 def holm(p: Floats) -> Floats:
@@ -190,7 +364,7 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
     return [tuple(names[i] for i in group) for group in positions]
 
 
-def win_rates(values: Mapping[str, Mapping[Place, float]]) -> dict[tuple[str, str], float]:
+def win_rates(values: Mapping[str, Mapping[Position, float]]) -> dict[tuple[str, str], float]:
     """Return the share of cells in which a row's value is higher than another's, for all pairs.
 
     Shares are over the cells that both have, equal values counting one half, so that a pair's two
@@ -221,14 +395,14 @@ def _check_shape(rows: Mapping[str, Row]) -> None:
                     "only rows with all cells are ranked"
                 )
             for cell, contribution in cells.items():
-                where, n = "/".join(cell), len(contribution.numerator)
+                label, n = "/".join(cell), len(contribution.numerator)
                 if n != (size := sizes.setdefault(cell[0], n)):
                     raise ResultsError(
-                        f"{name} has {n} test trajectories in {where}, expected {size}: rows of "
+                        f"{name} has {n} test trajectories in {label}, expected {size}: rows of "
                         "one table are of the same split and limit"
                     )
                 if math.isnan(contribution.value):
-                    raise ResultsError(f"{name} has no value in {where}, so it has no rank")
+                    raise ResultsError(f"{name} has no value in {label}, so it has no rank")
 
 
 def _mean(row: Row) -> float:
@@ -236,22 +410,22 @@ def _mean(row: Row) -> float:
     return float(np.mean([row[s][c].value for s in sorted(row) for c in sorted(row[s])]))
 
 
-def _influences(name: str, row: Row) -> Influences:
-    """Return what every drawn thing adds to the row's mean, centred.
+def _influences(name: str, row: Row) -> _Influences:
+    """Return what every drawn seed adds to the row's mean, centred.
 
     A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
     """
     seeds, cells = sorted(row), sorted(row[min(row)])
-    shared = {}
+    of_tests = {}
     for environment, members in itertools.groupby(cells, key=lambda cell: cell[0]):
         parts = [_influence(row[seed][cell]) for cell in members for seed in seeds]
-        shared[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
-    own = np.zeros(0)
+        of_tests[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
+    of_detectors = np.zeros(0)
     if len(seeds) > 1:
         means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
-        own = means - means.mean()
-        own = np.where(np.abs(own) > NOISE, own, 0.0)
-    return Influences(shared, own, f"{OWN_SEEDS} of {name}")
+        of_detectors = means - means.mean()
+        of_detectors = np.where(np.abs(of_detectors) > NOISE, of_detectors, 0.0)
+    return _Influences(of_tests, of_detectors, f"{DETECTOR_SEEDS} of {name}")
 
 
 def _influence(contribution: Contribution) -> Floats:

@@ -45,8 +45,8 @@ def crossing(shares: Floats, strengths: Floats) -> Floats:
     below = np.maximum(above - 1, 0)
     low, high = (np.take_along_axis(shares, k[None], axis=0)[0] for k in (below, above))
     part = np.clip((HALF - low) / np.maximum(high - low, _ROUNDING), 0.0, 1.0)
-    found = logs[below] + part * (logs[above] - logs[below])
-    return np.where(few == 0, -np.inf, np.where(few == len(logs), np.inf, found))
+    between = logs[below] + part * (logs[above] - logs[below])
+    return np.where(few == 0, -np.inf, np.where(few == len(logs), np.inf, between))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,23 +64,35 @@ class DetectionThreshold:
 
     @classmethod
     def of(
-        cls, environment: str, strengths: Sequence[float], found: Floats, counted: Floats
+        cls, environment: str, strengths: Sequence[float], detected: Floats, counted: Floats
     ) -> "DetectionThreshold":
-        """Estimate the threshold; `ValueError` for strengths that are not as told here.
+        """Estimate the threshold; those of one environment are resampled with the same episodes.
 
-        `strengths`, of the K rungs, are positive and do not decrease. `found` is 1 where a detector
-        seed found an episode's anomaly in time, else 0: shape (detector seeds, K, episodes). An
-        episode is of the same test seed on every rung. `counted` is 0 for an episode that does not
-        count, such as one with an early alarm, else 1. What is found in one environment is
-        resampled with the same episodes.
+        Parameters
+        ----------
+        environment
+            Its name.
+        strengths
+            Strengths of the K rungs: positive, none smaller than the one before.
+        detected
+            1 where a detector seed found an episode's anomaly in time, else 0: shape (detector
+            seeds, K, episodes). An episode is of the same test seed on every rung.
+        counted
+            0 for an episode that does not count, such as one with an early alarm, else 1: the same
+            shape.
+
+        Raises
+        ------
+        ValueError
+            For other strengths.
         """
         ends = np.asarray(strengths, dtype=np.float64)
-        if len(ends) != found.shape[1] or not (ends > 0).all() or (np.diff(ends) < 0).any():
+        if len(ends) != detected.shape[1] or not (ends > 0).all() or (np.diff(ends) < 0).any():
             raise ValueError(
-                f"strengths {ends.tolist()} of {found.shape[1]} rungs: expected as many positive "
-                "numbers, the weakest first"
+                f"strengths {ends.tolist()} of {detected.shape[1]} rungs: expected as many "
+                "positive numbers, the weakest first"
             )
-        drawn_found, drawn_total = (_drawn(environment, terms) for terms in (found, counted))
+        drawn_found, drawn_total = (_drawn(environment, terms) for terms in (detected, counted))
         empty = drawn_total == 0
         totals = np.where(empty, _NOTHING, drawn_total)
         shares = drawn_found / totals
@@ -116,8 +128,8 @@ class DetectionThreshold:
     def text(self, value: float) -> str:
         """Return a threshold, or an end of its interval, as printed.
 
-        >>> found = DetectionThreshold(0.5, 8.0, np.zeros(1))
-        >>> [found.text(x) for x in (0.0, 2.34567, math.inf)]
+        >>> threshold = DetectionThreshold(0.5, 8.0, np.zeros(1))
+        >>> [threshold.text(x) for x in (0.0, 2.34567, math.inf)]
         ['≤0.5', '2.35', '>8']
         """
         if value == 0:
@@ -160,12 +172,12 @@ def geometric_mean(
     resamples are then paired with these.
     """
     ratios, censored, sides = [], [], set()
-    for own, unit in zip(thresholds, units, strict=True):
+    for threshold, unit in zip(thresholds, units, strict=True):
         other = unit.within if isinstance(unit, DetectionThreshold) else math.log(unit)
-        ratios.append(own.within - other)
-        censored.append(own.beyond)
-        if unit is not own:
-            sides |= {own.beyond, -unit.beyond if isinstance(unit, DetectionThreshold) else 0}
+        ratios.append(threshold.within - other)
+        censored.append(threshold.beyond)
+        if unit is not threshold:
+            sides |= {threshold.beyond, -unit.beyond if isinstance(unit, DetectionThreshold) else 0}
     logs = np.mean(ratios, axis=0)
     low, high = _ends(logs)
     return MeanThreshold(
@@ -204,8 +216,8 @@ def _ends(logs: Floats) -> tuple[float, float]:
     return min(float(low), float(logs[0])), max(float(high), float(logs[0]))
 
 
-def isotonic(found: Floats, total: Floats) -> Floats:
-    """Return the non-decreasing shares that are nearest to `found` / `total`, weighted by `total`.
+def isotonic(counts: Floats, total: Floats) -> Floats:
+    """Return the non-decreasing shares that are nearest to `counts` / `total`, weighted by `total`.
 
     Least squares; the min-max formula of isotonic regression (Barlow et al. 1972), for many columns
     at once. Shapes are (K, ...), by rung; no total may be 0. At rung k it is the largest, over the
@@ -215,9 +227,9 @@ def isotonic(found: Floats, total: Floats) -> Floats:
     >>> isotonic(np.array([1.0, 3.0, 1.0, 4.0]), np.array([4.0, 4.0, 4.0, 4.0])).tolist()
     [0.25, 0.5, 0.5, 1.0]
     """
-    shares = np.full_like(found, -np.inf)
+    shares = np.full_like(counts, -np.inf)
     for i in range(len(shares)):
-        pooled = found[i:].cumsum(axis=0) / total[i:].cumsum(axis=0)
+        pooled = counts[i:].cumsum(axis=0) / total[i:].cumsum(axis=0)
         smallest = np.minimum.accumulate(pooled[::-1], axis=0)[::-1]
         np.maximum(shares[i:], smallest, out=shares[i:])
     return shares

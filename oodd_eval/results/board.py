@@ -14,9 +14,9 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, in_order, spli
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import drawn_cells, mean_interval, mean_over_cells
+from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells
 from oodd_eval.metrics.catalogue import NAMES, metric_info
-from oodd_eval.metrics.ranking import Place
+from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 
@@ -71,7 +71,7 @@ class Board:
         Environments and conditions that every row should have; by default `expected_cells`.
     """
 
-    def __init__(self, records: Sequence[Record], expected: Collection[Place] = ()) -> None:
+    def __init__(self, records: Sequence[Record], expected: Collection[Position] = ()) -> None:
         self.records = list(records)
         self.conditions = Conditions.of(self.records[0])
         self.split, self.digest = self.conditions.split, self.conditions.split_digest
@@ -167,7 +167,7 @@ class Board:
         return list(reversed(units.values()))
 
 
-def expected_cells(records: Sequence[Record]) -> set[Place]:
+def expected_cells(records: Sequence[Record]) -> set[Position]:
     """Return the environments and conditions in which a row of a board has to have a result.
 
     Those of a published split follow from its definition. Of another split they are the ones that
@@ -182,7 +182,7 @@ def expected_cells(records: Sequence[Record]) -> set[Place]:
         suite, cap = SPLITS[name].suite, SPLITS[name].episode_cap
         return {(e, condition) for e in ENVIRONMENTS for condition in conditions_of(suite, e, cap)}
     rows = grouped(records, lambda r: r.setting).values()
-    counts = Counter(cell for row in rows for cell in {r.place for r in row})
+    counts = Counter(cell for row in rows for cell in {r.position for r in row})
     return {cell for cell, n in counts.items() if 2 * n >= len(rows)}
 
 
@@ -229,7 +229,7 @@ def _mean_of(
         terms = np.array([r.per_trajectory[metric] for r in group])
         seeds = [r.seed for r in group]
         median = _is_median(metric)
-        cells.append(drawn_cells(environment, seeds, terms[:, 0], terms[:, 1], median=median))
+        cells.append(DrawnCells(environment, seeds, terms[:, 0], terms[:, 1], median=median))
         values += zip(seeds, cells[-1].values, strict=True)
     ends = NAN, NAN
     if intervals and cells:

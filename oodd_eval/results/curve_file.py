@@ -85,10 +85,10 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         # A field that does not belong there may have any name.
-        place = "".join(
+        path = "".join(
             f"[{p}]" if isinstance(p, int) else f".{ascii(p)[1:-1]:.60}" for p in first["loc"]
         )
-        raise _wrong(f"{where}: {place.removeprefix('.')}", first["input"], first["msg"]) from None
+        raise _wrong(f"{where}: {path.removeprefix('.')}", first["input"], first["msg"]) from None
     whole: dict[str, Any] = plain
     if whole["schema"] != SCHEMA:
         problem = f"expected {SCHEMA}: it was written by another version of oodd-eval"
@@ -105,8 +105,8 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
                 _check_length(values, first, f"{name}.{part}.{other}")
             for k, (before, value) in enumerate(itertools.pairwise(first), start=1):
                 if value < before:
-                    place = f"{name}.{part}.{first_name}[{k}]"
-                    raise _wrong(place, value, f"below {before} before it")
+                    field = f"{name}.{part}.{first_name}[{k}]"
+                    raise _wrong(field, value, f"below {before} before it")
         _check_example(unit["example"], f"{name}.example")
     return whole
 
@@ -161,8 +161,9 @@ def _check_example(example: Mapping[str, Any], where: str) -> None:
                 problem = f"no row in {start} ... {rows.stop - 1}"
                 raise _wrong(f"{where}.{prefix}alarms[{i}]", row, problem)
     if len(example["scores"]) > length - start:
-        found = f"{len(example['scores'])} numbers"
-        raise _wrong(f"{where}.scores", found, f"expected at most length - start, {length - start}")
+        actual = f"{len(example['scores'])} numbers"
+        problem = f"expected at most length - start, {length - start}"
+        raise _wrong(f"{where}.scores", actual, problem)
 
 
 def _check_length(values: Sequence[Any], like: Sequence[Any], where: str) -> None:
@@ -170,5 +171,5 @@ def _check_length(values: Sequence[Any], like: Sequence[Any], where: str) -> Non
         raise _wrong(where, f"{len(values)} numbers", f"expected {len(like)}")
 
 
-def _wrong(where: str, found: Any, problem: str) -> ResultsError:
-    return ResultsError(f"{where} is {found!r:.80}: {problem}")
+def _wrong(where: str, value: Any, problem: str) -> ResultsError:
+    return ResultsError(f"{where} is {value!r:.80}: {problem}")

@@ -156,7 +156,7 @@ class ResultsDirectory:
             text = "".join(record.to_json() + "\n" for record in kept)
             files.write_text(self.path / RECORDS, text)
             for key in {r.scores for r in gone.values()} - {r.scores for r in kept} - {""}:
-                for file in (*self._places(key), self.log_path(key)):
+                for file in (*self._score_paths(key), self.log_path(key)):
                     file.unlink(missing_ok=True)
 
     def log_path(self, key: str) -> Path:
@@ -168,7 +168,7 @@ class ResultsDirectory:
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
             parts[part] = _StoredPart(sequences, scores.order, scores.explained.get(part))
-        place, digests = self._places(key)
+        path, digests = self._score_paths(key)
         # In memory: HDF5 crashes where it cannot write, as on a full disk.
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
@@ -187,26 +187,26 @@ class ResultsDirectory:
         # First the digest, beside that of the file before: a kill between the two loses neither.
         sealed = f"{hashlib.sha256(content).hexdigest()} {len(content)}"
         files.write_text(digests, "\n".join([sealed, *_lines(digests)[:1]]) + "\n")
-        files.write_bytes(place, content)
+        files.write_bytes(path, content)
 
-    def _places(self, key: str) -> tuple[Path, Path]:
-        """Return the places of a score file and of its digests."""
+    def _score_paths(self, key: str) -> tuple[Path, Path]:
+        """Return the paths of a score file and of its digests."""
         return self.path / "scores" / f"{key}.h5", self.path / "scores" / f"{key}.sha256"
 
     def _opened(self, key: str) -> h5py.File:
         """Open a score file; `ValueError` when it is not the one that was written."""
-        place, digests = self._places(key)
+        path, digests = self._score_paths(key)
         if digests.exists():
-            sealed, size = _lines(digests), f" {place.stat().st_size}"
-            with place.open("rb") as file:
+            sealed, size = _lines(digests), f" {path.stat().st_size}"
+            with path.open("rb") as file:
                 same = any(line.endswith(size) for line in sealed) and (
                     hashlib.file_digest(file, "sha256").hexdigest() + size in sealed
                 )
             if not same:
-                note = f"{str(place)!r} was changed since it was written and is not used"
+                note = f"{str(path)!r} was changed since it was written and is not used"
                 self.notes += [] if note in self.notes else [note]
                 raise ValueError(note)
-        return h5py.File(place, "r")
+        return h5py.File(path, "r")
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
         """Read a unit's scores; None when the file is absent, damaged, lacks a part or misfits.
@@ -223,8 +223,8 @@ class ResultsDirectory:
                     if np.diff(offsets).tolist() != list(expected) or len(flat) != offsets[-1]:
                         return None
                     parts[part] = np.split(flat.astype(np.float64, copy=False), offsets[1:-1])
-                    if own := _explained(file[part]):
-                        explained[part] = own
+                    if columns := _explained(file[part]):
+                        explained[part] = columns
                 cost = {name: float(value) for name, value in file.attrs.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
@@ -328,7 +328,7 @@ def without_collector() -> Iterator[None]:
 
 @without_collector()
 def read_records(
-    file: Path, notes: list[str] | None = None, *, wanted: Callable[[str], bool] = bool
+    file: Path, notes: list[str] | None = None, *, matches: Callable[[str], bool] = bool
 ) -> list[Record]:
     """Read a file of records.
 
@@ -337,9 +337,14 @@ def read_records(
     file
         Lines of JSON, compressed or not.
     notes
-        Where given, a last line that was cut short is left out, which is told there.
-    wanted
-        Tells which lines to read.
+        With a list, a last line that was cut short is left out, and a note on it is added.
+    matches
+        Predicate of the lines to read.
+
+    Returns
+    -------
+    list of Record
+        In the order of the file.
 
     Raises
     ------
@@ -356,11 +361,14 @@ def read_records(
         except ResultsError:
             del lines[-1]
             notes.append(f"{str(file)!r} was cut short: its last line is left out")
-    return [
-        Record.from_json(line, f"{file}:{number}")
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and wanted(line)
-    ]
+    records: list[Record] = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and matches(line):
+            record = Record.from_json(line, f"{file}:{number}")
+            if records:
+                record.share(records[-1])
+            records.append(record)
+    return records
 
 
 def _merged(earlier: Sequence[Record], records: Iterable[Record]) -> list[Record]:

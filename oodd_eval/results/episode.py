@@ -20,11 +20,13 @@ class ScoredEpisode:
     Attributes
     ----------
     cell, index
-        Whose it is, and its place among the cell's episodes.
+        The cell, and the index of the episode among the cell's.
     scores, twin_scores
         One for each observation, NaN where undefined.
     trajectory, twin
-        The episodes, (T + 1) observations of the `sensors` each.
+        The episodes, of T + 1 observations each.
+    sensors
+        Names of the sensors, in the order of columns.
     onset, effect
         The row from which the anomaly is in force, and the first that differs from the twin's.
     rule
@@ -48,14 +50,17 @@ class ScoredEpisode:
         return self.rule.first(self.scores) if self.rule else None
 
     def delay(self, *, of_twin: bool = False) -> float:
-        """Return rows from the effect to the first alarm, infinite without one.
-
-        NaN where that precedes the effect, or no row follows it.
+        """Return the number of rows from the effect to the first alarm.
 
         Parameters
         ----------
         of_twin
-            Whether it is an alarm of the twin, which is a false one.
+            Whether the alarm is one of the twin, which is a false one.
+
+        Returns
+        -------
+        float
+            Infinite without an alarm; NaN where that precedes the effect, or no row follows it.
         """
         scores = self.twin_scores if of_twin else self.scores
         first = self.rule.first(scores) if self.rule else None

@@ -14,8 +14,8 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
-from oodd_eval.metrics.bootstrap import bounds, cell_samples, drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, IntervalKind, metric_info
+from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
+from oodd_eval.metrics.catalogue import HEADLINE, IntervalKind, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -55,19 +55,19 @@ def cell_metrics(
     corrupted: Sequence[Collection[int]] = (),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
     """Compute all metrics of one cell with their intervals; attribution where it is explained."""
-    found = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
+    contributions = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
     thresholds = {}
     for suffix, rule in rules.guaranteed.items():
-        own = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
-        found |= {f"{name}_{suffix}": own[name] for name in GUARANTEED}
+        of_level = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
+        contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
         # JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
         finite = math.isfinite(rule.threshold)
         thresholds[f"threshold_{suffix}"] = Metric(rule.threshold if finite else NAN)
     if explained and (headline := rules.guaranteed.get(HEADLINE)):
-        own = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
-        found |= {f"{name}_{HEADLINE}": contribution for name, contribution in own.items()}
-    metrics = {name: metric_of(name, c, environment) for name, c in found.items()}
-    return metrics | thresholds, found
+        named = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
+        contributions |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
+    metrics = {name: metric_of(name, c, environment) for name, c in contributions.items()}
+    return metrics | thresholds, contributions
 
 
 def metric_of(name: str, contribution: Contribution, environment: str) -> Metric:
@@ -82,10 +82,8 @@ def _interval(
     kind: IntervalKind, environment: str, median: bool, numerator: bytes, denominator: bytes
 ) -> tuple[float, float]:
     """Return the interval of a metric. Many metrics of a detector have the same terms."""
-    own = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
-    if own.n and (kind == "mean" or (kind == "share" and own.value not in (0.0, 1.0))):
-        return bounds(cell_samples(environment, own), own.value, [own.n])  # the same, sooner
-    return mean_interval([drawn_cell(environment, 0, own)], kind=kind)
+    terms = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
+    return mean_interval([drawn_cell(environment, 0, terms)], kind=kind)
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
@@ -131,10 +129,10 @@ def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) 
             units.setdefault((record.environment, record.scores), []).append(record)
     fresh: dict[tuple[str, ...], Record] = {}
     with split.opened() as environment:
-        for (name, _), own in units.items():
+        for (name, _), unit in units.items():
             data = environment(name)
-            found = evaluated(own, stored_scores(own, results, data), data)
-            fresh |= {record.identity: record for record in found}
+            again = evaluated(unit, stored_scores(unit, results, data), data)
+            fresh |= {record.identity: record for record in again}
     return [fresh.get(record.identity, record) for record in records]
 
 

@@ -40,43 +40,43 @@ class FitStore:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._made: set[str] = set()
+        self._kept: set[str] = set()
 
     def has(self, key: str, *, fresh: bool = False) -> bool:
         """Tell whether a fit is kept under a key; when `fresh`, only one that this object kept."""
-        return (key in self._made or not fresh) and (self.path / key / INDEX).is_file()
+        return (key in self._kept or not fresh) and (self.path / key / INDEX).is_file()
 
     def find(self, key: str, *, fresh: bool = False) -> KeptFit | None:
         """Return the fit kept under a key; None when there is none, or its files were damaged."""
         if not self.has(key, fresh=fresh):
             return None
-        place = self.path / key
+        path = self.path / key
         try:
-            if _size(place) > MAX_BYTES or (place / INDEX).stat().st_size > _MAX_INDEX:
+            if _size(path) > MAX_BYTES or (path / INDEX).stat().st_size > _MAX_INDEX:
                 return None
-            index = json.loads((place / INDEX).read_text(encoding="utf-8"))
+            index = json.loads((path / INDEX).read_text(encoding="utf-8"))
             seconds = float(index["seconds_fit"])
-            if digests(place, without=INDEX) != index["files"] or not 0 <= seconds < math.inf:
+            if digests(path, without=INDEX) != index["files"] or not 0 <= seconds < math.inf:
                 return None
-            return KeptFit(place, seconds)
+            return KeptFit(path, seconds)
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[Path]:
-        """Give an empty directory for a detector to save itself in; remove it afterwards.
+        """Yield an empty directory for a detector to save itself in; remove it afterwards.
 
         `OutputError`: it cannot be made.
         """
         try:
             try:
-                made = self._temporary()
+                temporary = self._temporary()
             except FileNotFoundError:  # Somebody has just removed the directory.
-                made = self._temporary()
+                temporary = self._temporary()
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
-        with made as place:
-            yield Path(place)
+        with temporary as path:
+            yield Path(path)
 
     def _temporary(self) -> "tempfile.TemporaryDirectory[str]":
         self.path.mkdir(parents=True, exist_ok=True)
@@ -98,11 +98,11 @@ class FitStore:
             (directory / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")
             shutil.rmtree(self.path / key, ignore_errors=True)
             directory.rename(self.path / key)
-            self._made.add(key)
+            self._kept.add(key)
 
     def distrust(self, key: str) -> None:
         """Treat the fit under a key as an earlier run's: it could not be loaded."""
-        self._made.discard(key)
+        self._kept.discard(key)
 
 
 def _size(directory: Path) -> int:

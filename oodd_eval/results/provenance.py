@@ -31,11 +31,11 @@ def gather(command: str = "") -> dict[str, Any]:
 
 def packages() -> dict[str, str]:
     """Return the installed versions of `PACKAGES`."""
-    found = {}
+    versions = {}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            versions[name] = version(name)
+    return versions
 
 
 def _commit() -> dict[str, Any]:

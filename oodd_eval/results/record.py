@@ -4,9 +4,11 @@ A record is plain data. `Record.to_json` and `Record.from_json` are inverse to e
 written as null, so that results can be stored, compared and published as lines of JSON.
 """
 
+import functools
+import itertools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
@@ -43,7 +45,15 @@ Terms = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A value with its 95 % interval over n trajectories; NaN where undefined."""
+    """A metric of one cell.
+
+    Attributes
+    ----------
+    value, low, high
+        The value with its 95 % interval, in the unit of records; NaN where undefined.
+    n
+        Number of trajectories that count.
+    """
 
     value: Number
     low: Number = NAN
@@ -121,7 +131,7 @@ class Record:
     metrics: dict[str, Metric] = field(default_factory=dict)
     brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
-    per_trajectory: dict[str, Terms] = field(default_factory=dict)
+    per_trajectory: Mapping[str, Terms] = field(default_factory=dict)
     scores: str = ""
     seconds_fit: Number = NAN
     seconds_score: Number = NAN
@@ -164,7 +174,7 @@ class Record:
         return join_condition(self.anomaly, self.strength)
 
     @property
-    def place(self) -> tuple[str, str]:
+    def position(self) -> tuple[str, str]:
         """Environment and condition: the column of a board that the record belongs to."""
         return self.environment, self.condition
 
@@ -188,7 +198,7 @@ class Record:
         """Return one line of JSON, keys in a fixed order, NaN as null."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain |= {name: _finite(plain[name]) for name in _COSTS}
-        plain["per_trajectory"] = {n: own.tolist() for n, own in self.per_trajectory.items()}
+        plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
         plain["metrics"] = {
             name: {e: _finite(getattr(m, e)) for e in ("value", "low", "high")} | {"n": m.n}
             for name, m in self.metrics.items()
@@ -217,25 +227,88 @@ class Record:
                     f"{len(bottoms)} denominators, expected as many of both"
                 )
         # Safe though frozen: the record has not been returned yet.
-        object.__setattr__(record, "per_trajectory", _arrays(record.per_trajectory))
+        object.__setattr__(record, "per_trajectory", _compact(record.per_trajectory))
         return record
+
+    def share(self, other: "Record") -> None:
+        """Hold equal values that take much memory once; the records of a fit have the same."""
+        for name in _SHARED:
+            if getattr(self, name) == (value := getattr(other, name)):
+                object.__setattr__(self, name, value)
 
 
 _READER: Final = TypeAdapter(Record)
 _PLAIN: Final = tuple(f.name for f in fields(Record) if f.name != "per_trajectory")
 
 
-def _arrays(terms: Mapping[str, Any]) -> dict[str, Terms]:
+_SHARED: Final = (
+    "parameters",
+    "overrides",
+    "counts",
+    "provenance",
+    "plugin_source",
+    "split_digest",
+    "scores",
+)
+
+
+class CompactTerms(Mapping[str, Terms]):
+    """Terms by metric in little memory: boards hold those of tens of thousands of records.
+
+    Whole numbers, which most terms are, take two bytes each.
+
+    Parameters
+    ----------
+    names
+        The metrics.
+    terms
+        Float64 array of shape (metrics, 2, n).
+    """
+
+    __slots__ = ("_others", "_position", "_whole")
+
+    def __init__(self, names: tuple[str, ...], terms: NDArray[np.float64]) -> None:
+        whole = ((terms >= 0) & (terms <= _MOST_WHOLE) & (terms % 1 == 0)).all(axis=(1, 2))
+        self._position = _positions(names, tuple(whole.tolist()))
+        self._whole, self._others = terms[whole].astype(np.uint16), terms[~whole]
+
+    def __getitem__(self, name: str) -> Terms:
+        """Return numerators and denominators of a metric: float64 of shape (2, n)."""
+        whole, i = self._position[name]
+        terms: Terms = self._whole[i].astype(np.float64) if whole else self._others[i]
+        return terms
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the metrics."""
+        return iter(self._position)
+
+    def __len__(self) -> int:
+        """Return the number of metrics."""
+        return len(self._position)
+
+
+_MOST_WHOLE: Final = np.iinfo(np.uint16).max
+
+
+@functools.lru_cache(maxsize=1024)
+def _positions(names: tuple[str, ...], whole: tuple[bool, ...]) -> dict[str, tuple[bool, int]]:
+    """Return for each metric whether its terms are whole, and its position among its like."""
+    counts = {True: itertools.count(), False: itertools.count()}
+    return {name: (flag, next(counts[flag])) for name, flag in zip(names, whole, strict=True)}
+
+
+def _compact(terms: Mapping[str, Any]) -> Mapping[str, Terms]:
     """Return lists of terms as arrays."""
-    if len({len(tops) for tops, _ in terms.values()}) > 1:
-        return {name: np.array(own) for name, own in terms.items()}
-    return dict(zip(terms, np.array([*terms.values()]), strict=True))  # faster than one by one
+    if len({len(numerators) for numerators, _ in terms.values()}) != 1:
+        return {name: np.array(pair) for name, pair in terms.items()}
+    return CompactTerms(tuple(terms), np.array([*terms.values()], np.float64))
 
 
 def same_terms(first: Mapping[str, Terms], second: Mapping[str, Terms]) -> bool:
     """Tell whether terms are equal to the last bit."""
-    known = first.keys() == second.keys()
-    return known and all(np.array_equal(own, second[name]) for name, own in first.items())
+    if first.keys() != second.keys():
+        return False
+    return all(np.array_equal(terms, second[name]) for name, terms in first.items())
 
 
 def _problem(line: str, error: ValidationError) -> str:
@@ -247,14 +320,14 @@ def _problem(line: str, error: ValidationError) -> str:
     if isinstance(plain, dict) and plain.get("schema") != SCHEMA:
         return _other_schema(plain.get("schema"))
     first = error.errors(include_url=False, include_context=False)[0]
-    place = ".".join(map(str, first["loc"]))
-    found = "" if first["type"] in {"missing", "json_invalid"} else f", got {first['input']!r:.60}"
-    return f"is no record: {place + ': ' if place else ''}{first['msg']}{found}"
+    path = ".".join(map(str, first["loc"]))
+    value = "" if first["type"] in {"missing", "json_invalid"} else f", got {first['input']!r:.60}"
+    return f"is no record: {path + ': ' if path else ''}{first['msg']}{value}"
 
 
-def _other_schema(found: object) -> str:
+def _other_schema(schema: object) -> str:
     return (
-        f"has schema {found!r:.20}, expected {SCHEMA}: it was written by another version of "
+        f"has schema {schema!r:.20}, expected {SCHEMA}: it was written by another version of "
         "oodd-eval; run again, or install that version to read it"
     )
 

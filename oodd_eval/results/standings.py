@@ -10,7 +10,7 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, UNDEFINED, metric_info
-from oodd_eval.metrics.ranking import Place, Ranking, Row, rank, win_rates
+from oodd_eval.metrics.ranking import Position, Ranking, Row, rank, win_rates
 from oodd_eval.results.board import Board, contribution, expected_cells, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
@@ -95,7 +95,7 @@ def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ())
     expected = expected_cells([r for rows in by_row.values() for r in rows])
 
     def order(row: Setting) -> tuple[Any, ...]:
-        cells, few = expected & {r.place for r in by_row[row]}, has_few_seeds(by_row[row])
+        cells, few = expected & {r.position for r in by_row[row]}, has_few_seeds(by_row[row])
         return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
 
     chosen: dict[str, Setting] = {}
@@ -109,7 +109,7 @@ def ranked(
     primary: Collection[Setting] | None = None,
     rerun: Collection[Setting] = (),
     *,
-    expected: Collection[Place] = (),
+    expected: Collection[Position] = (),
 ) -> RankedBoard:
     """Rank the rows of one board that have a value in every cell, with all their detector seeds.
 
@@ -136,7 +136,7 @@ def ranked(
     ResultsError
         When ranked rows differ in their numbers of test trajectories, or two rows have one name.
     """
-    ordered = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.place))
+    ordered = sorted(records, key=lambda r: (_name(r.setting), r.seed, r.position))
     by_row = grouped(ordered, lambda r: r.setting)
     labels = Counter(map(str, by_row))
     if twice := [label for label, n in labels.items() if n > 1]:
@@ -146,7 +146,7 @@ def ranked(
         )
     first = primary_settings(records) if primary is None else set(primary)
     cells = set(expected or expected_cells(records))
-    counted = {e: [r for r in rows if r.place in cells] for e, rows in by_row.items()}
+    counted = {e: [r for r in rows if r.position in cells] for e, rows in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
 
     def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row], dict[Setting, str]]:
@@ -201,12 +201,12 @@ def terms_of(records: Iterable[Record], metric: str) -> Row:
     Failed cells, and those without the metric, are left out.
     """
     sign = -1.0 if metric_info(metric).better == "lower" else 1.0
-    row: dict[int, dict[Place, Contribution]] = {}
+    row: dict[int, dict[Position, Contribution]] = {}
     for r in records:
         cells = row.setdefault(r.seed, {})
         if r.ok and metric in r.per_trajectory:
             terms = contribution(r, metric)
-            cells[r.place] = Contribution(sign * terms.numerator, terms.denominator)
+            cells[r.position] = Contribution(sign * terms.numerator, terms.denominator)
     return row
 
 
@@ -223,7 +223,9 @@ def cost_of(records: Iterable[Record]) -> Cost:
     )
 
 
-def _state(records: Sequence[Record], cells: Collection[Place], metric: str, primary: bool) -> str:
+def _state(
+    records: Sequence[Record], cells: Collection[Position], metric: str, primary: bool
+) -> str:
     """Return why a row is not ranked by a metric; empty if it is."""
     seeds = len({r.seed for r in records}) or 1
     expected = len(cells) * seeds

@@ -23,9 +23,14 @@ from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import SubmittedEntry, read_entry
-from oodd_eval.leaderboard.rerun import SPLIT_DIRECTORY, definition_of, draw, environments_of
 from oodd_eval.leaderboard.verify import verify
-from oodd_eval.leaderboard.verify.trust import LEAST
+from oodd_eval.leaderboard.verify.rerun import (
+    LEAST,
+    SPLIT_DIRECTORY,
+    definition_of,
+    draw,
+    environments_of,
+)
 from oodd_eval.names import expression, select
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.isolation.child import Limits

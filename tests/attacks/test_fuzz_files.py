@@ -23,10 +23,10 @@ from oodd_eval.data.bounded import STATE as STATE_BOUNDS
 from oodd_eval.data.bounded import Bounds, read_bytes, read_npz
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import FittedStateError, OoddError
-from oodd_eval.leaderboard.grants import GRANTS, read_grants
-from oodd_eval.leaderboard.rerun import ORDER, read_order
+from oodd_eval.leaderboard.entry import GRANTS, read_grants
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import verify
+from oodd_eval.leaderboard.verify.rerun import ORDER, read_order
 from oodd_eval.plugins.state import ARRAYS, STATE, load_state, save_state
 
 
@@ -94,7 +94,7 @@ def results(tmp_path_factory):
     home = tmp_path_factory.mktemp("results")
     split = make_split(home / "split", calibration=20)
     evaluate("persistence", split, output=home / "out")
-    return submit(home / "out", home / "results", Statement(), scores=True, split=split).place
+    return submit(home / "out", home / "results", Statement(), scores=True, split=split).path
 
 
 @pytest.mark.parametrize("name", ["entry.json", "records.jsonl", "curves.json", "scores"])

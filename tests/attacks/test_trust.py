@@ -9,8 +9,15 @@ from helpers_submission import Draft
 from oodd_eval import evaluate
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import verify as verification
-from oodd_eval.leaderboard.entry import read_entries, read_entry
-from oodd_eval.leaderboard.grants import GRANTS, Grant, digest_of, read_grants, write_grants
+from oodd_eval.leaderboard.entry import (
+    GRANTS,
+    Grant,
+    digest_of,
+    read_entries,
+    read_entry,
+    read_grants,
+    write_grants,
+)
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import verify
@@ -24,7 +31,7 @@ def rows(tmp_path_factory):
     for detector in ("persistence", "random"):
         evaluate(detector, split, output=home / "out")
     return {
-        name: submit(home / "out", home / "results", Statement(), detectors=name).place
+        name: submit(home / "out", home / "results", Statement(), detectors=name).path
         for name in ("persistence", "random")
     }
 

@@ -56,12 +56,12 @@ def files(
     the page does not link to them.
     """
     data, parts = site_data(sections, power)
-    found = {PAGE: index(data | {"project": project})}
+    contents = {PAGE: index(data | {"project": project})}
     for name, part in parts.items():
         if part.get("curves"):
             part = part | {"curves": packed(part["curves"])}  # noqa: PLW2901
-        found[f"{PARTS}/{name}.js"] = data_file(name, part)
-    return found
+        contents[f"{PARTS}/{name}.js"] = data_file(name, part)
+    return contents
 
 
 def index(data: Json) -> str:
@@ -110,20 +110,20 @@ def packed(curves: Mapping[str, Json]) -> Json:
     places in ``lists`` stand for these. Examples are those of `gridded`; their twins lack the first
     ``same_scores`` and ``same_cusum`` values, which are no others.
     """
-    places: dict[tuple[float, ...], int] = {}
+    positions: dict[tuple[float, ...], int] = {}
 
-    def place(numbers: Sequence[float]) -> int:
-        return places.setdefault(tuple(numbers), len(places))
+    def position(numbers: Sequence[float]) -> int:
+        return positions.setdefault(tuple(numbers), len(positions))
 
     cells = {}
     for name, cell in curves.items():
         example = _without_same(gridded(cell["example"]))
         lists = {
-            part: {key: place(numbers) for key, numbers in cell[part].items()}
+            part: {key: position(numbers) for key, numbers in cell[part].items()}
             for part in ("roc", "delay_far")
         }
         cells[name] = cell | lists | {"example": example}
-    return {"lists": [list(numbers) for numbers in places], "cells": cells}
+    return {"lists": [list(numbers) for numbers in positions], "cells": cells}
 
 
 def gridded(example: Json) -> Json:
@@ -132,28 +132,28 @@ def gridded(example: Json) -> Json:
     A ``score_step`` or ``cusum_step`` of None says that the numbers are as they were, because a few
     are so large that they need a logarithmic scale.
     """
-    found = dict(example)
+    steps = dict(example)
     for step_name, unit, names in (
         ("score_step", 1.0, ("scores", "twin")),
         ("cusum_step", THRESHOLD, ("cusum", "twin_cusum")),
     ):
         step = _step((v for name in names for v in example[name] if v is not None), unit)
-        found[step_name] = step
+        steps[step_name] = step
         if step is not None:
             for name in names:
-                found[name] = [None if v is None else round(v / step) for v in example[name]]
-    return found
+                steps[name] = [None if v is None else round(v / step) for v in example[name]]
+    return steps
 
 
 def _without_same(example: Json) -> Json:
     """Leave out the beginnings of the twin's series: up to the onset both are the same."""
-    found = dict(example)
+    shorter = dict(example)
     for name, twin in (("scores", "twin"), ("cusum", "twin_cusum")):
         pairs = zip(example[name], example[twin], strict=False)
         same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
-        found[f"same_{name}"] = same
-        found[twin] = example[twin][same:]
-    return found
+        shorter[f"same_{name}"] = same
+        shorter[twin] = example[twin][same:]
+    return shorter
 
 
 def _step(numbers: Iterable[float], unit: float) -> float | None:

@@ -9,17 +9,20 @@ sorts and draws.
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, paper_tables
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Quantity, paper_tables
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
 from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
-from oodd_eval.leaderboard.site.episodes import shipped_split, shown_episodes
-from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, RANKING, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
@@ -61,6 +64,9 @@ RANKING_PLACE: Final = WITH_INTERVALS.index(RANKING)
 
 _ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
 
+MOST_SENSORS: Final = 3  # sensors of an episode: those that leave their twin's course most
+STEPS: Final = 250  # steps between the least and the largest value: one a pixel
+
 Json = dict[str, Any]
 Units = Mapping[str, list[Json]]  # curves of single cells by the id of their entry
 
@@ -77,9 +83,9 @@ def site_data(
     entries = {entry.meta.id: entry for section in sections for entry in section.entries}
     units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
     parts: dict[str, Json] = {}
-    shown = [_board(section, units, parts) for section in sections]
-    names = dict.fromkeys(name for board in shown for name in board["metrics"])
-    used = {*TABLE1, *(name for board in shown for name in board["anomalies"])}
+    on_site = [_board(section, units, parts) for section in sections]
+    names = dict.fromkeys(name for board in on_site for name in board["metrics"])
+    used = {*TABLE1, *(name for board in on_site for name in board["anomalies"])}
     kinds = [a for a in ANOMALIES.values() if a.id in used]
     data = {
         "threshold": THRESHOLD,
@@ -88,7 +94,7 @@ def site_data(
         "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"],
-        "boards": shown,
+        "boards": on_site,
         "power": [*power],
     }
     return data, parts
@@ -152,10 +158,9 @@ def _metric(name: str) -> Json:
 
 def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) -> Json:
     ranks, board = section.ranks, section.ranks.board
-    found = {name for r in board.records for name in r.metrics}
-    # The plain ones stand there even where every cell of the board has failed.
-    by_level = [f"{m}_{suffix}" for suffix in LEVELS for m in (*GUARANTEED, "threshold")]
-    names = [*METRICS, *(name for name in (*by_level, *catalogue.ATTRIBUTION) if name in found)]
+    present = {name for r in board.records for name in r.metrics}
+    # Where every cell has failed, the page still shows the metrics without a level.
+    names = [name for name in NAMES if name in present] or [*METRICS]
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
     chosen = selections(cells)
@@ -168,7 +173,7 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         by_cell[row["part"]] = _by_cell(standing, cells)
     for metric in names:
         values = {
-            part: [_mean(records, metric) for records in own] for part, own in by_cell.items()
+            part: [_mean(records, metric) for records in of_row] for part, of_row in by_cell.items()
         }
         parts[metric_part(section.name, metric)] = {
             "values": values,
@@ -195,14 +200,14 @@ def _episodes(
     """Add a part for each environment with the sensors of the episodes that rows show."""
     if not (split := shipped_split(section.ranks.board.digest)):
         return {}
-    wanted: dict[str, list[tuple[str, int]]] = {}
+    episodes: dict[str, list[tuple[str, int]]] = {}
     for curves in (parts[row["part"]]["curves"] for row in rows):
-        for cell, shown in curves.items():
+        for cell, drawn in curves.items():
             environment, anomaly = cell.split("/")
-            wanted.setdefault(environment, []).append((anomaly, shown["example"]["index"]))
-    names = {environment: part_name(f"{section.name}/{environment}") for environment in wanted}
+            episodes.setdefault(environment, []).append((anomaly, drawn["example"]["index"]))
+    names = {environment: part_name(f"{section.name}/{environment}") for environment in episodes}
     for environment, name in names.items():
-        parts[name] = shown_episodes(split, environment, wanted[environment])
+        parts[name] = shown_episodes(split, environment, episodes[environment])
     return names
 
 
@@ -275,27 +280,27 @@ def _summaries(
 
     They are whole numbers of the last digit that is printed, None where there is none.
     """
-    board, found = section.ranks.board, {}
+    board, summaries = section.ranks.board, {}
     for key in (key for key in SUMMARIES if key in chosen):
         means = [board.mean(standing.entry, *_sides(chosen[key]), name) for name in names]
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
-        own = intervals.get(key, [None] * len(_with_intervals(names)))
+        ends_of = intervals.get(key, [None] * len(_with_intervals(names)))
         ends = [
             [
                 _digits(NAN if pair is None or pair[i] is None else pair[i], name)
-                for pair, name in zip(own, _with_intervals(names), strict=True)
+                for pair, name in zip(ends_of, _with_intervals(names), strict=True)
             ]
             for i in (0, 1)
         ]
-        found[key.partition("|")[2]] = [values, *ends]
-    return found
+        summaries[key.partition("|")[2]] = [values, *ends]
+    return summaries
 
 
 def _by_cell(standing: Standing, cells: Sequence[SelectedCell]) -> list[list[Record]]:
     """Return a row's records of every cell, none where one has failed."""
-    own = grouped(standing.records, lambda r: (r.environment, r.anomaly))
-    found = [own.get(cell, []) for cell in cells]
-    return [records if all(r.ok for r in records) else [] for records in found]
+    by_cell = grouped(standing.records, lambda r: (r.environment, r.anomaly))
+    cells_of = [by_cell.get(cell, []) for cell in cells]
+    return [records if all(r.ok for r in records) else [] for records in cells_of]
 
 
 def _mean(records: Sequence[Record], metric: str) -> float | None:
@@ -304,14 +309,14 @@ def _mean(records: Sequence[Record], metric: str) -> float | None:
 
 
 def _ranking_intervals(part: Json) -> dict[str, list[float | None]]:
-    """Return a row's intervals of matched AUC by selection; a cell of one record has its own."""
-    found = {key: ends[RANKING_PLACE] for key, ends in part["intervals"].items()}
+    """Return a row's intervals of matched AUC by selection; a cell of one record has its pair."""
+    intervals = {key: ends[RANKING_PLACE] for key, ends in part["intervals"].items()}
     once = grouped(part["cells"], lambda cell: (cell["environment"], cell["anomaly"]))
     for (environment, anomaly), cells in once.items():
         if len(cells) == 1 and "values" in cells[0]:
-            own = [cells[0][end][RANKING_PLACE] for end in ("low", "high")]
-            found[f"{environment}|{anomaly}"] = own
-    return {key: pair for key, pair in found.items() if pair and None not in pair}
+            pair = [cells[0][end][RANKING_PLACE] for end in ("low", "high")]
+            intervals[f"{environment}|{anomaly}"] = pair
+    return {key: pair for key, pair in intervals.items() if pair and None not in pair}
 
 
 def _entry(entry: SubmittedEntry, plugin: str) -> Json:
@@ -349,17 +354,19 @@ def _intervals(
     A single record has its own.
     """
     metrics = _with_intervals(names)
-    found: dict[str, list[list[float | None] | None]] = {}
+    intervals: dict[str, list[list[float | None] | None]] = {}
     few = {key: cells for key, cells in chosen.items() if key in SUMMARIES}
     for i, metric in enumerate(metrics):
-        wanted = chosen if metric == RANKING else few
-        several = {k: cells for k, cells in wanted.items() if len(cells) > 1 or standing.seeds > 1}
+        selected = chosen if metric == RANKING else few
+        several = {
+            k: cells for k, cells in selected.items() if len(cells) > 1 or standing.seeds > 1
+        }
         for key, cells in several.items():
             mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
             if not math.isnan(mean.low):
                 bounds = [_printed(v, metric_info(metric).unit) for v in (mean.low, mean.high)]
-                found.setdefault(key, [None] * len(metrics))[i] = bounds
-    return found
+                intervals.setdefault(key, [None] * len(metrics))[i] = bounds
+    return intervals
 
 
 def _with_intervals(names: Sequence[str]) -> list[str]:
@@ -369,12 +376,12 @@ def _with_intervals(names: Sequence[str]) -> list[str]:
 def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
     """Curves of a row's cells by ``environment/anomaly``, of the first seed that has them."""
     cells = {str(r.cell) for r in records}
-    found: Json = {}
+    curves: Json = {}
     for unit in units:
         if unit["cell"] in cells:
-            shown = {name: unit[name] for name in ("seed", "roc", "delay_far", "example")}
-            found.setdefault(f"{unit['environment']}/{unit['anomaly']}", shown)
-    return found
+            parts = {name: unit[name] for name in ("seed", "roc", "delay_far", "example")}
+            curves.setdefault(f"{unit['environment']}/{unit['anomaly']}", parts)
+    return curves
 
 
 def _digits(value: float, metric: str) -> int | None:
@@ -420,9 +427,51 @@ def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
             environments.setdefault(name, set()).add(environment)
         for name in ("all", ANOMALIES[anomaly].group, anomaly):
             anomalies.setdefault(name, set()).add(anomaly)
-    found = {
+    selected = {
         f"{some}|{others}": [(e, a) for e, a in cells if e in environments[some] and a in named]
         for some in environments
         for others, named in anomalies.items()
     }
-    return {key: chosen for key, chosen in found.items() if chosen}
+    return {key: chosen for key, chosen in selected.items() if chosen}
+
+
+def shipped_split(digest: str) -> Split | None:
+    """Return the split with a digest if it comes with the package.
+
+    The site shows no sensors of other splits, so that its files do not depend on which splits a
+    machine has; entries hold scores, not observations.
+    """
+    splits = (Split(path.parent) for path in SHIPPED.glob("*/manifest.json"))
+    return next((split for split in splits if split.digest == digest), None)
+
+
+def shown_episodes(split: Split, environment: str, episodes: Iterable[tuple[str, int]]) -> Json:
+    """Return the sensors of test episodes by ``anomaly/index``.
+
+    Each sensor has its name with unit, a step, and in whole numbers of steps what the episode and
+    its nominal twin read from row 0 on.
+    """
+    data = split.environment(environment)
+    return {f"{a}/{i}": _sensors(data, a, i) for a, i in sorted(set(episodes))}
+
+
+def _sensors(data: EnvironmentData, anomaly: str, index: int) -> list[Json]:
+    episode, twin = data.anomalous(anomaly)[index].observations, data.twins[index].observations
+    both = min(len(episode), len(twin))
+    spread = np.maximum(twin.std(axis=0), 1e-6)
+    apart = np.abs(episode[:both] - twin[:both]).mean(axis=0) / spread
+    return [
+        _sensor(_title(data.sensors[d]), episode[:, d], twin[:, d])
+        for d in np.argsort(-apart, kind="stable")[:MOST_SENSORS]
+    ]
+
+
+def _title(sensor: Quantity) -> str:
+    return sensor.name if sensor.unit == "1" else f"{sensor.name} ({sensor.unit})"
+
+
+def _sensor(name: str, episode: NDArray[Any], twin: NDArray[Any]) -> Json:
+    values = np.concatenate([episode, twin]).astype(np.float64)
+    step = float(f"{max(np.ptp(values) / STEPS, 1e-9):.2g}")
+    whole = np.round(values / step).astype(int).tolist()
+    return {"name": name, "step": step, "own": whole[: len(episode)], "twin": whole[len(episode) :]}

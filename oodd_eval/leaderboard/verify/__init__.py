@@ -2,15 +2,19 @@
 
 An entry is checked in an order in which every step only meets what the steps before have found
 sound: files, ``entry.json``, digests, the fields of each record, the metrics of each record, the
-records among each other, scores, and last the trajectories of the split, where it is at hand.
+records among each other, curves and scores, and last the scores against the split, where it is at
+hand. That the scores are those of the detector is not checked here: re-runs do that (`rerun`).
 """
 
 import os
 import stat
+import subprocess
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from pathlib import Path
-from typing import Final
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -18,26 +22,78 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import ENTRY, EntryInfo, read_entry, recorded_versions, row_of
-from oodd_eval.leaderboard.grants import GRANTS, TRUST, digest_of, read_grants
-from oodd_eval.leaderboard.rerun import RerunOrder
-from oodd_eval.leaderboard.verify import scores
-from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, shown
-from oodd_eval.leaderboard.verify.formats import read_info, read_records
-from oodd_eval.leaderboard.verify.records import (
+from oodd_eval.leaderboard.entry import (
+    ENTRY,
+    GRANTS,
+    TRUST,
+    EntryInfo,
+    Grant,
+    Means,
+    Trust,
+    digest_of,
+    read_entry,
+    read_grants,
+    recorded_versions,
+    row_of,
+    write_grants,
+)
+from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, short
+from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint, read_info, read_records
+from oodd_eval.leaderboard.verify.recompute import (
     Records,
     check_against_split,
+    check_curves,
     check_record,
+    check_rescored,
+    check_scores,
     check_together,
 )
-from oodd_eval.leaderboard.verify.trust import EntryVerdict, compare_rerun
+from oodd_eval.leaderboard.verify.rerun import Rerun, RerunOrder, compare_rerun
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.directory import RECORDS, without_collector
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
 Seen = dict[object, tuple[str, str]]  # by row or detector: its entry, a detector's distribution
-_Numbers = dict[object, tuple[str, str]]  # by place and numbers of a cell: its entry and row
+_Numbers = dict[object, tuple[str, str]]  # by position and numbers of a cell: its entry and row
+
+
+@dataclass(frozen=True, slots=True)
+class EntryVerdict:
+    """The result of verifying one entry.
+
+    `entry` is None when ``entry.json`` is not sound, `digest` is that of its bytes; `records` are
+    the sound ones, by where they stand; `rescored` says that every metric was recomputed from the
+    scores and agrees; `grant` is what maintainers have granted to just this entry.
+    """
+
+    name: str
+    findings: Findings
+    records: Records
+    entry: EntryInfo | None = None
+    rescored: bool = False
+    rerun: Rerun | None = None
+    digest: str = ""
+    grant: Grant | None = None
+
+    @property
+    def ok(self) -> bool:
+        """True if no problem was found."""
+        return not self.findings.count
+
+    @property
+    def trust(self) -> Trust:
+        """The level of trust that was granted."""
+        return self.grant.trust if self.grant else "reported"
+
+    @property
+    def reached(self) -> Trust | None:
+        """The level of trust that was established here; None for an entry that is refused."""
+        if not self.ok:
+            return None
+        if self.rerun is not None and self.rerun.confirmed:
+            return "re-run"
+        return "re-scored" if self.rescored else "reported"
 
 
 @without_collector()
@@ -65,36 +121,32 @@ def verify_entry(
         _check_info(entry, name, findings)
         check_digests(contents, entry.files, findings)
     records = read_records(contents, findings)
-    terms = {where: check_record(where, record, findings) for where, record in records.items()}
-    sums = {where: own for where, own in terms.items() if own is not None}
+    for where, record in records.items():
+        check_record(where, record, findings)
     if entry is None or not records:
         return EntryVerdict(name, findings, records, entry)
     _check_statements(entry, records, findings)
-    check_together(entry, records, sums, findings)
-    scored = scores.check_scores(directory, contents, records, findings)
-    curves = scores.check_curves(contents, records, findings)
-    complete = bool(scored) and all(w in scored for w, r in records.items() if r.ok)
+    check_together(entry, records, findings)
+    check_curves(contents, records, findings)
+    scored = check_scores(directory, contents, records, findings)
     rescored = False
     opened, note = find_split(entry.split, entry.split_digest, split)
     if opened is None:
         findings.notes.append(f"{note}: compared with no trajectory, nothing recomputed")
     else:
-        sound = not findings.count
-        own = {w: r for w, r in records.items() if r.split_digest == opened.digest}
-        scored = {w: r for w, r in scored.items() if w in own}
-        check_against_split(own, sums, opened, findings)
-        if scored:
-            rescored = scores.check_rescored(scored, directory, opened, findings) and complete
-        if scored and curves is not None and sound:
-            scores.check_recomputed_curves(curves, scored, directory, opened, findings)
+        of_split = {w: r for w, r in records.items() if r.split_digest == opened.digest}
+        check_against_split(of_split, opened, findings)
+        complete = all(where in scored for where, r in records.items() if r.ok)
+        if scored := {w: r for w, r in scored.items() if w in of_split}:
+            rescored = check_rescored(scored, directory, opened, findings) and complete
     digest = digest_of(contents[ENTRY])
     if order is not None and order.entry != digest:
         why = "seeds were drawn for another version of the entry"
         findings.expect("re-run", "entry", order.entry, digest, why)
     again = compare_rerun(records, rerun, findings, order) if rerun else None
-    rescored = rescored and not findings.count
     grant = read_grants(directory.absolute().parent).get(name)
     held = grant if grant and grant.entry == digest else None
+    rescored = rescored and not findings.count
     verdict = EntryVerdict(name, findings, records, entry, rescored, again, digest, held)
     findings.notes.extend(_notes_on_trust(verdict))
     return verdict
@@ -106,8 +158,8 @@ def _guarded(directory: Path, split: str | Path | None) -> EntryVerdict:
         return verify_entry(directory, split=split)
     except Exception as error:  # noqa: BLE001  it holds what nobody has thought of
         findings = Findings()
-        what = plain(f"{type(error).__name__}: {error}")
-        findings.refuse("entry", "", f"could not be checked ({what}): please report it")
+        reason = plain(f"{type(error).__name__}: {error}")
+        findings.refuse("entry", "", f"could not be checked ({reason}): please report it")
         return EntryVerdict(directory.name, findings, {})
 
 
@@ -119,7 +171,7 @@ def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
     """
     findings.expect(ENTRY, "id", name, entry.id, "the name of its directory")
     published, split, digest = published_digests(), entry.split, entry.split_digest
-    names = [known for known, its in published.items() if its == digest]
+    names = [known for known, other in published.items() if other == digest]
     if not digest.startswith(split.partition("@")[2]):
         findings.refuse(ENTRY, "split", f"is {split!r}, but split_digest is {digest[:8]}…")
     if names and split not in names:
@@ -136,8 +188,8 @@ def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
 def _check_statements(entry: EntryInfo, records: Records, findings: Findings) -> None:
     """Check what ``entry.json`` says of its records: detectors, plug-ins, versions."""
     why = "as the records have it"
-    found = sorted({record.detector for record in records.values()})
-    findings.expect(ENTRY, "detectors", found, entry.detectors, why)
+    detectors = sorted({record.detector for record in records.values()})
+    findings.expect(ENTRY, "detectors", detectors, entry.detectors, why)
     listed = sorted(
         (f"{p['distribution']}:{p['plugin']}", p["version"], p["source_digest"])
         for p in entry.plugins
@@ -148,7 +200,7 @@ def _check_statements(entry: EntryInfo, records: Records, findings: Findings) ->
     named = [rows.get(row, "") for row in entry.primary]
     for row, detector in zip(entry.primary, named, strict=True):
         if not detector or named.count(detector) > 1:
-            message = f"names {shown(row)}, expected rows of these records, one a detector"
+            message = f"names {short(row)}, expected rows of these records, one a detector"
             findings.refuse(ENTRY, "primary", message)
     stated = entry.environment["packages"] | {"python": entry.environment["python"]}
     for package, version in recorded_versions(records.values()).items():
@@ -156,12 +208,12 @@ def _check_statements(entry: EntryInfo, records: Records, findings: Findings) ->
         findings.expect(ENTRY, field, version, stated.get(package), why)
 
 
-def find_split(name: str, digest: str, place: str | Path | None) -> tuple[Split | None, str]:
-    """Open a split, or say why it is not at hand; one that is named by `place` has to be there."""
+def find_split(name: str, digest: str, path: str | Path | None) -> tuple[Split | None, str]:
+    """Open a split, or say why it is not at hand; one that a `path` names has to be there."""
     try:
-        split = load_split(place or name.partition("@")[0])
+        split = load_split(path or name.partition("@")[0])
     except (SplitError, UnknownNameError):
-        if place:
+        if path:
             raise
         return None, f"split {name} is not on this machine (name its place with --split)"
     if split.digest == digest:
@@ -222,8 +274,8 @@ def verify_changed(root: Path, names: Collection[str]) -> Iterator[EntryVerdict]
     The others are taken as they are. Names without a directory are entries that were removed.
     """
     seen, numbers = Seen(), _Numbers()
-    places = sorted(path.parent for path in root.glob(f"*/{ENTRY}"))
-    for entry in (read_entry(place) for place in places if place.name not in names):
+    directories = sorted(path.parent for path in root.glob(f"*/{ENTRY}"))
+    for entry in (read_entry(path) for path in directories if path.name not in names):
         records = {str(i): record for i, record in enumerate(entry.records)}
         check_clashes(entry.meta.id, records, seen, Findings())
         check_copies(entry.meta.id, records, numbers, Findings())
@@ -257,13 +309,88 @@ def check_copies(name: str, records: Records, seen: _Numbers, findings: Findings
     cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
     for record in records.values():
         terms, row = record.per_trajectory.get(RANKING, np.zeros((2, 0))), str(record.setting)
-        told = tuple(round(term, 3) for term in terms[0].tolist())
-        if len(set(told)) > 1:
+        numbers = tuple(round(term, 3) for term in terms[0].tolist())
+        if len(set(numbers)) > 1:
             cells[row] += 1
-            place = record.split_digest, record.environment, record.condition, told
-            entry, other = seen.setdefault(place, (name, row))
+            key = record.split_digest, record.environment, record.condition, numbers
+            entry, other = seen.setdefault(key, (name, row))
             copied[row, entry, other] += entry != name
     for (row, entry, other), count in copied.items():
         if 2 * count > cells[row]:
             message = f"has in {count} of {cells[row]} cells the numbers of {other} in {entry}"
             findings.refuse(RECORDS, row, f"{message}: expected a detector's own")
+
+
+def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
+    """Grant an entry the level of trust that its verification by somebody established."""
+    if message := complaint(GrantedBy, by):
+        raise UsageError(f"--grant {message}")
+    level = verdict.reached
+    if level is None:
+        raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
+    if level == "reported" or TRUST.index(level) <= TRUST.index(verdict.trust):
+        raise UsageError(
+            f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
+            f"is {level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
+        )
+    how, means = "every metric recomputed from its scores", Means()
+    if verdict.rerun:
+        how, means = verdict.rerun.how, verdict.rerun.means
+    day = datetime.now(UTC).date().isoformat()
+    new = Grant(verdict.digest, level, by, day, how, means)
+    results = directory.absolute().parent
+    write_grants(results, read_grants(results) | {verdict.name: new})
+    return new
+
+
+class Changes(NamedTuple):
+    """Names of the entries that were added, changed or removed, and the paths of other files."""
+
+    entries: list[str]
+    others: list[str]
+
+
+def changes_against(base: str, results: Path) -> Changes:
+    """Return what differs from the commit where the current branch left a base, by name.
+
+    The base is a branch, tag or commit. `results` is the directory of the entries, in a checkout,
+    where files that git does not know yet count, too. `UsageError`: this is no checkout, or `base`
+    is no commit of it that the branch comes from.
+    """
+    inside = results if results.is_dir() else Path()
+    top = Path(_git(inside, "rev-parse", "--show-toplevel").rstrip("\n"))
+    commit = _git(top, "rev-parse", "--verify", "--end-of-options", f"{base}^{{commit}}").strip()
+    fork = _git(top, "merge-base", commit, "HEAD").strip()
+    changed = _git(top, "diff", "--name-only", "--no-renames", "--no-ext-diff", "-z", fork)
+    root = PurePosixPath(Path(os.path.relpath(results.resolve(), top.resolve())).as_posix())
+    added = _git(top, "ls-files", "--others", "--exclude-standard", "-z", "--", str(root))
+    entries, others = set[str](), set[str]()
+    for text in filter(None, f"{changed}{added}".split("\0")):
+        path = PurePosixPath(text)
+        below = path.relative_to(root).parts if path.is_relative_to(root) else ()
+        if len(below) > 1:
+            entries.add(below[0])
+        else:
+            others.add(text)  # a file beside the entries is none of them
+    return Changes(sorted(entries), sorted(others))
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    """Return what git prints; its message is the error's."""
+    try:
+        done = subprocess.run(  # noqa: S603
+            ["git", "-C", str(directory), *arguments],  # noqa: S607
+            capture_output=True,
+            check=False,
+            text=True,
+            errors="surrogateescape",
+        )
+    except OSError as error:
+        raise UsageError(f"--changed-against needs git: {error.strerror}") from None
+    if done.returncode:
+        said = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
+        raise UsageError(
+            f"--changed-against: git {arguments[0]} says {said!r}; expected a checkout and a "
+            "commit that it has (in CI, fetch the whole history)"
+        )
+    return done.stdout

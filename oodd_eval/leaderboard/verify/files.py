@@ -43,14 +43,14 @@ _SHORT.maxstring = _SHORT.maxother = 60
 _SHORT.maxlevel = 2
 
 
-def shown(value: Any) -> str:
+def short(value: Any) -> str:
     """Return a value of a submission, shortened and safe to print on a terminal."""
     return _SHORT.repr(value).encode("ascii", "backslashreplace").decode()
 
 
 def plain(text: str) -> str:
-    """Return a name of a submission like `shown`, without its quotes."""
-    return shown(text)[1:-1]
+    """Return a name of a submission like `short`, without its quotes."""
+    return short(text)[1:-1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +85,11 @@ class Findings:
         if len(self.problems) < MOST_PROBLEMS:
             self.problems.append(Problem(where, field, message))
 
-    def expect(self, where: str, field: str, expected: Any, found: Any, why: str = "") -> None:
+    def expect(self, where: str, field: str, expected: Any, actual: Any, why: str = "") -> None:
         """Refuse a value that is not the expected one."""
-        if found != expected:
+        if actual != expected:
             reason = f": {why}" if why else ""
-            self.refuse(where, field, f"is {shown(found)}, expected {shown(expected)}{reason}")
+            self.refuse(where, field, f"is {short(actual)}, expected {short(expected)}{reason}")
 
     @contextmanager
     def reading(self, where: str) -> Iterator[None]:
@@ -190,13 +190,13 @@ def check_digests(
     contents: Mapping[str, bytes], claimed: Mapping[str, Any], findings: Findings
 ) -> None:
     """Compare the files with what ``entry.json`` says of them."""
-    found = contents.keys() - {ENTRY}
-    for name in sorted(claimed.keys() - found):
+    present = contents.keys() - {ENTRY}
+    for name in sorted(claimed.keys() - present):
         findings.refuse(ENTRY, f"files.{plain(name)}", "names a file that is not there")
-    for name in sorted(found - claimed.keys()):
+    for name in sorted(present - claimed.keys()):
         findings.refuse(ENTRY, f"files.{name}", "is missing, but the file is there")
     why = "it was changed after the entry was written"
-    for name in sorted(found & claimed.keys()):
+    for name in sorted(present & claimed.keys()):
         facts = {"bytes": len(contents[name]), "sha256": hashlib.sha256(contents[name]).hexdigest()}
         for fact, value in facts.items():
             findings.expect(ENTRY, f"files.{name}.{fact}", value, claimed[name][fact], why)
@@ -213,10 +213,10 @@ def parse_json(text: str) -> Any:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError(f"a name stands twice among {shown([name for name, _ in pairs])}")
-    return found
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError(f"a name stands twice among {short([name for name, _ in pairs])}")
+    return members
 
 
 def _refuse_constant(constant: str) -> Any:

@@ -16,7 +16,7 @@ from pydantic_core import ValidationError
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo
-from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, shown
+from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, short
 from oodd_eval.names import PARAMETER_NAME, SPEC_NAME
 from oodd_eval.results import record as record_format
 from oodd_eval.results.curve_file import strict_model
@@ -209,16 +209,16 @@ def complaint(kind: Any, value: object) -> str:
 
 
 def _message(error: Any) -> str:
-    """Return one of pydantic's errors as found and expected."""
+    """Return one of pydantic's errors as the value and what is expected."""
     if error["type"] == "missing":
         return "is missing"
     if error["type"] == "extra_forbidden":
         return "is no field of this format"
     text = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
-    return f"is {shown(error['input'])}, {text}"
+    return f"is {short(error['input'])}, {text}"
 
 
-def _place(parts: tuple[int | str, ...]) -> str:
+def _path(parts: tuple[int | str, ...]) -> str:
     """Return the path of a field, such as ``plugins[0].version``."""
     text = ""
     for part in parts:
@@ -237,7 +237,7 @@ def _holds_to(model: type[BaseModel], text: str, where: str, findings: Findings)
             model.model_validate_json(text)
     except ValidationError as error:
         for one in error.errors(include_url=False):
-            findings.refuse(where, _place(one["loc"]), _message(one))
+            findings.refuse(where, _path(one["loc"]), _message(one))
     return findings.count == before
 
 
@@ -259,13 +259,13 @@ def read_records(contents: Mapping[str, bytes], findings: Findings) -> dict[str,
     if not text or len(lines) > MOST_RECORDS:
         findings.refuse(name, "", f"has {len(lines)} lines, expected 1 to {MOST_RECORDS} records")
         return {}
-    found = {}
+    records = {}
     for number, line in enumerate(lines, start=1):
         where = f"{name}:{number}"
         if len(line) > MOST_LINE or not line.isprintable():
             expected = f"one record in plain JSON of at most {MOST_LINE} characters"
-            findings.refuse(where, "", f"is {shown(line)}, expected {expected}")
+            findings.refuse(where, "", f"is {short(line)}, expected {expected}")
         elif _holds_to(_RECORD, line, where, findings):
             record = Record.from_json(line, where)
-            found[f"{where} ({record.cell})"] = record
-    return found
+            records[f"{where} ({record.cell})"] = record
+    return records

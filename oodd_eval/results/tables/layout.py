@@ -90,7 +90,7 @@ def guaranteed(
     names = board.present(f"{name}_{suffix}" for name in bases)
     if not names:
         return None
-    with_ends = [n for n in names if intervals or n.startswith("false_episodes")]
+    with_ends = [n for n in names if intervals or metric_info(n).interval == "exact"]
     columns = _overall(board, names, with_ends, level=False)
     level = f"{100 * catalogue.LEVELS[suffix]:g} %"
     title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
@@ -154,7 +154,8 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric without a level, mean over all cells, with nulls and the placebo."""
-    columns = _overall(board, catalogue.METRICS, catalogue.METRICS if intervals else ())
+    names = board.present(catalogue.METRICS) or [*catalogue.METRICS]
+    columns = _overall(board, names, names if intervals else ())
     return _by_metric(board, "All metrics, mean over cells", columns)
 
 

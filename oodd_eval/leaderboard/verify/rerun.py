@@ -1,28 +1,33 @@
-"""The verdict on an entry, its comparison with a re-run, and the grant of a level of trust.
+"""A run of an entry's rows once more, on a split of seeds that are drawn after the entry was made.
+
+The directory of a re-run is a results directory with the split that was built for it, ``split``,
+and the order, ``rerun.json``. The order is written before anything is recorded, and names the
+digest of ``entry.json``: seeds that were drawn for one entry do not count for another.
 
 A re-run uses the same code, by its digest, on a split of seeds that the submitter could not know,
 so its numbers differ by chance. How much chance explains is estimated from environments: each has a
 fit, a calibration and episodes of its own. An entry that is better by more than that is refused.
 """
 
+import json
 import math
+import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import TABLE1
+from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS, TABLE1, SplitDefinition
+from oodd_eval.data.files import write_text
 from oodd_eval.data.split import published_digests
-from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import EntryInfo
-from oodd_eval.leaderboard.grants import TRUST, Grant, Means, Trust, read_grants, write_grants
-from oodd_eval.leaderboard.rerun import RerunOrder
+from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.leaderboard.entry import ENTRY, Means, SubmittedEntry, digest_of
 from oodd_eval.leaderboard.verify.files import Findings
-from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint
-from oodd_eval.leaderboard.verify.records import Records
+from oodd_eval.leaderboard.verify.recompute import Records
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.metrics.binomial import t_quantile
 from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval, nan_mean
@@ -30,6 +35,9 @@ from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
+
+ORDER: Final = "rerun.json"
+SPLIT_DIRECTORY: Final = "split"  # directory of the split, in that of the re-run
 
 COMPARED: Final = (
     "auc_matched",
@@ -63,6 +71,89 @@ _FIELDS: Final = (
 
 
 @dataclass(frozen=True, slots=True)
+class RerunOrder:
+    """Seeds drawn on a `day` (ISO 8601) for an entry, given by the digest of its ``entry.json``.
+
+    `sandbox` is False as soon as one worker was a plain one.
+    """
+
+    entry: str
+    seed_base: int
+    day: str
+    environments: list[str]
+    sandbox: bool
+    schema: Literal[1] = 1  # version of the layout; others are refused
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
+
+    def __str__(self) -> str:
+        """Return what a grant says of it."""
+        where = "in a sandbox" if self.sandbox else "without a sandbox"
+        return f"seed base {self.seed_base} drawn on {self.day} for this entry, {where}"
+
+
+def read_order(directory: Path) -> RerunOrder | None:
+    """Return the order in a directory, None if it has none; `ResultsError` for a damaged one."""
+    file = directory / ORDER
+    if not file.exists():
+        return None
+    try:
+        return TypeAdapter(RerunOrder).validate_json(file.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise ResultsError(
+            f"{str(file)!r} is no order of a re-run: {error}; use another directory"
+        ) from None
+
+
+def draw(
+    entry: SubmittedEntry, directory: Path, environments: Sequence[str], *, sandbox: bool
+) -> RerunOrder:
+    """Draw seeds for an entry and write the order, or go on with the one that is there.
+
+    `UsageError`: the order there is for another entry, another version of it, or environments.
+    """
+    digest = digest_of((entry.path / ENTRY).read_bytes())
+    order = read_order(directory)
+    if order is None:
+        taken = {definition.seed_base for definition in SPLITS.values()}
+        base = secrets.choice([n for n in OWN_SEED_BASES if n not in taken])
+        day = datetime.now(UTC).date().isoformat()
+        order = RerunOrder(digest, base, day, list(environments), sandbox)
+    if order.entry != digest:
+        raise UsageError(
+            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {entry.meta.id} "
+            f"has {digest[:12]}: seeds are drawn for one version of an entry; name another --output"
+        )
+    if order.environments != list(environments):
+        raise UsageError(
+            f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
+            f"{', '.join(environments)}: name another --output"
+        )
+    order = replace(order, sandbox=order.sandbox and sandbox)
+    directory.mkdir(parents=True, exist_ok=True)
+    write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
+    return order
+
+
+def definition_of(entry: SubmittedEntry, order: RerunOrder) -> SplitDefinition:
+    """Return the entry's split, recorded anew from the order's seeds; `UsageError` for others."""
+    definition = SPLITS.get(entry.meta.split)
+    if definition is None or definition.base:
+        known = ", ".join(name for name, one in SPLITS.items() if not one.base)
+        raise UsageError(
+            f"{entry.meta.id} is on split {entry.meta.split!r}: expected one that can be recorded "
+            f"with other seeds ({known})"
+        )
+    return replace(definition, name=f"rerun-{order.seed_base}", seed_base=order.seed_base)
+
+
+def environments_of(entry: SubmittedEntry) -> list[str]:
+    """Return the environments that an entry has, in the order of the paper."""
+    present = {record.environment for record in entry.records}
+    return [name for name in ENVIRONMENTS if name in present]
+
+
+@dataclass(frozen=True, slots=True)
 class Rerun:
     """The result of a comparison with a re-run, in one line and in a line for every row.
 
@@ -76,45 +167,7 @@ class Rerun:
     means: Means
 
 
-@dataclass(frozen=True, slots=True)
-class EntryVerdict:
-    """The result of verifying one entry.
-
-    `entry` is None when ``entry.json`` is not sound, `digest` is that of its bytes; `records` are
-    the sound ones, by where they stand; `rescored` says that every metric was recomputed from the
-    scores and agrees; `grant` is what maintainers have granted to just this entry.
-    """
-
-    name: str
-    findings: Findings
-    records: Records
-    entry: EntryInfo | None = None
-    rescored: bool = False
-    rerun: Rerun | None = None
-    digest: str = ""
-    grant: Grant | None = None
-
-    @property
-    def ok(self) -> bool:
-        """True if no problem was found."""
-        return not self.findings.count
-
-    @property
-    def trust(self) -> Trust:
-        """The level of trust that was granted."""
-        return self.grant.trust if self.grant else "reported"
-
-    @property
-    def reached(self) -> Trust | None:
-        """The level of trust that was established here; None for an entry that is refused."""
-        if not self.ok:
-            return None
-        if self.rerun is not None and self.rerun.confirmed:
-            return "re-run"
-        return "re-scored" if self.rescored else "reported"
-
-
-_Place = tuple[Setting, str, str]  # row, environment, condition
+_CellKey = tuple[Setting, str, str]  # row, environment, condition
 
 
 def compare_rerun(
@@ -125,53 +178,53 @@ def compare_rerun(
     The run may be of fewer environments and detector seeds, and have more than the entry's rows.
     """
     before = findings.count
-    again, place = _usable(records, fresh, findings)
-    ours = grouped(records.values(), _place)
-    both = {key: (own, again[key]) for key, own in ours.items() if key in again}
+    again, source = _usable(records, fresh, findings)
+    ours = grouped(records.values(), _cell_of)
+    pairs = {key: (cells, again[key]) for key, cells in ours.items() if key in again}
     lines, means = [], Means()
     for row in dict.fromkeys(row for row, _, _ in ours):
-        own = {(env, condition): pair for (r, env, condition), pair in both.items() if r == row}
-        whole = {env for env, _ in own if all((env, a) in own for a in TABLE1)}
+        of_row = {(env, a): pair for (r, env, a), pair in pairs.items() if r == row}
+        whole = {env for env, _ in of_row if all((env, a) in of_row for a in TABLE1)}
         if len(whole) < LEAST:
             why = f"was run again with all anomalies in {len(whole)} environments, expected {LEAST}"
             findings.refuse("re-run", str(row), why)
             continue
         cells = sum(key[0] == row for key in ours)
-        told = list(_differences(str(row), own, findings))
-        means[str(row)] = {metric: pair for metric, pair, _ in told}
-        differences = [text for *_, text in told if text]
-        lines.append("; ".join([f"{row}: {len(own)} of {cells} cells run again", *differences]))
+        compared = list(_differences(str(row), of_row, findings))
+        means[str(row)] = {metric: pair for metric, pair, _ in compared}
+        differences = [text for *_, text in compared if text]
+        lines.append("; ".join([f"{row}: {len(of_row)} of {cells} cells run again", *differences]))
     for where, record in records.items():
-        for other in again.get(_place(record), ())[:1]:
+        for other in again.get(_cell_of(record), ())[:1]:
             for field in _FIELDS:
                 new, old = getattr(other, field), getattr(record, field)
                 findings.expect(where, field, new, old, "as in the re-run")
     drawn = str(order or "by the verifier's word")
-    how = f"{place}, {drawn}, {len(both)} of {len(ours)} cells"
+    how = f"{source}, {drawn}, {len(pairs)} of {len(ours)} cells"
     return Rerun(how, lines, findings.count == before, means)
 
 
-def _place(record: Record) -> _Place:
+def _cell_of(record: Record) -> _CellKey:
     return record.setting, record.environment, record.condition
 
 
 def _usable(
     records: Records, fresh: Sequence[Record], findings: Findings
-) -> tuple[Mapping[_Place, list[Record]], str]:
-    """Return the records of a re-run by place, and its split in words; none if unusable."""
+) -> tuple[Mapping[_CellKey, list[Record]], str]:
+    """Return the records of a re-run by row and cell, and its split in words; none if unusable."""
     first = next(iter(records.values()))
     known = {first.split_digest, *published_digests().values()}
     usable = [r for r in fresh if r.protocol == first.protocol and r.limit is None]
     splits = {r.split_digest: r.split for r in usable}
     if len(splits) != 1 or known & splits.keys():
-        found = ", ".join(sorted(splits.values())) or "none without --limit"
+        names = ", ".join(sorted(splits.values())) or "none without --limit"
         expected = "results on one whole split of seeds that nobody could know before"
-        findings.refuse("re-run", "split", f"is {found}, expected {expected} (data build)")
+        findings.refuse("re-run", "split", f"is {names}, expected {expected} (data build)")
         return {}, "nothing"
     ((digest, name),) = splits.items()
-    again = grouped(usable, _place)
+    again = grouped(usable, _cell_of)
     for record in records.values():
-        for other in again.get(_place(record), ()):
+        for other in again.get(_cell_of(record), ()):
             for part in ("train", "calibration"):
                 if other.counts.get(part) != record.counts.get(part):
                     message = f"are {other.counts} in {other.cell}, expected {record.counts}"
@@ -193,7 +246,7 @@ def _differences(
         drawn: tuple[list[DrawnCells], list[DrawnCells]] = ([], [])
         pairs: dict[str, list[list[float]]] = {}
         for (environment, _), sides in cells.items():
-            own = [
+            by_side = [
                 [
                     drawn_cell(environment, r.seed, contribution(r, metric))
                     for r in side
@@ -201,12 +254,12 @@ def _differences(
                 ]
                 for side in sides
             ]
-            both = [nan_mean(value for cell in side for value in cell.values) for side in own]
+            both = [nan_mean(value for cell in side for value in cell.values) for side in by_side]
             if not any(map(math.isnan, both)):
                 pairs.setdefault(environment, []).append(both)
-                for all_of_side, one in zip(drawn, own, strict=True):
-                    all_of_side.extend(one)
-        means = np.array([np.mean(own, axis=0) for own in pairs.values()]).reshape(-1, 2)
+                for all_of_side, of_cell in zip(drawn, by_side, strict=True):
+                    all_of_side.extend(of_cell)
+        means = np.array([np.mean(both, axis=0) for both in pairs.values()]).reshape(-1, 2)
         change = means[:, 0] - means[:, 1]
         if len(change) < 2:
             continue
@@ -239,25 +292,3 @@ def by_chance(change: Floats, episodes: float = 0.0) -> float:
     n = len(change)
     error = max(float(change.std(ddof=1)) / math.sqrt(n), episodes)
     return t_quantile(1 - LEVEL / len(COMPARED), n - 1) * error
-
-
-def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
-    """Grant an entry the level of trust that its verification by somebody established."""
-    if message := complaint(GrantedBy, by):
-        raise UsageError(f"--grant {message}")
-    level = verdict.reached
-    if level is None:
-        raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
-    if level == "reported" or TRUST.index(level) <= TRUST.index(verdict.trust):
-        raise UsageError(
-            f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
-            f"is {level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
-        )
-    how, means = "every metric recomputed from its scores", Means()
-    if verdict.rerun:
-        how, means = verdict.rerun.how, verdict.rerun.means
-    day = datetime.now(UTC).date().isoformat()
-    granted = Grant(verdict.digest, level, by, day, how, means)
-    results = directory.absolute().parent
-    write_grants(results, read_grants(results) | {verdict.name: granted})
-    return granted
