@@ -17,7 +17,7 @@ from typing import Any
 
 from oodd_eval.errors import ContractError, MissingExtraError
 from oodd_eval.names import check_known
-from oodd_eval.plugins.conformance import Report, Result
+from oodd_eval.plugins.conformance import CheckReport, Result
 
 try:
     from oodd_eval.plugins.conformance.trial import Factory, Trial, shared_trial, trial
@@ -32,8 +32,8 @@ globals().update({check.__name__: check for check in CHECKS.values()})
 
 __all__ = [
     "CHECKS",
+    "CheckReport",
     "NonConformingError",
-    "Report",
     "Result",
     "Trial",
     "check_detector",
@@ -54,7 +54,7 @@ class NonConformingError(ContractError, AssertionError):
         The results of all checks.
     """
 
-    def __init__(self, report: Report) -> None:
+    def __init__(self, report: CheckReport) -> None:
         lines = [result.line() for result in report.failed]
         super().__init__("\n".join([report.summary(), *lines]))
         self.report = report
@@ -62,7 +62,7 @@ class NonConformingError(ContractError, AssertionError):
 
 def run_checks(
     factory: Factory, *, expected_failures: Mapping[str, str] | None = None, **arguments: Any
-) -> Report:
+) -> CheckReport:
     """Carry out all checks in this process and return what they came to.
 
     Parameters
@@ -76,7 +76,7 @@ def run_checks(
 
     Returns
     -------
-    Report
+    CheckReport
         The result of every check, in the order in which they run.
 
     Raises
@@ -88,12 +88,12 @@ def run_checks(
     check_known("check", CHECKS, *failures)
     results: list[Result] = []
     run_tests(Trial(factory, **arguments), results.append)
-    return Report([result.expected(failures) for result in results])
+    return CheckReport([result.expected(failures) for result in results])
 
 
 def check_detector(
     factory: Factory, *, expected_failures: Mapping[str, str] | None = None, **arguments: Any
-) -> Report:
+) -> CheckReport:
     """Do what `run_checks` does, and print it.
 
     Parameters
@@ -103,7 +103,7 @@ def check_detector(
 
     Returns
     -------
-    Report
+    CheckReport
         The result of every check, as in `run_checks`.
 
     Raises

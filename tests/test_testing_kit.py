@@ -12,7 +12,7 @@ from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
 
 from oodd_eval import check_detector
 from oodd_eval.errors import UnknownNameError
-from oodd_eval.plugins.conformance import Report, Result
+from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_eval.plugins.conformance import test_effects as effects
 from oodd_eval.plugins.conformance.session import CHECKS, MOST_ENDS, run_tests
 from oodd_eval.plugins.conformance.trial import ACTIONS, EPISODES, SENSORS, Trial
@@ -163,13 +163,13 @@ def test_expected_failures_have_names_of_checks():
 
 def test_a_report_counts_every_status():
     statuses = ("passed", "failed", "skipped", "xfailed", "xpassed")
-    report = Report([Result(s, s, seconds=0.2) for s in statuses])
+    report = CheckReport([Result(s, s, seconds=0.2) for s in statuses])
     assert report.summary() == (
         "5 checks: 1 passed, 1 failed, 1 skipped, 1 failed as expected, 1 passed unexpectedly "
         "in 1.0 s"
     )
     assert not report.ok
-    assert Report([]).summary() == "0 checks: none ran in 0.0 s"
+    assert CheckReport([]).summary() == "0 checks: none ran in 0.0 s"
 
 
 def test_long_messages_stand_below_in_80_columns():

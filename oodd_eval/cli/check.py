@@ -17,7 +17,7 @@ from oodd_eval.cli import (
 from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
-from oodd_eval.plugins.conformance import Report
+from oodd_eval.plugins.conformance import CheckReport
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import resolve_parameters
 
@@ -84,7 +84,7 @@ def check(options: Options) -> int:
                 console.print(result.line(max(map(len, names))), style=STYLES[result.status])
             if options.verbosity > 0 and result.detail:
                 console.print(result.detail.rstrip())
-        report = Report(results)
+        report = CheckReport(results)
         console.print(report.summary(), style="green" if report.ok else "bold red")
         good = good and report.ok
     return 0 if good else 1

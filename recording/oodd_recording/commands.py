@@ -37,7 +37,7 @@ from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, select
-from oodd_eval.plugins.conformance import Report, Result
+from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import check_own
@@ -303,7 +303,7 @@ def check_custom(options: Options, selects: Predicate) -> int:
             results.append(Result(name, "failed" if problem else "passed", problem, seconds))
             if options.verbosity >= 0 or problem:
                 console.print(results[-1].line(13), style=STYLES[results[-1].status])
-    report = Report(results)
+    report = CheckReport(results)
     if not results:
         return say(f"no check matches -k {options.expression!r}", 5)
     console.print(report.summary(), style="green" if report.ok else "bold red")

@@ -71,7 +71,7 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class CheckReport:
     """Results of the checks of one detector; printing it gives a line per check and a summary."""
 
     results: Sequence[Result] = ()
