@@ -7,17 +7,16 @@ no page leads into the repository, if pyproject.toml says where that is, or beco
 
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
+import click
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from oodd_eval._version import repository
-from oodd_eval.cli import Parser
-from oodd_eval.cli.main import build_parser
+from oodd_eval.cli.main import PROGRAM
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.build import CELLS, cells, suite_cells
 from oodd_eval.leaderboard.entry import read_entries
@@ -138,15 +137,16 @@ def _link(found: re.Match[str], source: str, uri: str, pages: dict[str, str]) ->
 
 def _commands() -> str:
     """Help texts of all commands, a section each."""
-    # Wide enough for the longest option, narrow enough for a page, whatever the terminal is.
-    os.environ["COLUMNS"] = "80"
     sections: list[str] = []
 
-    def add(name: str, parser: Parser, help_text: Callable[[], str], level: int) -> None:
-        sections.append(f"{'#' * level} {name}\n\n```text\n{help_text().rstrip()}\n```")
-        for action, inner in parser.choices.items():
-            add(f"{name} {action}", inner, inner.format_help, level)
+    def add(context: click.Context) -> None:
+        path = context.command_path
+        level = "#" * (1 + len(path.split()))
+        sections.append(f"{level} {path}\n\n```text\n{context.get_help().rstrip()}\n```")
+        if isinstance(group := context.command, click.Group):
+            for name in group.list_commands(context):
+                add(click.Context(group.get_command(context, name), context, info_name=name))
 
-    parser = build_parser()
-    add("oodd-eval", parser, parser.format_help, 2)
+    # Narrow enough for a page, whatever the terminal is.
+    add(click.Context(PROGRAM, info_name="oodd-eval", terminal_width=80))
     return "\n\n".join(sections)

@@ -90,44 +90,37 @@ def evaluate(
     (1.0, 0.5)
     """
     opened = split if isinstance(split, Split) else load_split(split)
-    given = dict(parameters or {})
-    # What is a sequence by chance may be a detector all the same.
+    arguments = dict(parameters or {})
+    # A detector may be a sequence, too.
     several = isinstance(detector, list | tuple)
     tried: Sequence[Tried] = detector if several else [detector]  # type: ignore[assignment,list-item]
     if not tried:
         raise UsageError("no detector was named: expected at least one")
     installed = any(isinstance(d, str) for d in tried)
     plugins = discover() if installed else discover(only=())
-    names = [_added(plugins, d, given) for d in tried]
+    names = [_offer(plugins, d, arguments) for d in tried]
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
-    where, kinds = opened.select(_listed(environments), _listed(anomalies))
+    selected = opened.select(_listed(environments), _listed(anomalies))
     plan = make_plan(
         plugins,
         split=opened,
         detectors=names,
-        environments=where,
-        anomalies=kinds,
+        environments=selected[0],
+        anomalies=selected[1],
         horizons=[horizon],
         seeds=[seed] if isinstance(seed, int) else list(seed),
-        parameters=given,
+        parameters=arguments,
         limit=limit,
     )
-    place = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)
-    directory = ResultsDirectory(place)
-    try:
-        observers = [_Bar()] if progress else []
-        settings = RunSettings(jobs=jobs)
-        results = Results(
-            run(plan, opened, plugins, settings, directory, observers).records, directory, opened
-        )
-    except BaseException:
-        if output is None:
-            shutil.rmtree(place, ignore_errors=True)
-        raise
+    path = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)
+    directory = ResultsDirectory(path)
     if output is None:
-        weakref.finalize(directory, shutil.rmtree, place, ignore_errors=True)
-    return results
+        weakref.finalize(directory, shutil.rmtree, path, ignore_errors=True)
+    observers = [_Bar()] if progress else []
+    settings = RunSettings(jobs=jobs)
+    outcome = run(plan, opened, plugins, settings, directory, observers)
+    return Results(outcome.records, directory, opened)
 
 
 def load_results(path: str | Path, split: str | Path | Split | None = None) -> Results:
@@ -155,49 +148,47 @@ def load_results(path: str | Path, split: str | Path | Split | None = None) -> R
     return Results(directory.records(), directory, opened)
 
 
-def _added(plugins: Plugins, detector: Tried, given: Mapping[str, Any]) -> str:
-    """Offer a detector where it is no installed one; return its name."""
+def _offer(plugins: Plugins, detector: Tried, arguments: Mapping[str, Any]) -> str:
+    """Offer a detector, unless it is an installed one; return its name."""
     if isinstance(detector, str):
         return plugins.offer(detector).spec.name
-    if not isinstance(detector, DetectorSpec):
-        made: Callable[..., Detector]
-        if isinstance(detector, type) or not isinstance(detector, Detector):
-            if not callable(detector):
-                raise UsageError(
-                    f"{detector!r:.80} is no detector: expected a name, a DetectorSpec, a class or "
-                    "function that makes one, or an object with fit(nominal) and score(trajectory)"
-                )
-            made, shown = detector, getattr(detector, "__name__", type(detector).__name__)
-            _must_take(made, shown, given)
-        else:
-            if given:
-                raise UsageError(
-                    f"parameters {[*given]} for an instance of {type(detector).__name__}: expected "
-                    "none, as it is made already"
-                )
-            own = detector
-            made, shown = lambda **_: copy.deepcopy(own), type(detector).__name__
-        name = re.sub("[^a-z0-9]+", "-", shown.lower())[:64].strip("-")
-        detector = DetectorSpec(
-            name or "detector",
-            made,
-            "",
-            inputs="observations+actions",
-            parameters=declared_by(given),
+    spec = detector if isinstance(detector, DetectorSpec) else _spec_of(detector, arguments)
+    check_detector_spec(spec)
+    plugins.add(Offer(spec, "", "", "local", ""))
+    return spec.name
+
+
+def _spec_of(
+    detector: Detector | Callable[..., Detector], arguments: Mapping[str, Any]
+) -> DetectorSpec:
+    """Return the spec of a class, a function or an unfitted detector."""
+    factory: Callable[..., Detector]
+    if isinstance(detector, Detector) and not isinstance(detector, type):
+        prototype, name = detector, type(detector).__name__
+        if arguments:
+            raise UsageError(f"parameters {[*arguments]} for an instance of {name}: expected none")
+        factory = lambda **_: copy.deepcopy(prototype)  # noqa: E731
+    elif callable(detector):
+        factory, name = detector, getattr(detector, "__name__", type(detector).__name__)
+        _check_call(factory, name, arguments)
+    else:
+        raise UsageError(
+            f"{detector!r:.80} is no detector: expected a name, a DetectorSpec, a class or "
+            "function that makes one, or an object with fit(nominal) and score(trajectory)"
         )
-    check_detector_spec(detector)
-    plugins.add(Offer(detector, "", "", "local", ""))
-    return detector.name
+    name = re.sub("[^a-z0-9]+", "-", name.lower())[:64].strip("-") or "detector"
+    parameters = declared_by(arguments)
+    return DetectorSpec(name, factory, "", inputs="observations+actions", parameters=parameters)
 
 
-def _must_take(factory: Callable[..., Detector], name: str, given: Mapping[str, Any]) -> None:
+def _check_call(factory: Callable[..., Detector], name: str, arguments: Mapping[str, Any]) -> None:
     """Raise `UsageError` unless a factory takes the arguments that it will be called with."""
     try:
         signature = inspect.signature(factory)
     except ValueError:  # of some compiled functions
         return
     try:
-        signature.bind(seed=0, horizon=1, **given)
+        signature.bind(seed=0, horizon=1, **arguments)
     except TypeError as error:
         raise UsageError(
             f"{name} cannot be called as {name}(seed=..., horizon=..., ...): {error}; let it take "

@@ -1,4 +1,4 @@
-"""Read what users write: lists of names, numbers, times, parameters, expressions of ``-k``."""
+"""Readers of texts that users write: lists of names, numbers, times, ``-k`` expressions."""
 
 import ast
 import fnmatch
@@ -48,10 +48,10 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     for pattern in (p.strip() for p in patterns.split(",")):
         if not pattern:
             continue
-        found = names if pattern == "all" else fnmatch.filter(names, pattern)
-        if not found:
+        matches = names if pattern == "all" else fnmatch.filter(names, pattern)
+        if not matches:
             raise UnknownNameError(kind, pattern, names)
-        chosen.update(dict.fromkeys(found))
+        chosen.update(dict.fromkeys(matches))
     if not chosen:
         raise UsageError(f"no {kind} was named: expected names separated by commas, or 'all'")
     return list(chosen)
@@ -102,13 +102,13 @@ def parameter(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def expression(text: str) -> Predicate:
+def expression(text: str | None) -> Predicate:
     """Return the test of cell ids that an expression of ``-k`` describes; an empty one passes all.
 
     Words are substrings, regardless of case; ``and``, ``or``, ``not`` and round brackets join them.
 
-    >>> wanted = expression("hopper and not (iid or drift)")
-    >>> wanted("mini/hopper/gravity::rf[h=1,seed=0]"), wanted("mini/hopper/iid::rf[h=1,seed=0]")
+    >>> selects = expression("hopper and not (iid or drift)")
+    >>> selects("mini/hopper/gravity::rf[h=1,seed=0]"), selects("mini/hopper/iid::rf[h=1,seed=0]")
     (True, False)
     """
     if not text:

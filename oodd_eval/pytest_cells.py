@@ -197,8 +197,8 @@ def _plan(
     if reference and not plain:
         has = f"{reference.where} has only cells with parameters of their own, such as {cells[0]}"
         raise UsageError(f"{has}; here detectors run with their defaults")
-    recorded = {cell.environment for cell in cells}
-    environments = [e for e in split.environments if not reference or e in recorded]
+    covered = {cell.environment for cell in cells}
+    environments = [e for e in split.environments if not reference or e in covered]
     if envs:
         environments = select("environment", envs, split.environments)
     horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
@@ -211,19 +211,15 @@ def _plan(
         seeds=sorted(seeds) or [0],
     )
     labels = {cell.label for cell in cells}
-    names = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
-    return plan.matching(names.__contains__)
+    selected = {str(cell) for cell in plan.cells if not reference or cell.label in labels}
+    return plan.matching(selected.__contains__)
 
 
 def _explained(record: Record, failures: list[Difference], where: str) -> str:
-    text = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
-    options = {
-        "detector": record.detector,
-        "env": record.environment,
-        "anomaly": record.condition,
-        "split": record.split,
-        "horizon": record.horizon,
-        "seed": record.seed,
-    }
-    command = " ".join(["oodd-eval run", *(f"--{name} {value}" for name, value in options.items())])
-    return f"{text}\nthe reference is {where}; to run this cell alone:\n{command}"
+    reason = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
+    command = (
+        f"oodd-eval run --detector {record.detector} --env {record.environment} "
+        f"--anomaly {record.condition} --split {record.split} --horizon {record.horizon} "
+        f"--seed {record.seed}"
+    )
+    return f"{reason}\nthe reference is {where}; to run this cell alone:\n{command}"

@@ -46,7 +46,13 @@ __all__ += [check.__name__ for check in CHECKS.values()]
 
 
 class NonConformingError(ContractError, AssertionError):
-    """A detector failed checks; the message has a line for each, `report` has all results."""
+    """A detector failed checks; the message has a line for each of them.
+
+    Parameters
+    ----------
+    report
+        The results of all checks.
+    """
 
     def __init__(self, report: Report) -> None:
         lines = [result.line() for result in report.failed]
@@ -71,11 +77,12 @@ def run_checks(
     Returns
     -------
     Report
+        The result of every check, in the order in which they run.
 
     Raises
     ------
     UnknownNameError
-        For an expected failure of no check.
+        When there is no check of a name among the expected failures.
     """
     failures = dict(expected_failures or {})
     check_known("check", CHECKS, *failures)
@@ -97,6 +104,7 @@ def check_detector(
     Returns
     -------
     Report
+        The result of every check, as in `run_checks`.
 
     Raises
     ------

@@ -8,6 +8,8 @@ import sys
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
 
 from helpers_own import forget_own
 
@@ -119,15 +121,17 @@ def quick(command, rules=()):
 
 
 def parse(command):
-    """Check the options of an ``oodd-eval`` command."""
-    from oodd_eval.cli.main import build_parser
+    """Check the options of an ``oodd-eval`` command without running it; return them."""
+    from oodd_eval.cli import Command
+    from oodd_eval.cli.main import main
 
-    try:
-        build_parser().parse_args(shlex.split(command, comments=True)[1:])
-    except SystemExit as ended:
-        # Help ends the program, too.
-        if ended.code:
-            raise
+    contexts = []
+    with patch.object(Command, "invoke", lambda _, context: contexts.append(context) or 0):
+        assert main(shlex.split(command, comments=True)[1:]) == 0
+    # Help has no options.
+    return (
+        SimpleNamespace(command=contexts[0].info_name, **contexts[0].params) if contexts else None
+    )
 
 
 class Session:
@@ -151,10 +155,7 @@ class Session:
     def _in_process(self, arguments):
         from oodd_eval.cli.main import main
 
-        try:
-            return main(arguments)
-        except SystemExit as ended:
-            return ended.code or 0
+        return main(arguments)
 
     def _process(self, words):
         """Run a program of this environment; words such as ``PYTHONPATH=.`` come before it."""

@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import replace
-from importlib.metadata import entry_points
 from types import SimpleNamespace
 
 import pytest
@@ -58,11 +57,6 @@ def altered(reference, path, **figures):
     ]
     write_reference(records, path)
     return path
-
-
-def test_the_entry_point_is_installed():
-    (point,) = entry_points(group="pytest11", name="oodd-eval")
-    assert point.value == "oodd_eval.pytest_plugin"
 
 
 def test_off_unless_asked_and_nothing_of_the_harness_is_imported(run, pytester):
@@ -151,16 +145,6 @@ def test_a_detector_that_fails_is_reported_with_its_state(cells, monkeypatch, tm
             own.check(cell, None)
 
 
-def test_collecting_fits_nothing(run, pytester, reference):
-    result = run(
-        "--oodd-detector", "persistence", "--oodd-reference", reference, "--oodd-split", "tiny",
-        "--oodd-output", "out", "--collect-only", "-q",
-    )  # fmt: skip
-    assert "oodd-eval::tiny/hopper/iid::persistence[h=1,seed=0]" in result.stdout.lines
-    assert "16 tests collected" in result.stdout.str()
-    assert not (pytester.path / "out").exists()
-
-
 def test_a_new_cell_is_skipped(cells, reference, tmp_path):
     cell = "tiny/hopper/iid::persistence[h=1,seed=0]"
     less = [r for r in read_record_set(reference).records if str(r.cell) != cell]
@@ -198,13 +182,6 @@ def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, refer
 def test_what_cannot_be_done_is_a_usage_error(cells, reference, options, message):
     with pytest.raises(pytest.UsageError, match=message):
         cells(**{"oodd_reference": str(reference)} | options)
-
-
-def test_a_reference_of_other_parameters_only_is_a_usage_error(cells, reference, tmp_path):
-    others = [replace(r, overrides={"size": 3}) for r in read_record_set(reference).records]
-    write_reference(others, tmp_path / "r.jsonl")
-    with pytest.raises(pytest.UsageError, match="only cells with parameters of their own"):
-        cells(oodd_reference=str(tmp_path / "r.jsonl"))
 
 
 def test_a_broken_plugin_is_named_when_a_detector_is_unknown(cells, monkeypatch, tmp_path):

@@ -5,10 +5,10 @@ import json
 
 import pytest
 from helpers_submission import assert_refused
+from oodd_recording.rerun import check_installed, plan_of
 from test_submission_trust import entry, fresh, of_three  # noqa: F401  fixtures
 
 from oodd_eval.cli import main as cli
-from oodd_eval.cli.rerun import check_installed, plan_of
 from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError

@@ -1,168 +1,321 @@
-"""The command line: a module per command, and here the parser and the options that they share."""
+"""The command line: a module per command, and here the classes and options that they share."""
 
-import argparse
-import difflib
-import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, Final, NoReturn, TypeVar
+from importlib import import_module
+from inspect import getdoc
+from itertools import chain
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final, TypeAlias
+
+import click
+from click.shell_completion import CompletionItem
 
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import memory_bytes, parameter, seconds, whole_numbers
 
 NAMES: Final = "names separated by commas, globs, or 'all'"
-EXPRESSION: Final = "only cells whose id matches, such as 'hopper and not (iid or drift)'"
 
-Add = Callable[..., argparse.Action]
-T = TypeVar("T")
+Options: TypeAlias = SimpleNamespace
+"""The values of a command's options and arguments, with ``invocation``, the whole command line."""
 
+Commands: TypeAlias = Mapping[str, tuple[str, "str | Commands"]]
+"""A summary for each name, with ``module:attribute`` of a command, or the commands of a group."""
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are exceptions, with a suggestion."""
-
-    def __init__(self, **settings: Any) -> None:
-        plain = {"formatter_class": argparse.RawDescriptionHelpFormatter, **settings}
-        super().__init__(allow_abbrev=False, **plain)
-        self.choices: dict[str, Parser] = {}
-        self.examples: tuple[str, ...] = ()
-
-    def nested(self, kind: str) -> Callable[[str, str], "Parser"]:
-        """Return a function that adds a command or an action: its name and summary."""
-        nested = self.add_subparsers(dest=kind, metavar=kind.upper(), required=True)
-        self.choices = nested.choices
-        return lambda name, summary: nested.add_parser(name, help=summary, description=summary)
-
-    def format_help(self) -> str:
-        """Return the help, with examples below it: a command's own, or those of its actions."""
-        examples = self.examples or [e for p in self.choices.values() for e in p.examples[:1]]
-        if examples and not self.epilog:
-            lines = "".join(f"\n  oodd-eval {line}" for line in examples)
-            self.epilog = f"examples:{lines}"
-        return super().format_help()
-
-    def options(
-        self, handler: Callable[[argparse.Namespace], int], *examples: str, plugins: bool = False
-    ) -> Add:
-        """Add the options that all commands have; return the method that adds further ones.
-
-        `examples` are arguments of oodd-eval that the help shows.
-        """
-        self.examples = examples
-
-        def left_out(text: str) -> str:
-            if not text.startswith("no:"):
-                raise UsageError(f"{text!r}, expected no:NAME, which leaves a plug-in out")
-            return text.removeprefix("no:")
-
-        self.set_defaults(handler=handler)
-        add = partial(self.add_mutually_exclusive_group().add_argument, dest="verbosity", default=0)
-        add("-q", action="store_const", const=-1, help="print less")
-        add("-v", action="store_const", const=1, help="print more, and tracebacks of errors")
-        if plugins:
-            self.add_argument(
-                "-p",
-                dest="disabled",
-                action="append",
-                default=[],
-                metavar="no:NAME",
-                type=value(left_out),
-                help="leave a plug-in out (see also OODD_EVAL_PLUGINS)",
-            )
-        return self.add_argument
-
-    def error(self, message: str) -> NoReturn:
-        """Raise `UsageError` instead of ending the process."""
-        if wrong := re.match(r"argument (-\S+): is (.*)", message, re.DOTALL):
-            raise UsageError(f"{wrong[1]} is {wrong[2]}")
-        if wrong := re.match(r"argument (COMMAND|ACTION): invalid choice: '(.*?)'", message):
-            kind = "command" if wrong[1] == "COMMAND" else f"action of {self.prog.split()[-1]}"
-            raise UnknownNameError(kind, wrong[2], self.choices)
-        if unknown := re.match(r"unrecognized arguments: (\S+)", message):
-            option = unknown[1].partition("=")[0]
-            close = difflib.get_close_matches(option, self._option_string_actions, n=1)
-            message += f": did you mean {close[0]}?" if close else ""
-        raise UsageError(f"{message} (see {self.prog} --help)")
-
-    def parse_known_args(  # type: ignore[override]  # the overloads of argparse say the same
-        self, *given: Any
-    ) -> tuple[argparse.Namespace, list[str]]:
-        """Refuse unknown options where they stand, so that the suggestion is the command's."""
-        parsed, rest = super().parse_known_args(*given)
-        if rest:
-            self.error(f"unrecognized arguments: {' '.join(rest)}")
-        return parsed, rest
+Items: TypeAlias = list[CompletionItem[str]]
+Handler: TypeAlias = Callable[[Options], int]
+Decorator: TypeAlias = Callable[[Handler], Handler]
 
 
-def value(convert: Callable[[str], T]) -> Callable[[str], T]:
-    """Return a converter for argparse that reports the message of a `UsageError`."""
+def load(target: str) -> Any:
+    """Import ``module:attribute``: what belongs to other packages is known by name only."""
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)
 
-    def converted(text: str) -> T:
+
+class Command(click.Command):
+    """A command that hands its options to a function, and shows examples in its help.
+
+    Parameters
+    ----------
+    handler
+        The function, which returns the exit code; its docstring is the help.
+    params
+        Options and arguments.
+    examples
+        Arguments of oodd-eval that the help shows.
+    repeated
+        Options that may have several words behind them, each of which is a value.
+    """
+
+    def __init__(
+        self,
+        handler: Handler,
+        params: list[click.Parameter],
+        examples: Sequence[str],
+        repeated: Sequence[str],
+    ) -> None:
+        settings = {"show_default": True}
+        super().__init__(None, settings, params=params, help=getdoc(handler))
+        self.handler, self.examples, self._repeated = handler, examples, repeated
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the arguments, with ``--primary a b`` as ``--primary=a --primary=b``."""
+        words, option = [], ""
+        for word, following in zip(args, [*args, "-"][1:], strict=True):
+            if word in self._repeated and not following.startswith("-"):
+                option = word
+                continue
+            option = "" if word.startswith("-") else option
+            words.append(f"{option}={word}" if option else word)
+        return super().parse_args(ctx, words)
+
+    def invoke(self, ctx: click.Context) -> int:
+        """Run the command and return its exit code."""
+        return self.handler(Options(**ctx.params, invocation=ctx.obj))
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples."""
+        del ctx
+        write_section(formatter, "Examples", [f"oodd-eval {line}" for line in self.examples])
+
+
+def write_section(formatter: click.HelpFormatter, heading: str, lines: Iterable[str]) -> None:
+    """Write lines into a help text as they are, below a heading."""
+    with formatter.section(heading):
+        for line in lines:
+            formatter.write(f"  {line}\n")
+
+
+def command(
+    *examples: str,
+    plugins: bool = False,
+    repeated: Sequence[str] = (),
+    kind: type[Command] = Command,
+) -> Callable[[Handler], Command]:
+    """Return a decorator that makes a command of a function with click's options.
+
+    Parameters
+    ----------
+    examples, repeated
+        As in `Command`.
+    plugins
+        Whether the command loads plug-ins, and so has the option ``-p``.
+    kind
+        The class of the command.
+    """
+
+    def decorate(handler: Handler) -> Command:
+        params = [*reversed(getattr(handler, "__click_params__", []))]
+        options = _PLUGIN_OPTION if plugins else ()
+        return kind(handler, [*params, *options, *_VERBOSITY], examples, repeated)
+
+    return decorate
+
+
+def _left_out(text: str) -> str:
+    if not text.startswith("no:"):
+        raise UsageError(f"{text!r}, expected no:NAME, which leaves a plug-in out")
+    return text.removeprefix("no:")
+
+
+class Group(click.Group):
+    """Commands that are imported when they are named: help and completion need no import.
+
+    Parameters
+    ----------
+    help_text
+        What the group is for.
+    sections
+        Commands by the headings of the help.
+    """
+
+    def __init__(self, help_text: str, sections: Mapping[str, Commands]) -> None:
+        super().__init__(help=help_text, no_args_is_help=False, subcommand_metavar="COMMAND ...")
+        self.sections = sections
+        self.entries = {name: row for rows in sections.values() for name, row in rows.items()}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands."""
+        del ctx
+        return list(self.entries)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
+        """Import a command; raise `UnknownNameError`, with a suggestion, if there is none."""
+        if cmd_name not in self.entries:
+            kind = f"command of {ctx.info_name}" if ctx.parent else "command"
+            raise UnknownNameError(kind, cmd_name, self.entries)
+        summary, target = self.entries[cmd_name]
+        if isinstance(target, Mapping):
+            return Group(f"{summary[0].upper()}{summary[1:]}.", {"Commands": target})
+        loaded: Command = load(target)
+        return loaded
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands below their headings."""
+        del ctx
+        width = max(map(len, self.entries))
+        for heading, commands in self.sections.items():
+            with formatter.section(heading):
+                rows = [(name.ljust(width), row[0]) for name, row in commands.items()]
+                formatter.write_dl(rows)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write an example of each command."""
+        commands = (self.get_command(ctx, name) for name in self.entries)
+        examples = (c.examples[0] for c in commands if isinstance(c, Command))
+        write_section(formatter, "Examples", [f"oodd-eval {line}" for line in examples])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> Items:
+        """Complete names of commands without importing them, and options."""
+        rows = [(name, row[0]) for name, row in self.entries.items() if name.startswith(incomplete)]
+        names = [CompletionItem(name, help=summary) for name, summary in rows]
+        return names + click.Command.shell_complete(self, ctx, incomplete)
+
+
+class Converted(click.ParamType[Any]):
+    """The type of an option whose text a function reads.
+
+    The message of the function's `UsageError` follows the name of the option.
+
+    Parameters
+    ----------
+    function
+        Returns what a text stands for.
+    metavar
+        What the help shows in place of the text.
+    """
+
+    def __init__(self, function: Callable[[str], Any], metavar: str) -> None:
+        self.name, self._function = metavar, function
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return what the text stands for."""
+        del ctx
         try:
-            return convert(text)
+            return self._function(value) if isinstance(value, str) else value
         except UsageError as error:
-            raise argparse.ArgumentTypeError(f"is {error}") from None
-
-    return converted
-
-
-def at_least(least: int) -> Callable[[str], int]:
-    """Return a converter for whole numbers that are not below a bound."""
-
-    def convert(text: str) -> int:
-        if not re.fullmatch(r"-?\d+", text) or int(text) < least:
-            raise UsageError(f"{text!r}, expected a whole number of at least {least}")
-        return int(text)
-
-    return value(convert)
+            option = param.opts[0] if param else "the value"
+            raise UsageError(f"{option} is {error}") from None
 
 
-def add_detector(add: Add) -> None:
-    """Add the options that say how detectors are made."""
-    add(
-        "--param",
-        action="append",
-        default=[],
-        metavar="K=V",
-        type=value(parameter),
-        help="a parameter of the detector, V in JSON or plain text",
+class Names(click.ParamType[str]):
+    """The type of an option with names separated by commas, of which shells complete the last.
+
+    Parameters
+    ----------
+    kinds
+        Kinds of names that the option takes, as ``oodd-eval list`` knows them.
+    """
+
+    name = "names"
+
+    def __init__(self, *kinds: str) -> None:
+        self._kinds = kinds
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+        """Return the list with each name that begins like its last one."""
+        del ctx, param
+        before, comma, last = incomplete.rpartition(",")
+        names = chain.from_iterable(map(_names, self._kinds))
+        return [CompletionItem(before + comma + name) for name in names if name.startswith(last)]
+
+
+class Name(Names):
+    """The type of an option with one name."""
+
+    name = "name"
+
+
+def _names(kind: str) -> Iterable[str]:
+    """Return the names of a kind, of plug-ins too."""
+    if kind == "metrics":
+        return [*load("oodd_eval.metrics.catalogue:NAMES")]
+    # Forms such as (pyod:NAME) are listed, too.
+    rows = load("oodd_eval.cli.listing:rows")(kind, load("oodd_eval.plugins.discovery:discover")())
+    return [name for name, *_ in rows if name[0].isalnum()]
+
+
+def _named(kind: click.ParamType[Any], metavar: str) -> click.ParamType[Any]:
+    """Return a type with another text in the help in place of the value."""
+    kind.name = metavar
+    return kind
+
+
+DIRECTORY: Final = _named(click.Path(path_type=Path), "DIR")
+FILE: Final = _named(click.Path(path_type=Path), "FILE")
+COUNT: Final = _named(click.IntRange(min=1), "N")
+HORIZONS: Final = Converted(partial(whole_numbers, least=1), "N,...")
+SEEDS: Final = Converted(partial(whole_numbers, least=0), "N,...")
+TIME: Final = Converted(seconds, "TIME")
+MEMORY: Final = Converted(memory_bytes, "SIZE")
+PARAMETER: Final = Converted(parameter, "K=V")
+
+_PLUGIN_OPTION: Final = (
+    click.Option(
+        ["-p", "disabled"],
+        multiple=True,
+        metavar="no:NAME",
+        type=Converted(_left_out, "NAME"),
+        help="leave a plug-in out (see also OODD_EVAL_PLUGINS)",
+    ),
+)
+
+_VERBOSITY: Final = tuple(
+    click.Option(
+        [flag, "verbosity"], flag_value=value, type=int, default=0, show_default=False, help=text
     )
-    add(
-        "--horizon",
-        default="1",
-        metavar="N,...",
-        type=value(partial(whole_numbers, least=1)),
-        help="prediction horizons (default: 1)",
+    for flag, value, text in (
+        ("-q", -1, "print less"),
+        ("-v", 1, "print more, and tracebacks of errors"),
+    )
+)
+
+
+def together(*options: Decorator) -> Decorator:
+    """Return one decorator for several options."""
+
+    def decorate(handler: Handler) -> Handler:
+        for option in reversed(options):
+            handler = option(handler)
+        return handler
+
+    return decorate
+
+
+expression_option: Final = click.option(
+    "-k",
+    "expression",
+    metavar="EXPR",
+    help="only cells whose id matches, such as 'hopper and not (iid or drift)'",
+)
+
+detector_options: Final = together(
+    click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text"),
+    click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
+)
+
+
+def limit_options(process: str, timeout: str) -> Decorator:
+    """Return the options that limit the time and the memory of a process."""
+    return together(
+        click.option("--timeout", default=timeout, type=TIME, help=f"wall-clock time of {process}"),
+        click.option("--memory", default="8GB", type=MEMORY, help=f"resident memory of {process}"),
     )
 
 
-def add_limits(add: Add, what: str, timeout: str) -> None:
-    """Add the options that limit a process."""
-    add(
-        "--timeout",
-        default=timeout,
-        type=value(seconds),
-        metavar="TIME",
-        help=f"wall-clock time of {what} (default: {timeout})",
-    )
-    add(
-        "--memory",
-        default="8GB",
-        type=value(memory_bytes),
-        help=f"resident memory of {what} (default: 8GB)",
-    )
+jobs_option: Final = click.option(
+    "--jobs", type=COUNT, help="processes at a time (default: one per core)"
+)
 
 
-def add_resources(add: Add, *, timeout: str) -> None:
-    """Add the options that say where fits are carried out and within which limits."""
-    add("--jobs", type=at_least(1), metavar="N", help="fits at a time (default: one per core)")
-    add(
-        "--device",
-        choices=("auto", "cpu", "cuda"),
-        metavar="auto|cpu|cuda",
-        help="where networks compute: the parameter device of detectors that have it",
-    )
-    add_limits(add, "a fit with its scores", timeout)
+def fit_options(timeout: str) -> Decorator:
+    """Return the options that say where fits run and within which limits."""
+    choice = click.Choice(["auto", "cpu", "cuda"])
+    device = click.option("--device", type=choice, help="where networks of detectors compute")
+    return together(jobs_option, device, limit_options("a fit with its scores", timeout))
 
 
 def say_notes(notes: Iterable[str]) -> None:

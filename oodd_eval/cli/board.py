@@ -3,11 +3,13 @@
 Both read the board that is installed with the package, so that neither needs a network.
 """
 
-import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
-from oodd_eval.cli import NAMES, Add, Parser, say_notes
+import click
+
+from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, say_notes, together
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, read_entry
@@ -25,36 +27,22 @@ from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import Section
 from oodd_eval.results.tables import ladder, layout
 
-
-def define(action: Callable[[str, str], Parser]) -> None:
-    """Add both actions with their options."""
-    add = action("show", "print the published board").options(
-        show, "leaderboard show", "leaderboard show --split mini --csv"
-    )
-    add("--split", default="", metavar="NAME", help="only the board of this split (default: all)")
-    _formats(add)
-    add = action("place", "show where a run would stand on the published board").options(
-        place_run,
-        "leaderboard place oodd-results",
-        "leaderboard place oodd-results --detector mine",
-    )
-    add("directory", metavar="DIR", help="results directory of oodd-eval run, or an entry")
-    add("--detector", default="all", metavar="NAMES", help=f"{NAMES} (default: all)")
-    _formats(add)
+_format_options: Final = together(
+    click.option("--markdown", is_flag=True, help="print Markdown"),
+    click.option("--csv", is_flag=True, help="print a line per row, with all figures"),
+)
 
 
-def _formats(add: Add) -> None:
-    add("--markdown", action="store_true", help="print Markdown")
-    add("--csv", action="store_true", help="print a line per row, with all figures")
-
-
-def show(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard show``."""
+@command("leaderboard show", "leaderboard show --split mini --csv")
+@click.option("--split", type=Name("splits"), help="only the board of this split")
+@_format_options
+def show(options: Options) -> int:
+    """Print the published board, which is installed with the package."""
     published = read_published()
     if options.split:
         names = {board.records[0].split for board in published.boards}
         check_known("split with a published board", sorted(names), options.split)
-    chosen = [b for b in published.boards if options.split in ("", b.records[0].split)]
+    chosen = [b for b in published.boards if options.split in (None, b.records[0].split)]
     output = _Output(options)
     for board in chosen:
         ranks = board.ranks()
@@ -72,9 +60,16 @@ def show(options: argparse.Namespace) -> int:
     return 0
 
 
-def place_run(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard place``; 4 where nothing of a run can be compared with a board."""
-    records, primary = _read(Path(options.directory), options.detector)
+@command("leaderboard place oodd-results", "leaderboard place oodd-results --detector mine")
+@click.argument("directory", type=DIRECTORY, help="results directory of oodd-eval run, or an entry")
+@click.option("--detector", default="all", type=Names("detectors"), help=NAMES)
+@_format_options
+def place_run(options: Options) -> int:
+    """Show where a run would stand on the published board.
+
+    The exit code is 4 when nothing of the run can be compared with a board.
+    """
+    records, primary = _read(options.directory, options.detector)
     published = read_published()
     output = _Output(options)
     runs = boards(records)
@@ -150,7 +145,7 @@ def _rank(rank: int | None) -> str:
 class _Output:
     """Prints sections as the options ask: for a terminal, as Markdown, or as CSV."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: Options) -> None:
         self.markdown, self.csv, self.quiet = options.markdown, options.csv, options.verbosity < 0
         self._console = make_console()
 

@@ -1,10 +1,11 @@
 """``oodd-eval compare``: two rows of results, results against a reference; writing references."""
 
-import argparse
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.cli import EXPRESSION, Parser, say
+import click
+
+from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES, RANKING
@@ -20,40 +21,42 @@ LOG_WIDTH: Final = 160
 """Columns that a log has at least."""
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    # fmt: off
-    add = parser.options(
-        run,
-        "compare oodd-results pe rf",
-        "compare oodd-results --against reference.jsonl --fail auc_matched:-0.01",
-        "compare oodd-results --write-reference reference.jsonl -k 'seed=0'",
-    )
-    add("results", metavar="DIR", help="results directory or file of records")
-    add("rows", nargs="*", metavar="ROW",
-        help="two rows of these results to compare by the paired bootstrap, such as pe and rf")
-    add("--metric", default=RANKING, help=f"metric of that comparison (default: {RANKING})")
-    add("--against", metavar="REFERENCE", help="likewise: what the results should come up to")
-    add("--fail", action="append", default=[], metavar="METRIC:[+-]NUMBER[%]",
-        help="fail when the metric changed by more in the direction of the sign: auc:-0.01, "
-             "delay:+10%% (default: when any metric is worse at all)")
-    add("--two-sided", action="store_true",
-        help="fail for improvements beyond the tolerance, too")
-    add("--by", choices=("cell", "group", "mean"), default="cell",
-        help="compare cells, means over the anomalies of a group in an environment, or means "
-             "over all cells (default: cell)")
-    add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
-    add("--junit", metavar="FILE", help="write JUnit XML, a test case per cell and metric")
-    add("--markdown", metavar="FILE", help="write Markdown, for a pull request")
-    add("--write-reference", metavar="FILE",
-        help="write a small file of records to compare with later, compressed if named .xz or .gz")
-    add("--keep", metavar="METRICS", default="",
-        help="of these metrics alone, but with what their intervals are made of")
-    # fmt: on
+@command(
+    "compare oodd-results pe rf",
+    "compare oodd-results --against reference.jsonl --fail auc_matched:-0.01",
+    "compare oodd-results --write-reference reference.jsonl -k 'seed=0'",
+)
+@click.argument("results", type=FILE, help="results directory or file of records")
+@click.argument("rows", nargs=-1, metavar="[ROW ROW]", help="compare these, such as pe and rf")
+@click.option("--metric", default=RANKING, type=Name("metrics"), help="metric of that comparison")
+@click.option("--against", type=FILE, help="likewise: what the results should come up to")
+@click.option(
+    "--fail",
+    multiple=True,
+    metavar="METRIC:[+-]NUMBER[%]",
+    help="fail when a metric changed by more: auc:-0.01, delay:+10% (default: when one is worse)",
+)
+@click.option("--two-sided", is_flag=True, help="fail for improvements beyond the tolerance, too")
+@click.option(
+    "--by",
+    type=click.Choice(["cell", "group", "mean"]),
+    default="cell",
+    help="compare cells, means over a group of anomalies in an environment, or means of all cells",
+)
+@expression_option
+@click.option("--junit", type=FILE, help="write JUnit XML, a test case per cell and metric")
+@click.option("--markdown", type=FILE, help="write Markdown, for a pull request")
+@click.option(
+    "--write-reference",
+    type=FILE,
+    help="write records to compare with later (compressed: .xz, .gz)",
+)
+@click.option("--keep", type=Names("metrics"), help="keep only these metrics, with their intervals")
+def compare(options: Options) -> int:
+    """Compare two rows of some results, or results with a reference.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval compare``; 1 when the comparison fails, 5 when nothing is in it."""
+    The exit code is 1 when the comparison fails, and 5 when nothing is in it.
+    """
     if not options.against and not options.write_reference and not options.rows:
         raise UsageError(
             "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE"
@@ -76,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     return code
 
 
-def _rows(now: RecordSet, options: argparse.Namespace) -> int:
+def _rows(now: RecordSet, options: Options) -> int:
     if len(options.rows) != 2 or options.against or options.write_reference:
         rows = " ".join(options.rows)
         raise UsageError(f"rows {rows!r}, expected two, without --against or --write-reference")
@@ -98,7 +101,7 @@ def _rows(now: RecordSet, options: argparse.Namespace) -> int:
     return 0
 
 
-def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) -> int:
+def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:
     known = dict.fromkeys((*NAMES, *reference.metrics()))
     tolerances = regression.parse_tolerances(options.fail, known)
     rules = {"by": options.by, "two_sided": options.two_sided}
@@ -125,8 +128,8 @@ def _compare(now: RecordSet, reference: RecordSet, options: argparse.Namespace) 
     return int(bool(comparison.failures))
 
 
-def _write(path: str, text: str) -> None:
+def _write(path: Path, text: str) -> None:
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{path!r} cannot be written: {error.strerror}") from None
+        raise OutputError(f"{str(path)!r} cannot be written: {error.strerror}") from None

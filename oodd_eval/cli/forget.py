@@ -1,35 +1,28 @@
-"""``oodd-eval forget``: remove cells from a results directory, such as those of a failed detector.
+"""``oodd-eval forget``: remove cells from a results directory."""
 
-Their records, scores and logs go; fits that other cells may share stay.
-"""
+import click
 
-import argparse
-
-from oodd_eval.cli import EXPRESSION, Parser, say
+from oodd_eval.cli import DIRECTORY, Options, command, expression_option, say
 from oodd_eval.errors import UsageError
 from oodd_eval.names import expression
 from oodd_eval.results.directory import ResultsDirectory
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    # fmt: off
-    add = parser.options(
-        run, "forget oodd-results --failed", "forget oodd-results -k 'riqn and hopper'"
-    )
-    add("directory", metavar="DIR", help="results directory")
-    add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
-    add("--failed", action="store_true", help="only cells that failed")
-    # fmt: on
+@command("forget oodd-results --failed", "forget oodd-results -k 'riqn and hopper'")
+@click.argument("directory", type=DIRECTORY, help="results directory")
+@expression_option
+@click.option("--failed", is_flag=True, help="only cells that failed")
+def forget(options: Options) -> int:
+    """Remove cells from a results directory, such as those of a failed detector.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval forget``; 5 when nothing is selected."""
+    Their records, scores and logs go; fits that other cells may share stay. The exit code is 5 when
+    nothing is selected.
+    """
     if not options.failed and not options.expression:
         raise UsageError("nothing to forget: expected --failed or -k EXPR")
-    wanted = expression(options.expression)
+    selects = expression(options.expression)
     results = ResultsDirectory(options.directory)
-    gone = [r for r in results.records() if wanted(str(r.cell)) and not (options.failed and r.ok)]
+    gone = [r for r in results.records() if selects(str(r.cell)) and not (options.failed and r.ok)]
     if not gone:
         return say(f"no cell of {options.directory} is selected: nothing was removed", 5)
     results.forget(gone)

@@ -1,13 +1,12 @@
-"""``oodd-eval info``: all there is to know of one detector, environment or anomaly."""
+"""``oodd-eval info``: describe a detector, an environment or an anomaly."""
 
-import argparse
 import json
 from collections.abc import Iterator
 
-from oodd_recording.values import unit_of
+import click
 from tabulate import tabulate
 
-from oodd_eval.cli import Parser
+from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.ladder import rungs_of
@@ -19,14 +18,10 @@ from oodd_eval.plugins.parameters import parameters_of
 Lines = Iterator[tuple[str, str]]
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    add = parser.options(run, "info pe", "info hopper", "info gravity", plugins=True)
-    add("name", metavar="DETECTOR|ENV|ANOMALY")
-
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval info``."""
+@command("info pe", "info hopper", "info gravity", plugins=True)
+@click.argument("name", type=Name("detectors", "envs", "anomalies"), metavar="DETECTOR|ENV|ANOMALY")
+def info(options: Options) -> int:
+    """Print all there is to know of one detector, environment or anomaly."""
     name = options.name
     if name in ENVIRONMENTS:
         lines = _environment(ENVIRONMENTS[name])
@@ -34,16 +29,12 @@ def run(options: argparse.Namespace) -> int:
         lines = _anomaly(ANOMALIES[name])
     else:
         plugins = discovered(options)
-        own = plugins.own_specs
-        if name in own:
-            print(tabulate(_own(*own[name]), tablefmt="plain", disable_numparse=True))
-            return 0
+        custom = plugins.own_specs
         try:
-            offer = plugins.offer(name)
+            lines = _custom(*custom[name]) if name in custom else _detector(plugins.offer(name))
         except UnknownNameError:
-            known = [*ENVIRONMENTS, *ANOMALIES, *own, *plugins.offers]
-            raise UnknownNameError("detector, environment or anomaly", name, known) from None
-        lines = _detector(offer)
+            names = [*ENVIRONMENTS, *ANOMALIES, *custom, *plugins.offers]
+            raise UnknownNameError("detector, environment or anomaly", name, names) from None
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
 
@@ -60,7 +51,7 @@ def _environment(info: EnvironmentInfo) -> Lines:
         yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
 
 
-def _own(spec: OwnSpec, origin: str) -> Lines:
+def _custom(spec: OwnSpec, origin: str) -> Lines:
     if isinstance(spec, AnomalySpec):
         yield "anomaly", f"{spec.name}, {origin}"
         yield "group", spec.group
@@ -77,6 +68,7 @@ def _own(spec: OwnSpec, origin: str) -> Lines:
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:
+    unit_of = load("oodd_recording.values:unit_of")
     of_paper = " of the paper" if info.id in TABLE1 else ""
     yield "anomaly", f"{info.id} ({info.title}{of_paper})"
     yield "group", info.group
@@ -85,8 +77,8 @@ def _anomaly(info: AnomalyInfo) -> Lines:
         rungs = rungs_of(environment, info.id)
         ends = f"{rungs['kept99'].strength:.3g} to {[*rungs.values()][-1].strength:.3g}"
         strongest = [*rungs][-1]
-        told = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
-        yield f"strength in {environment}", told
+        text = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
+        yield f"strength in {environment}", text
 
 
 def _detector(offer: Offer) -> Lines:
@@ -99,8 +91,8 @@ def _detector(offer: Offer) -> Lines:
     yield "looks at", spec.inputs.replace("+", " and ")
     yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
-    for i, (name, known) in enumerate(parameters_of(spec.parameters).items()):
-        default = f"{name} = {json.dumps(known.default, default=str)}"
-        yield "" if i else "parameters", f"{default}  {known.help}".rstrip()
+    for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):
+        default = f"{name} = {json.dumps(parameter.default, default=str)}"
+        yield "" if i else "parameters", f"{default}  {parameter.help}".rstrip()
     if spec.other_parameters:
         yield "", "and any others"

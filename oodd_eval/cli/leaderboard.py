@@ -1,15 +1,15 @@
 """``oodd-eval leaderboard``: the published board, and its making from entries that are verified."""
 
-import argparse
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+import click
 from rich.console import Console
 
-from oodd_eval.cli import EXPRESSION, NAMES, Parser, board, rerun, say
+from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expression_option, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
@@ -24,73 +24,26 @@ from oodd_eval.results.directory import ResultsDirectory
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
 
-SPLIT: Final = "where the split is, if not at its usual place"
-
 MOST_SHOWN: Final = 30  # problems of an entry that are printed without -v
 
 
-def define(parser: Parser) -> None:
-    """Add the command, its actions and their options."""
-    # fmt: off
-    action = parser.nested("action")
-    add = action("build", "render tables and site from the entries").options(
-        build, "leaderboard build --check"
-    )
-    add("results", nargs="?", default=RESULTS, metavar="RESULTS_DIR",
-        help=f"directory of the entries (default: {RESULTS})")
-    add("--output", default="leaderboard", metavar="DIR",
-        help="where to write (default: leaderboard)")
-    add("--check", action="store_true",
-        help="write nothing, exit 1 where a file beside the site would change")
-    add = action("verify", "check entries as data, running none of their code").options(
-        verify, "leaderboard verify leaderboard/results/paper-mini"
-    )
-    add("paths", nargs="*", metavar="PATH",
-        help=f"an entry, or a directory of entries (default: {RESULTS})")
-    add("--changed-against", default="", metavar="BRANCH",
-        help="check a pull request: the entries that were changed since the branch was left, that "
-             "nothing else was changed with them, and that the board builds")
-    add("--split", metavar="PATH", help=SPLIT)
-    add("--rerun", metavar="DIR",
-        help="results of leaderboard rerun, or of a run of your own, to compare one entry with")
-    add("--grant", default="", metavar="NAME",
-        help=f"write the trust level that was reached into {GRANTS}, in this name")
-    rerun.define(action("rerun", "run an entry's detectors again on seeds drawn now"))
-    board.define(action)
-    add = action("submit", "write an entry from a results directory").options(
-        submit, "leaderboard submit oodd-results --id mine --title 'My detector'"
-    )
-    add("directory", metavar="DIR", help="results directory, written by oodd-eval run or reproduce")
-    add("--results", default=RESULTS, metavar="RESULTS_DIR",
-        help=f"directory of the entries (default: {RESULTS})")
-    add("--detector", dest="detectors", default="all", metavar="NAMES",
-        help=f"{NAMES} (default: all)")
-    add("-k", dest="cells", default="", metavar="EXPR", help=EXPRESSION)
-    add("--complete", action="store_true",
-        help="leave out those seeds of a row that lack cells which others have")
-    add("--id", default="", metavar="ID",
-        help="name of the entry's directory (default: detectors and split)")
-    add("--title", default="", metavar="TEXT", help="one line, shown on the board")
-    add("--submitter", default="", metavar="TEXT", help="who stands behind the results")
-    add("--citation", default="", metavar="TEXT", help="how to cite the method")
-    add("--url", default="", metavar="URL", help="page of the method or its code")
-    add("--primary", nargs="+", default=(), metavar="ROW",
-        help="rows that are ranked for their detectors, such as 'riqn[updates=9000]' (default: of "
-             "each detector the one with default parameters and the shortest horizon)")
-    add("--caption", default="", metavar="TEXT",
-        help="a note above the tables, such as a reduced setting")
-    add("--scores", action="store_true",
-        help="include every score, so that others can recompute the metrics")
-    add("--split", metavar="PATH", help=SPLIT)
-    add("--curves", default="rows", choices=("rows", "detectors", "none"),
-        help="curves for the site: of every row, of each detector's plainest row, or none "
-             "(default: rows)")
-    # fmt: on
+_split_option: Final = click.option(
+    "--split", type=Name("splits"), help="where the split is, if not at its usual place"
+)
 
 
-def build(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard build``; 1 when ``--check`` finds a difference, 5 without entries."""
-    output = Path(options.output)
+@command("leaderboard build --check")
+@click.argument("results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
+@click.option("--output", default="leaderboard", type=DIRECTORY, help="where to write")
+@click.option(
+    "--check", is_flag=True, help="write nothing, exit 1 where a file beside the site would change"
+)
+def build(options: Options) -> int:
+    """Render tables and site from the entries.
+
+    The exit code is 1 when --check finds a difference, and 5 when there are no entries.
+    """
+    output = options.output
     with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
         show("entries")
         entries = read_entries(options.results)
@@ -123,65 +76,110 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
         yield lambda part: status.update(f"leaderboard: {part}")
 
 
-def submit(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard submit``; 1 when what was written did not pass."""
-    options.citation = " ".join(options.citation.split())
-    texts = ("id", "title", "submitter", "citation", "url", "caption", "primary")
-    statement = submission.Statement(**{name: getattr(options, name) for name in texts})
-    chosen = ("detectors", "cells", "complete", "scores", "curves", "split")
-    how = {name: getattr(options, name) for name in chosen}
-    made = submission.submit(options.directory, options.results, statement, **how)
-    console, place = make_console(), made.path
-    for line in made.left_out if options.verbosity >= 0 else ():
+@command("leaderboard submit oodd-results --id mine --title 'My detector'", repeated=["--primary"])
+@click.argument("directory", type=DIRECTORY, help="results of oodd-eval run or reproduce")
+@click.option("--results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
+@click.option("--detector", "detectors", default="all", type=Names("detectors"), help=NAMES)
+@expression_option
+@click.option("--complete", is_flag=True, help="leave out seeds of a row that lack cells")
+@click.option("--id", help="name of the entry's directory (default: detectors and split)")
+@click.option("--title", help="one line, shown on the board")
+@click.option("--submitter", help="who stands behind the results")
+@click.option("--citation", help="how to cite the method")
+@click.option("--url", help="page of the method or its code")
+@click.option(
+    "--primary",
+    multiple=True,
+    metavar="ROW...",
+    help="ranked rows, such as 'riqn[updates=9000]' (default: default parameters, least horizon)",
+)
+@click.option("--caption", help="a note above the tables, such as a reduced setting")
+@click.option("--scores", is_flag=True, help="include every score, so that others can recompute")
+@_split_option
+@click.option(
+    "--curves",
+    default="rows",
+    type=click.Choice(["rows", "detectors", "none"]),
+    help="curves of every row, of each detector's plainest row, or none",
+)
+def submit(options: Options) -> int:
+    """Write an entry from a results directory.
+
+    Nothing is written, and the exit code is 1, when the entry would not be valid.
+    """
+    names = ("id", "title", "submitter", "citation", "url", "caption")
+    texts = {name: getattr(options, name) or "" for name in names}
+    texts["citation"] = " ".join(texts["citation"].split())
+    statement = submission.Statement(**texts, primary=options.primary)
+    chosen = ("detectors", "complete", "scores", "curves", "split")
+    how = {name: getattr(options, name) for name in chosen} | {"cells": options.expression}
+    submitted = submission.submit(options.directory, options.results, statement, **how)
+    console, path = make_console(), submitted.path
+    for line in submitted.left_out if options.verbosity >= 0 else ():
         console.print(f"left out: {line}")
-    report(console, made.verdict, options.verbosity)
-    if not made.verdict.ok:
-        console.print(f"nothing was written to {place}")
+    report(console, submitted.verdict, options.verbosity)
+    if not submitted.verdict.ok:
+        console.print(f"nothing was written to {path}")
         return 1
     if options.verbosity >= 0:
-        size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file())
+        size = sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
         if size > submission.LARGE:
             advice = "leave the scores or some curves out (--curves), or submit fewer rows"
             console.print(f"  note: so large an entry is a burden to the repository: {advice}")
         console.print(
-            f"\nwritten to {place}, {size / 1e6:.2g} MB; next:\n"
-            f"  oodd-eval leaderboard place {place}\n"
-            f"  git add {place}\n"
+            f"\nwritten to {path}, {size / 1e6:.2g} MB; next:\n"
+            f"  oodd-eval leaderboard place {path}\n"
+            f"  git add {path}\n"
             "commit it alone, and open a pull request (docs/submitting.md)"
         )
     return 0
 
 
-def verify(options: argparse.Namespace) -> int:
-    """Carry out ``leaderboard verify``; 1 when an entry is refused, 5 when there is none."""
+@command("leaderboard verify leaderboard/results/paper-mini")
+@click.argument(
+    "paths", nargs=-1, type=DIRECTORY, help=f"entries, or directories of them (default: {RESULTS})"
+)
+@click.option(
+    "--changed-against",
+    metavar="BRANCH",
+    help="check a pull request: entries changed since the branch, nothing else, and the board",
+)
+@_split_option
+@click.option("--rerun", type=DIRECTORY, help="results of a re-run to compare one entry with")
+@click.option("--grant", help=f"write the trust level that was reached into {GRANTS}, in this name")
+def verify(options: Options) -> int:
+    """Check entries as data, running none of their code.
+
+    The exit code is 1 when an entry is refused, and 5 when there is none.
+    """
     console = make_console()
-    options.paths = options.paths or [RESULTS]
+    paths = options.paths or (Path(RESULTS),)
     if options.changed_against:
-        if options.rerun or options.grant or options.split or len(options.paths) > 1:
+        if options.rerun or options.grant or options.split or len(paths) > 1:
             options_named = "--split, --rerun or --grant"
             raise UsageError(
                 f"--changed-against is for one directory of entries, without {options_named}"
             )
-        return verify_pull_request(console, Path(options.paths[0]), options)
+        return verify_pull_request(console, paths[0], options)
     fresh = ResultsDirectory(options.rerun).records() if options.rerun else []
     if options.rerun and not fresh:
-        raise UsageError(f"--rerun: {options.rerun!r} has no records")
-    if (options.rerun or options.grant) and len(options.paths) > 1:
+        raise UsageError(f"--rerun: {str(options.rerun)!r} has no records")
+    if (options.rerun or options.grant) and len(paths) > 1:
         raise UsageError("--rerun and --grant are for one entry: name a single PATH")
-    drawn = read_order(Path(options.rerun)) if options.rerun else None
+    drawn = read_order(options.rerun) if options.rerun else None
     verdicts = []
-    for path in options.paths:
+    for path in paths:
         for verdict in check(path, split=options.split, rerun=fresh, order=drawn):
             verdicts.append(verdict)
             report(console, verdict, options.verbosity)
     if not verdicts:
-        return say(f"no entries in {', '.join(options.paths)}", 5)
+        return say(f"no entries in {', '.join(map(str, paths))}", 5)
     if options.grant:
         if len(verdicts) > 1:
             raise UsageError("--grant is for one entry: name it, not the directory of entries")
-        granted = grant(Path(options.paths[0]), verdicts[0], options.grant)
-        place = Path(options.paths[0]).absolute().parents[1] / GRANTS
-        console.print(f"{verdicts[0].name}: trust {granted.trust} is written to {place}")
+        granted = grant(paths[0], verdicts[0], options.grant)
+        grants = paths[0].absolute().parents[1] / GRANTS
+        console.print(f"{verdicts[0].name}: trust {granted.trust} is written to {grants}")
         return 0
     refused = sum(not verdict.ok for verdict in verdicts)
     if len(verdicts) > 1:
@@ -189,7 +187,7 @@ def verify(options: argparse.Namespace) -> int:
     return int(refused > 0)
 
 
-def verify_pull_request(console: Console, results: Path, options: argparse.Namespace) -> int:
+def verify_pull_request(console: Console, results: Path, options: Options) -> int:
     """Check what a branch changes; 1 when it may not be merged as the pull request of an entry."""
     entries, others = changes_against(options.changed_against, results)
     if not entries:
@@ -218,7 +216,7 @@ def verify_pull_request(console: Console, results: Path, options: argparse.Names
 
 
 def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
-    """Print what was found for one entry, every problem with its entry, place and field."""
+    """Print what was found for one entry, every problem with its entry, position and field."""
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
         cells = f"{len(verdict.records)} cells of {', '.join(entry.detectors)}"
@@ -227,10 +225,10 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
             console.print(f"  trust level established here: {verdict.reached}")
     else:
         console.print(f"{verdict.name}: refused, {findings.count} problems")
-    shown = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
-    lines = [f"{verdict.name}: {problem.text}" for problem in shown]
-    if findings.count > len(shown):
-        lines.append(f"and {findings.count - len(shown)} more")
+    problems = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
+    lines = [f"{verdict.name}: {problem.text}" for problem in problems]
+    if findings.count > len(problems):
+        lines.append(f"and {findings.count - len(problems)} more")
     lines += [f"re-run: {line}" for line in (verdict.rerun.lines if verdict.rerun else ())]
     lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]
     for line in lines:

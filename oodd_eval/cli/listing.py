@@ -1,67 +1,62 @@
 """``oodd-eval list``: one line each, the name first."""
 
-import argparse
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import TypeVar
+from typing import Final, TypeVar
 
+import click
 from tabulate import tabulate
 
-from oodd_eval.cli import Parser
+from oodd_eval.cli import Options, command
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
-from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
+from oodd_eval.names import check_known
 from oodd_eval.plugins.discovery import Plugins, discover
 
 T = TypeVar("T")
 Rows = Iterable[tuple[str, ...]]
 
-
-def define(parser: Parser) -> None:
-    """Add the options."""
-    add = parser.options(run, "list detectors", "list metrics", plugins=True)
-    add("what", metavar="detectors|envs|anomalies|splits|metrics")
+KINDS: Final = ("detectors", "envs", "anomalies", "splits", "metrics")
 
 
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval list``; 1 when a plug-in is broken."""
-    rows: Rows
-    code = 0
-    match options.what:
+@command("list detectors", "list metrics", plugins=True)
+@click.argument("kind", metavar="|".join(KINDS), shell_complete=click.Choice(KINDS).shell_complete)
+def list_names(options: Options) -> int:
+    """List what there is, one line each, the name first.
+
+    The exit code is 1 when a plug-in is broken.
+    """
+    check_known("thing to list", KINDS, options.kind)
+    plugins = discover(options.disabled)
+    print(tabulate(rows(options.kind, plugins), tablefmt="plain", disable_numparse=True))
+    return int(options.kind == "detectors" and bool(plugins.broken))
+
+
+def rows(kind: str, plugins: Plugins) -> Rows:
+    """Yield a row for each name of one of `KINDS`: the name, and what describes it."""
+    match kind:
         case "detectors":
-            plugins = discover(options.disabled)
-            rows = list(_detectors(plugins))
-            code = int(bool(plugins.broken))
+            yield from _detectors(plugins)
         case "envs":
-            rows = [
-                (e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy")
-                for e in ENVIRONMENTS.values()
-            ]
-            rows += [
-                (s.name, origin, f"{len(s.sensors)} sensors, its own policy")
-                for s, origin in _own(options, EnvironmentSpec)
-            ]
+            for e in ENVIRONMENTS.values():
+                yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
+            for env, origin in _custom(plugins, EnvironmentSpec):
+                yield env.name, origin, f"{len(env.sensors)} sensors, its own policy"
         case "anomalies":
-            rows = [(a.id, a.group, a.summary) for a in ANOMALIES.values()]
-            rows += [
-                (s.name, s.group, f"{s.summary} ({origin})")
-                for s, origin in _own(options, AnomalySpec)
-            ]
+            for a in ANOMALIES.values():
+                yield a.id, a.group, a.summary
+            for anomaly, origin in _custom(plugins, AnomalySpec):
+                yield anomaly.name, anomaly.group, f"{anomaly.summary} ({origin})"
         case "splits":
-            rows = _splits()
+            yield from _splits()
         case "metrics":
-            rows = _metrics()
-        case _:
-            kinds = "detectors", "envs", "anomalies", "splits", "metrics"
-            raise UnknownNameError("thing to list", options.what, kinds)
-    print(tabulate(rows, tablefmt="plain", disable_numparse=True))
-    return code
+            yield from _metrics()
 
 
-def _own(options: argparse.Namespace, kind: type[T]) -> Iterable[tuple[T, str]]:
+def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
     """Yield the environments, or the anomalies, of plug-ins with their origin."""
-    for spec, origin in discover(options.disabled).own_specs.values():
+    for spec, origin in plugins.own_specs.values():
         if isinstance(spec, kind):
             yield spec, origin
 

@@ -1,82 +1,130 @@
 """The entry point: read the command line, carry it out, and return its exit code."""
 
-import argparse
 import contextlib
 import os
 import shlex
 import signal
 import sys
 import traceback
-from collections.abc import Container, Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
 from typing import Final
 
+import click
+from click.shell_completion import shell_complete
+
 from oodd_eval._version import __version__
-from oodd_eval.cli import Parser, say
+from oodd_eval.cli import Commands, Group, Options, command, say, write_section
 from oodd_eval.errors import OoddError
 
-EXIT_CODES: Final = """exit codes:
-  0  ok
-  1  a cell, check or comparison failed, or a plug-in is broken
-  2  interrupted (Ctrl-C, TERM, HUP), or output pipe closed
-  3  internal error
-  4  the request cannot be carried out: unknown name, missing data, no place to write
-  5  nothing was selected or compared"""
-
-COMMANDS: Final = (
-    ("run", "run", "fit and score every selected cell"),
-    ("list", "listing", "list what there is, one line each"),
-    ("show", "show", "print the tables of earlier results from stored scores"),
-    ("check", "check", "check that a detector honours the contract"),
-    ("compare", "compare", "compare rows of some results, or results with a reference"),
-    ("info", "info", "describe a detector, an environment or an anomaly"),
-    ("forget", "forget", "remove cells from a results directory"),
-    ("leaderboard", "leaderboard", "submit, verify and show entries of the board"),
-    ("data", "data", "build, import, verify, fetch and export splits"),
-    ("policies", "policies", "train and evaluate nominal policies"),
-    (
-        "reproduce",
-        "reproduce",
-        "regenerate the paper's tables, figures and claims; resumes where it was",
-    ),
-    ("new", "new", "write a ready plug-in project"),
+FIRST_STEPS: Final = (
+    "run --detector mewma --env hopper  evaluate a detector, in seconds",
+    "show oodd-results                  print tables of that run again",
+    "list detectors                     list what else can be run",
+    "leaderboard show                   print the published board",
+    "data import --help                 bring logs of your own system",
 )
 
+EXIT_CODES: Final = (
+    "0  ok",
+    "1  a cell, check or comparison failed, or a plug-in is broken",
+    "2  interrupted (Ctrl-C, TERM, HUP), or output pipe closed",
+    "3  internal error",
+    "4  cannot be carried out: unknown name, missing data, no place to write",
+    "5  nothing was selected or compared",
+)
 
-def build_parser(named: Container[str] | None = None) -> Parser:
-    """Return the parser of the command line: with the options of all commands, or of some."""
-    parser = Parser(
-        prog="oodd-eval",
-        description="Evaluate detectors of out-of-distribution dynamics on frozen trajectories.",
-        epilog=EXIT_CODES,
-    )
-    parser.add_argument("--version", action="version", version=f"oodd-eval {__version__}")
-    add_command = parser.nested("command")
-    for name, module, summary in COMMANDS:
-        command = add_command(name, summary)
-        if named is None or name in named:
-            import_module(f"oodd_eval.cli.{module}").define(command)
-    return parser
+DATA: Final[Commands] = {
+    "import": ("import logs of your own as an environment", "oodd_eval.cli.data:import_logs"),
+    "info": ("describe a split", "oodd_eval.cli.data:info"),
+    "verify": ("compare a split with its digests", "oodd_eval.cli.data:verify"),
+    "fetch": ("verify a copy of a split and install it", "oodd_eval.cli.data:fetch"),
+    "export": ("write a split in another project's format", "oodd_eval.cli.data:export"),
+    "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
+    "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
+    "page": ("write the pages on environments (extra sim)", "oodd_recording.commands:page"),
+}
+
+LEADERBOARD: Final[Commands] = {
+    "show": ("print the published board", "oodd_eval.cli.board:show"),
+    "place": ("show where a run would stand on it", "oodd_eval.cli.board:place_run"),
+    "submit": ("write an entry from a results directory", "oodd_eval.cli.leaderboard:submit"),
+    "verify": ("check entries as data", "oodd_eval.cli.leaderboard:verify"),
+    "rerun": ("run an entry's detectors again on new seeds", "oodd_recording.rerun:rerun"),
+    "build": ("render tables and site from the entries", "oodd_eval.cli.leaderboard:build"),
+}
+
+POLICIES: Final[Commands] = {
+    "train": ("train a policy (extra train)", "oodd_recording.commands:train"),
+    "evaluate": ("mean return of a policy (extra sim)", "oodd_recording.commands:evaluate"),
+}
+
+COMMANDS: Final[Mapping[str, Commands]] = {
+    "Evaluate": {
+        "run": ("fit and score every selected cell", "oodd_eval.cli.run:run"),
+        "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
+        "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
+        "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
+        "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),
+    },
+    "Look up": {
+        "list": ("list what there is, one line each", "oodd_eval.cli.listing:list_names"),
+        "info": ("describe a detector, environment or anomaly", "oodd_eval.cli.info:info"),
+        "leaderboard": ("show, submit and verify entries of the board", LEADERBOARD),
+    },
+    "Add your own": {
+        "new": ("write a ready plug-in project", "oodd_eval.cli.new:new"),
+        "check": ("check that a detector honours the contract", "oodd_eval.cli.check:check"),
+        "data": ("import, record, verify, fetch and export splits", DATA),
+        "policies": ("train and evaluate nominal policies", POLICIES),
+        "completion": ("print a script for a shell's completion", "oodd_eval.cli.main:completion"),
+    },
+}
 
 
-def _parse(given: Sequence[str]) -> argparse.Namespace:
-    parser = build_parser(given[:1])
-    parsed = parser.parse_args(given)
-    if getattr(parsed, "config", None):
-        # The command line comes last, so that it wins.
-        parsed = parser.parse_args([given[0], *parsed.options_of(parsed.config), *given[1:]])
-    parsed.invocation = shlex.join(["oodd-eval", *given])
-    return parsed
+class _Program(Group):
+    """The command line as a whole; its help begins with first steps and ends with exit codes."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        steps = [f"oodd-eval {step}" for step in FIRST_STEPS]
+        write_section(formatter, "First steps", steps)
+        super().format_options(ctx, formatter)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        del ctx
+        write_section(formatter, "Exit codes", EXIT_CODES)
+
+
+PROGRAM: Final = click.version_option(__version__, message="oodd-eval %(version)s")(
+    _Program("Evaluate detectors of out-of-distribution dynamics on frozen trajectories.", COMMANDS)
+)
+
+COMPLETION: Final = "_OODD_EVAL_COMPLETE"  # the variable in which shells ask for completions
+
+
+@command("completion bash", "completion fish")
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(options: Options) -> int:
+    """Print what makes a shell complete commands, options and names of oodd-eval.
+
+    For bash, put `eval "$(oodd-eval completion bash)"` into ~/.bashrc; for zsh, the same with zsh
+    into ~/.zshrc, after compinit; for fish, write the output to
+    ~/.config/fish/completions/oodd-eval.fish.
+    """
+    return shell_complete(PROGRAM, {}, "oodd-eval", COMPLETION, f"{options.shell}_source")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code; by default end this process with it."""
     if arguments is not None:
-        return _carried_out(list(arguments))
+        return _exit_code(list(arguments))
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, signal.default_int_handler)
-    code = _carried_out(sys.argv[1:])
+    if question := os.environ.get(COMPLETION):
+        with contextlib.suppress(OoddError):  # of a broken split, say: then there are no names
+            shell_complete(PROGRAM, {}, "oodd-eval", COMPLETION, question)
+        return 0
+    code = _exit_code(sys.argv[1:])
     # Threads and exit handlers of plug-ins, which might never end, have no say.
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -84,18 +132,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os._exit(code)
 
 
-def _carried_out(given: list[str]) -> int:
-    options = None
+def _exit_code(arguments: list[str]) -> int:
+    """Carry out a command line, and print why it failed."""
+    invocation = shlex.join(["oodd-eval", *arguments])
     try:
-        if not given:
-            build_parser(given).print_help()
-            return 0
-        options = _parse(given)
-        code: int = options.handler(options)
+        # Group.main is not called, as it has exit codes of its own.
+        with PROGRAM.make_context("oodd-eval", arguments or ["--help"], obj=invocation) as context:
+            code: int = PROGRAM.invoke(context)
         sys.stdout.flush()
+    except click.exceptions.Exit as ended:  # --help and --version
+        return ended.exit_code
     except SystemExit as error:
-        if options is None:  # argparse's --help and --version
-            return error.code if isinstance(error.code, int) else 0
         return say(f"something called sys.exit({error.code!r}), so that not all was done", 3)
     except KeyboardInterrupt:
         return say("interrupted", 2)
@@ -104,8 +151,11 @@ def _carried_out(given: list[str]) -> int:
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 2
+    except click.UsageError as error:
+        where = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
+        return say(f"{error.format_message().removesuffix('.')}{where}", 4)
     except OoddError as error:
-        if "-v" in given:
+        if "-v" in arguments:
             traceback.print_exc()
         return say(str(error), 4)
     except Exception:  # noqa: BLE001  the outermost: everything unforeseen ends here

@@ -1,24 +1,24 @@
 """``oodd-eval new``: a plug-in project that works before anything in it is edited."""
 
-import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
-from oodd_eval.cli import Parser
+import click
+
+from oodd_eval.cli import DIRECTORY, Options, command
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.template import Project, write_project
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    add = parser.options(run, "new my-detector", plugins=True)
-    add("name", metavar="NAME", help="name of the detector: lower-case letters, digits, hyphens")
-    add("--output", metavar="DIR", help="where to write it (default: oodd-NAME)")
+@command("new my-detector", plugins=True)
+@click.argument("name", help="name of the detector: lower-case letters, digits, hyphens")
+@click.option("--output", type=DIRECTORY, help="where to write it (default: oodd-NAME)")
+def new(options: Options) -> int:
+    """Write a plug-in project that works before anything in it is edited.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval new``, unless the project would collide with what is installed."""
+    A name is refused when its project would collide with what is installed.
+    """
     project = Project(options.name)
     plugins = discover(options.disabled)
     taken = ""
@@ -30,16 +30,16 @@ def run(options: argparse.Namespace) -> int:
         taken = f"module {project.module!r} already"
     if taken:
         raise UsageError(f"there is a {taken}: choose another name, such as 'my-{project.name}'")
-    directory = Path(options.output or project.distribution)
+    directory = options.output or Path(project.distribution)
     written = write_project(project, directory)
     if options.verbosity >= 0:
         # Without the dot, pip would look for a distribution of that name.
-        place = directory if directory.is_absolute() else f"./{directory}"
+        path = directory if directory.is_absolute() else f"./{directory}"
         print(f"wrote {directory}:")
         for file in written:
             print(f"  {file.relative_to(directory)}")
         print(
-            f'\nnext:\n  pip install -e "{place}[test]"\n  oodd-eval check {project.name}\n'
+            f'\nnext:\n  pip install -e "{path}[test]"\n  oodd-eval check {project.name}\n'
             f"  oodd-eval run --detector {project.name} --env all\n"
             "  oodd-eval leaderboard place oodd-results\n"
             f"  oodd-eval leaderboard submit oodd-results --detector {project.name}"

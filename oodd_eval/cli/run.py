@@ -1,19 +1,34 @@
 """``oodd-eval run``: fit and score every selected cell, print tables and write them."""
 
-import argparse
 import json
 import tomllib
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from oodd_eval import cli
-from oodd_eval.cli import Parser
+import click
+
+from oodd_eval.cli import (
+    COUNT,
+    DIRECTORY,
+    FILE,
+    NAMES,
+    SEEDS,
+    Command,
+    Name,
+    Names,
+    Options,
+    command,
+    detector_options,
+    expression_option,
+    fit_options,
+    say,
+    say_notes,
+)
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import load_split, split_places
 from oodd_eval.errors import UsageError
-from oodd_eval.names import expression, whole_numbers
+from oodd_eval.names import expression
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import REPORT, ResultsDirectory
@@ -21,50 +36,51 @@ from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
 from oodd_eval.scoring.executors import LOCAL, RunSettings
 from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import run as carry_out
+from oodd_eval.scoring.runner import run as run_plan
 
 
-def define(parser: Parser) -> None:
-    """Add the options."""
-    # fmt: off
-    add = parser.options(
-        run,
-        "run --detector rf --env all",
-        "run --detector pe,rf --env hopper,ant --anomaly iid,gravity --jobs 2",
-        "run --detector riqn --env hopper --param updates=500 --horizon 1,10 --output mine",
-        plugins=True,
-    )
-    parser.set_defaults(options_of=options_of)
-    add("--detector", metavar="NAMES", help=f"{cli.NAMES} (required)")
-    add("--env", metavar="NAMES", help=f"{cli.NAMES} (required)")
-    add("--anomaly", default="all", metavar="NAMES", help=f"{cli.NAMES} (default: all)")
-    add("--split", default="mini", help="name or path of a split (default: mini)")
-    cli.add_detector(add)
-    add("--seed", default="0", metavar="N,...", type=cli.value(partial(whole_numbers, least=0)),
-        help="seeds of the detectors (default: 0)")
-    add("-k", dest="expression", default="", metavar="EXPR", help=cli.EXPRESSION)
-    add("--collect-only", action="store_true", help="print the selected cells and do nothing")
-    add("-x", dest="stop", action="store_true", help="stop at the first failure")
-    add("--limit", type=cli.at_least(1), metavar="N",
-        help="use the first N trajectories of each part")
-    cli.add_resources(add, timeout="30m")
-    add("--executor", default="local", metavar="local|dask://HOST:PORT",
-        help="where fits are carried out: here, or on a Dask cluster (default: local)")
-    add("--sandbox", action="store_true",
-        help="run detectors in bubblewrap: no network, no view of splits, results or the home")
-    add("--fresh", action="store_true", help="fit again what the results directory has already")
-    add("--intervals", action="store_true", help="print 95 %% intervals in the tables")
-    add("--config", metavar="FILE", help="TOML file with these options by their long names")
-    add("--output", default="oodd-results", metavar="DIR",
-        help="results directory (default: oodd-results)")
-    # fmt: on
+class _Configurable(Command):
+    """A command whose options may also stand in a file."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        values, _, _ = self.make_parser(ctx).parse_args(list(args))
+        file = None if ctx.resilient_parsing else values.get("config")
+        # The command line comes last, so that it wins.
+        return super().parse_args(ctx, [*_options_of(file), *args] if file else args)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval run`` and return its exit code."""
-    for name in ("detector", "env"):
-        if getattr(options, name) is None:
-            raise UsageError(f"--{name} is missing, on the command line and in --config")
+@command(
+    "run --detector rf --env all",
+    "run --detector pe,rf --env hopper,ant --anomaly iid,gravity --jobs 2",
+    "run --detector riqn --env hopper --param updates=500 --horizon 1,10 --output mine",
+    plugins=True,
+    kind=_Configurable,
+)
+@click.option("--detector", required=True, type=Names("detectors"), help=NAMES)
+@click.option("--env", required=True, type=Names("envs"), help=NAMES)
+@click.option("--anomaly", default="all", type=Names("anomalies"), help=NAMES)
+@click.option("--split", default="mini", type=Name("splits"), help="name or path of a split")
+@detector_options
+@click.option("--seed", default="0", type=SEEDS, help="seeds of the detectors")
+@expression_option
+@click.option("--collect-only", is_flag=True, help="print the selected cells and do nothing")
+@click.option("-x", "stop", is_flag=True, help="stop at the first failure")
+@click.option("--limit", type=COUNT, help="use the first N trajectories of each part")
+@fit_options("30m")
+@click.option("--executor", default="local", help="local, or dask://HOST:PORT, a Dask cluster")
+@click.option(
+    "--sandbox", is_flag=True, help="run detectors without network, splits, results and home"
+)
+@click.option("--fresh", is_flag=True, help="fit again what the results directory has already")
+@click.option("--intervals", is_flag=True, help="print 95 % intervals in the tables")
+@click.option("--config", type=FILE, help="TOML file with these options by their long names")
+@click.option("--output", default="oodd-results", type=DIRECTORY, help="results directory")
+def run(options: Options) -> int:
+    """Fit and score every selected cell, print the tables and write the results.
+
+    The exit code is 1 when a cell failed, and 2 when the run was interrupted. What was done before
+    is kept: the same command goes on.
+    """
     plugins = discovered(options)
     split = load_split(options.split)
     environments, anomalies = split.select(options.env, options.anomaly)
@@ -82,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     )
     plan = plan.matching(expression(options.expression))
     if not plan.cells:
-        return cli.say(f"no cell matches -k {options.expression!r}", 5)
+        return say(f"no cell matches -k {options.expression!r}", 5)
     console = make_console()
     if options.collect_only:
         if options.verbosity >= 0:
@@ -94,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
         if options.executor != LOCAL:
             raise UsageError("--sandbox is for workers of this machine, without --executor")
         require_sandbox()
-        hidden = (*split_places(split), options.output)
+        hidden = (*split_places(split), str(options.output))
     limits = Limits(options.timeout, options.memory, hidden)
     settings = RunSettings(
         jobs=options.jobs,
@@ -108,8 +124,8 @@ def run(options: argparse.Namespace) -> int:
     reporter = TerminalReporter(
         console, verbosity=options.verbosity, intervals=options.intervals, log=results.log_path
     )
-    done = carry_out(plan, split, plugins, settings, results, observers=[reporter])
-    cli.say_notes(results.notes)
+    done = run_plan(plan, split, plugins, settings, results, observers=[reporter])
+    say_notes(results.notes)
     if done.records:
         report = Report(results.records(), intervals=options.intervals)
         path = results.path / REPORT
@@ -121,23 +137,23 @@ def run(options: argparse.Namespace) -> int:
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
 
 
-def options_of(file: str) -> list[str]:
+def _options_of(file: str) -> list[str]:
     """Return a TOML file's content, long names of options with their values, as options."""
     try:
         content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"configuration file {file!r} cannot be read: {error}") from None
-    return [option for key, given in content.items() for option in _options(file, key, given)]
+    return [option for key, value in content.items() for option in _option(file, key, value)]
 
 
-def _options(file: str, name: str, given: Any) -> list[str]:
-    match given:
+def _option(file: str, name: str, value: Any) -> list[str]:
+    match value:
         case dict() if name == "param":
-            return [f"--param={key}={json.dumps(v)}" for key, v in given.items()]
+            return [f"--param={key}={json.dumps(v)}" for key, v in value.items()]
         case bool():
-            return [f"--{name}"] if given else []
-        case list() if all(isinstance(v, str | int) for v in given):
-            return [f"--{name}={','.join(map(str, given))}"]
+            return [f"--{name}"] if value else []
+        case list() if all(isinstance(v, str | int) for v in value):
+            return [f"--{name}={','.join(map(str, value))}"]
         case str() | int():
-            return [f"--{name}={given}"]
-    raise UsageError(f"configuration file {file!r}: {name} is {given!r}, which no option takes")
+            return [f"--{name}={value}"]
+    raise UsageError(f"configuration file {file!r}: {name} is {value!r}, which no option takes")

@@ -1,8 +1,20 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
-import argparse
+from typing import Final
 
-from oodd_eval.cli import EXPRESSION, Parser, say, say_notes
+import click
+
+from oodd_eval.cli import (
+    DIRECTORY,
+    Name,
+    Names,
+    Options,
+    command,
+    expression_option,
+    say,
+    say_notes,
+    together,
+)
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import load_split
@@ -15,34 +27,36 @@ from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.terminal import print_sections
 from oodd_eval.results.report import Report
 
-
-def define(parser: Parser) -> None:
-    """Add the options."""
-    # fmt: off
-    add = parser.options(
-        run,
-        "show oodd-results --intervals",
-        "show oodd-results --detector rf --metric missed_at_5pct",
-        "show oodd-results --env hopper -k 'not drift' --csv",
+_format_options: Final = together(
+    *(
+        click.option(f"--{name}", is_flag=True, help=f"print {layout.summary}")
+        for name, layout in FORMATS.items()
     )
-    add("directory", metavar="DIR", help="results directory")
-    add("--split", metavar="NAME", help="where the split is, if not at its usual place")
-    add("--stored", action="store_true", help="print stored metrics without recomputing them")
-    add("--intervals", action="store_true", help="print 95 %% intervals")
-    add("--detector", metavar="NAME", help="print the table by anomaly of one detector")
-    add("--metric", default="auc_matched",
-        help="metric of that table (default: auc_matched; see oodd-eval list metrics)")
-    add("--wide", action="store_true",
-        help="print all metrics, nulls and guaranteed alarms at 10, 5 and 1 %% among them")
-    for name, layout in FORMATS.items():
-        add(f"--{name}", action="store_true", help=f"print {layout.summary}")
-    add("--env", default="all", metavar="NAMES", help="only these environments (default: all)")
-    add("-k", dest="expression", default="", metavar="EXPR", help=EXPRESSION)
-    # fmt: on
+)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Carry out ``oodd-eval show``; 1 when one of the cells failed."""
+@command(
+    "show oodd-results --intervals",
+    "show oodd-results --detector rf --metric missed_at_5pct",
+    "show oodd-results --env hopper -k 'not drift' --csv",
+)
+@click.argument("directory", type=DIRECTORY, help="results directory")
+@click.option("--split", type=Name("splits"), help="where the split is, if not at its usual place")
+@click.option("--stored", is_flag=True, help="print stored metrics without recomputing them")
+@click.option("--intervals", is_flag=True, help="print 95 % intervals")
+@click.option(
+    "--detector", type=Name("detectors"), help="print the table by anomaly of one detector"
+)
+@click.option("--metric", default="auc_matched", type=Name("metrics"), help="metric of that table")
+@click.option("--wide", is_flag=True, help="print all metrics, with nulls and all alarm levels")
+@_format_options
+@click.option("--env", default="all", type=Names("envs"), help="only these environments")
+@expression_option
+def show(options: Options) -> int:
+    """Print tables of earlier results, recomputed from their scores.
+
+    The exit code is 1 when one of the cells failed.
+    """
     check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()

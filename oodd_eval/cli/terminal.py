@@ -1,6 +1,5 @@
 """The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
-import argparse
 import math
 import sys
 import time
@@ -13,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from oodd_eval._version import __version__
-from oodd_eval.cli import say
+from oodd_eval.cli import Options, say
 from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.own import OwnSpec, register
 from oodd_eval.metrics.catalogue import METRICS
@@ -39,7 +38,7 @@ def make_console(*, quiet: bool = False) -> Console:
     return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
 
 
-def discovered(options: argparse.Namespace) -> Plugins:
+def discovered(options: Options) -> Plugins:
     """Discover plug-ins without those of ``-p``; broken ones are reported on standard error."""
     plugins = discover(options.disabled)
     plugins.report_broken_to(
@@ -48,11 +47,11 @@ def discovered(options: argparse.Namespace) -> Plugins:
     return plugins
 
 
-def know_own(options: argparse.Namespace) -> list[OwnSpec]:
+def register_custom(options: Options) -> list[OwnSpec]:
     """Make environments and anomalies of plug-ins known in this process; return them."""
-    found = [spec for spec, _ in discovered(options).own_specs.values()]
-    register(found)
-    return found
+    specs = [spec for spec, _ in discovered(options).own_specs.values()]
+    register(specs)
+    return specs
 
 
 class TerminalReporter:

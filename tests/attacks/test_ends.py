@@ -121,7 +121,7 @@ def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
     code = (
         "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "import oodd_eval.cli.main as m, os\n"
-        "m._carried_out = lambda _: os.kill(os.getpid(), signal.SIGHUP) or 5\n"
+        "m._exit_code = lambda _: os.kill(os.getpid(), signal.SIGHUP) or 5\n"
         "m.main()"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 5

@@ -1,74 +1,85 @@
-"""``oodd-eval reproduce``: the paper from one command."""
+"""``oodd-eval reproduce``: compute the paper's tables, figures and claims."""
 
-import argparse
-from pathlib import Path
+import click
 
-from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
-from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
-from oodd_paper.page import publish
-from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
-
-from oodd_eval.cli import Parser, add_resources, say_notes, value
-from oodd_eval.cli.data import record_split
+from oodd_eval.cli import DIRECTORY, TIME, Name, Options, command, fit_options, load, say_notes
 from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
-from oodd_eval.names import check_known, seconds, select
+from oodd_eval.names import check_known, select
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.terminal import print_table
 from oodd_eval.scoring.executors import RunSettings, available_cores
 from oodd_eval.scoring.plan import Plan
-from oodd_eval.scoring.runner import RunOutcome
-from oodd_eval.scoring.runner import run as carry_out
+from oodd_eval.scoring.runner import RunOutcome, run
+from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
+from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
+from oodd_paper.page import publish
+from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
 
 
-def define(parser: Parser) -> None:
-    """Add the command and its options."""
-    # fmt: off
-    add = parser.options(
-        run, "reproduce --tier mini", "reproduce --tier reduced --plan", plugins=True
-    )
-    add("--tier", default="full", metavar="full|reduced|mini",
-        help="how much: split standard; its first trajectories and fewer seeds; split mini "
-             "(default: full)")
-    add("--split", metavar="NAME", help="name or path of a split (default: the tier's)")
-    add("--output", default="reproduction", metavar="DIR",
-        help="directory of the reproduction (default: reproduction)")
-    add("--only", default="all", metavar="NAMES",
-        help="run what these need, such as table-5,figure-horizon (default: all)")
-    add("--plan", action="store_true", help="show what remains and how long it takes; do nothing")
-    add("--budget", metavar="TIME", type=value(seconds),
-        help="start nothing after this time, such as 2h; exit code 2")
-    add_resources(add, timeout="3h")
-    add("--fresh", action="store_true", help="run again what the directory has already")
-    add("--build", action="store_true", help="build the split if it is not on this machine")
-    add("--render-only", action="store_true",
-        help="run nothing; make tables and figures again from the directory's records")
-    add("--records", nargs="+", metavar="DIR",
-        help="with --render-only: read all results below these directories instead")
-    add("--beside", metavar="DIR",
-        help="show the numbers of another reproduction beside these, such as one of Table 1's "
-             "strengths beside one of the paper's losses")
-    add("--no-figures", dest="figures", action="store_false", help="write tables only")
-    # fmt: on
+@command(
+    "reproduce --tier mini", "reproduce --tier reduced --plan", plugins=True, repeated=["--records"]
+)
+@click.option(
+    "--tier",
+    default="full",
+    metavar="full|reduced|mini",
+    help="how much: split standard; its first trajectories and fewer seeds; split mini",
+)
+@click.option("--split", type=Name("splits"), help="name or path of a split (default: the tier's)")
+@click.option(
+    "--output", default="reproduction", type=DIRECTORY, help="directory of the reproduction"
+)
+@click.option(
+    "--only",
+    default="all",
+    metavar="NAMES",
+    help="run what these need, such as table-5,figure-horizon",
+)
+@click.option("--plan", is_flag=True, help="show what remains and how long it takes; do nothing")
+@click.option("--budget", type=TIME, help="start nothing after this time, such as 2h; exit code 2")
+@fit_options("3h")
+@click.option("--fresh", is_flag=True, help="run again what the directory has already")
+@click.option("--build", is_flag=True, help="build the split if it is not on this machine")
+@click.option(
+    "--render-only",
+    is_flag=True,
+    help="run nothing; make tables and figures again from the directory's records",
+)
+@click.option(
+    "--records",
+    multiple=True,
+    type=DIRECTORY,
+    metavar="DIR...",
+    help="with --render-only: read all results below these directories instead",
+)
+@click.option(
+    "--beside",
+    type=DIRECTORY,
+    help="show the numbers of another reproduction beside these, such as one of Table 1's "
+    "strengths beside one of the paper's losses",
+)
+@click.option("--no-figures", is_flag=True, help="write tables only")
+def reproduce(options: Options) -> int:
+    """Compute the paper's tables, figures and claims; the same command goes on where it was.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Carry out the command; 1 when units failed, 2 when units are left."""
+    The exit code is 1 when units failed, and 2 when units are left.
+    """
     check_known("tier", TIERS, options.tier)
     if options.render_only:
-        header = Reproduction.load(Path(options.output))
-        places = [Path(place) for place in options.records or [options.output]]
-        return _render(options, header, load_records(header, places))
+        header = Reproduction.load(options.output)
+        records = load_records(header, options.records or [options.output])
+        return _render(options, header, records)
     if options.records:
         raise UsageError("--records is what --render-only reads; a run reads its own directory")
     return _run(options)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: Options) -> int:
     """Run what remains, as far as the budget goes, and write tables and figures."""
     console, results = make_console(), ResultsDirectory(options.output)
     directory, jobs = results.path, options.jobs or available_cores()
@@ -80,16 +91,16 @@ def _run(options: argparse.Namespace) -> int:
     sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
     units = len(lay_out(EXPERIMENTS, tier, split, plugins))
     header = Reproduction(tier, split.name, split.digest, PROTOCOL, **sizes, units=units)
-    wanted = lay_out(experiments, tier, split, plugins, options.device)
+    selected = lay_out(experiments, tier, split, plugins, options.device)
     header.check_same_data(directory)
     here = results.records() if (directory / RECORDS).exists() and not options.fresh else []
-    left = unfinished(wanted, here)
+    left = unfinished(selected, here)
     fitted = {u.fit_key for u in left if results.fits.has(u.fit_key, fresh=options.fresh)}
     rows = scored_rows(split)
     if options.verbosity >= 0 or options.plan:
         data = f"split {header.split}, digest {header.split_digest[:12]}"
         console.print(f"reproduction, tier {header.tier.name}: {data}")
-        print_table(stages(wanted, left, rows, fitted, jobs), console)
+        print_table(stages(selected, left, rows, fitted, jobs), console)
     if options.plan:
         return 0
     results.prepare()
@@ -106,7 +117,7 @@ def _run(options: argparse.Namespace) -> int:
             command=options.invocation,
         )
         plan = Plan(split.name, split.digest, tuple(left), split.groups)
-        outcome = carry_out(plan, split, plugins, settings, results, observers=[progress])
+        outcome = run(plan, split, plugins, settings, results, observers=[progress])
     say_notes(results.notes)
     code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
     if outcome.left:
@@ -116,7 +127,7 @@ def _run(options: argparse.Namespace) -> int:
     return 2 if outcome.left else code
 
 
-def _split(options: argparse.Namespace) -> Split:
+def _split(options: Options) -> Split:
     """Open the split, building it first where that was asked for."""
     name = options.split or TIERS[options.tier].split
     try:
@@ -126,17 +137,17 @@ def _split(options: argparse.Namespace) -> Split:
             raise
         if not options.build:
             raise SplitNotFoundError(f"{error}, or let reproduce do so with --build") from None
-    record_split(SPLITS[name], options)
+    load("oodd_recording.commands:record_split")(SPLITS[name], options)
     return load_split(name)
 
 
-def _render(options: argparse.Namespace, header: Reproduction, records: list[Record]) -> int:
+def _render(options: Options, header: Reproduction, records: list[Record]) -> int:
     """Write tables and figures; 1 when units failed, as far as there are records."""
-    console, directory = make_console(), Path(options.output)
+    console, directory = make_console(), options.output
     returns = load_returns(directory, header.split_digest)
-    other = Other.load(Path(options.beside)) if options.beside else None
+    other = Other.load(options.beside) if options.beside else None
     try:
-        publish(directory, header, records, returns, figures=options.figures, other=other)
+        publish(directory, header, records, returns, figures=not options.no_figures, other=other)
     except MissingExtraError as error:
         console.print(f"without figures: {error}")
         publish(directory, header, records, returns, figures=False, other=other)
