@@ -23,8 +23,8 @@ from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
-from oodd_eval.results.ladder import FOUND
 from oodd_eval.results.record import Metric
+from oodd_eval.results.strengths import FOUND
 
 DIGEST = "ab" * 32
 

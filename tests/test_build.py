@@ -18,6 +18,7 @@ from oodd_recording.policies import FROZEN, load_policy
 from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
@@ -58,9 +59,10 @@ def test_a_built_split_holds_what_recording_gives(built):
     assert data.train.seeds.tolist() == [950_000_000 + i for i in range(4)]
     assert data.calibration.seeds.tolist() == [950_300_000, 950_300_001]
     assert data.twins.seeds.tolist() == [950_600_000, 950_600_001]
+    gravity = Condition("gravity")
     episode = record_seed(
-        "cartpole", 950_600_001, ["gravity"], policy=load_policy("cartpole"), episode_cap=60
-    )["gravity"]
+        "cartpole", 950_600_001, [gravity], policy=load_policy("cartpole"), episode_cap=60
+    )[gravity]
     stored = data.anomalous("gravity")
     np.testing.assert_array_equal(stored[1].observations, episode.trajectory.observations)
     np.testing.assert_array_equal(stored[1].actions, episode.trajectory.actions)

@@ -17,6 +17,7 @@ from oodd_recording.policies import load_policy
 from oodd_recording.record import Setup, record_anomalous, record_seed
 from oodd_recording.values import VALUES, bound_of, spread_of, unit_of
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.split import load_split
 
@@ -67,7 +68,7 @@ def test_at_strength_zero_every_kind_equals_the_twin(environment):
     setup = Setup(environment, load_policy(environment), 90)
     twin = setup.record(950_000_001)
     for kind in ANOMALIES:
-        episode = record_anomalous(setup, f"{kind}@0", 0.0, twin, redraws=0)
+        episode = record_anomalous(setup, kind, 0.0, twin, redraws=0)
         assert episode.onset == episode.effect, kind
         assert (episode.trajectory.observations == twin.trajectory.observations).all(), kind
         assert (episode.rewards == twin.rewards).all(), kind
@@ -76,13 +77,13 @@ def test_at_strength_zero_every_kind_equals_the_twin(environment):
 @pytest.mark.parametrize("environment", CHEAP)
 def test_every_kind_acts_from_the_onset_on_and_never_before(environment):
     policy = load_policy(environment)
-    strengths = {f"{kind}@x": bound_of(environment, kind) / 4 for kind in ANOMALIES}
+    strengths = {Condition(kind, "x"): bound_of(environment, kind) / 4 for kind in ANOMALIES}
     found = record_seed(environment, 950_000_002, strengths, policy=policy, episode_cap=90)
     twin = found.pop(None).trajectory.observations
     for condition, episode in found.items():
         before = episode.trajectory.observations[: episode.effect]
         assert (before == twin[: episode.effect]).all(), condition
-        late = 0 if ANOMALIES[condition[:-2]].group == "sensor" else 20
+        late = 0 if ANOMALIES[condition.anomaly].group == "sensor" else 20
         assert episode.effect - episode.onset <= late, condition
         assert episode.parameters["strength"] == strengths[condition]
 
@@ -90,7 +91,7 @@ def test_every_kind_acts_from_the_onset_on_and_never_before(environment):
 def test_an_anomaly_too_weak_to_be_felt_keeps_its_episode_and_counts_from_its_onset():
     setup = Setup("cartpole", Reflex("cartpole"), 60)
     twin = setup.record(5)
-    episode = record_anomalous(setup, "wind-l2r@x", 1e-12, twin, redraws=3)
+    episode = record_anomalous(setup, "wind-l2r", 1e-12, twin, redraws=3)
     assert (episode.effect, episode.redraws) == (episode.onset, 3)
     assert episode.trajectory is twin.trajectory
 
@@ -341,8 +342,8 @@ def test_sensor_faults_corrupt_a_fifth_of_the_sensors_and_name_them(rows, kind):
 
 def test_noise_of_nominal_operation_is_that_of_the_twin_and_has_the_stated_deviation():
     clean, noisy = (
-        record_seed("cartpole", 950_000_003, ["gravity"] if n else [], policy=Reflex("cartpole"),
-                    episode_cap=200, noise=n)
+        record_seed("cartpole", 950_000_003, [Condition("gravity")] if n else [],
+                    policy=Reflex("cartpole"), episode_cap=200, noise=n)
         for n in (0.0, 0.05)
     )  # fmt: skip
     a, b = (found[None].trajectory.observations for found in (clean, noisy))

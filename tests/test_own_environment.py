@@ -58,7 +58,7 @@ def test_a_split_of_ones_own_is_recorded_and_evaluated(tank, capsys):
 def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_byte(tank):
     assert build("one", "--env", "valve", "--strength", "leak=0.1,2") == 0
     split = load_split("one")
-    assert split.conditions("valve") == ("leak@0.1", "leak@2")
+    assert split.anomalies == ("leak", "leak@0.1", "leak@2")
     assert split.environment("valve").discrete
     again = ["--jobs", "2", "--output", str(tank / "again")]
     assert build("one", "--env", "valve", "--strength", "leak=0.1,2", *again) == 0

@@ -19,7 +19,7 @@ from oodd_eval.leaderboard.placing import neighbours, placement, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import FOUND
+from oodd_eval.results.strengths import FOUND
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]

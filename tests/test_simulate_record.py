@@ -16,6 +16,7 @@ from oodd_recording import record as recording
 from oodd_recording.anomalies import Draw
 from oodd_recording.record import TwinTooShortError, record_nominal, record_seed
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError, UnknownNameError
@@ -40,8 +41,11 @@ def episodes(request):
     """(environment, {None: twin, anomaly: episode}) of one seed."""
     environment = request.param
     policy = Reflex(environment)
-    found = record_seed(environment, SEEDS[environment], TABLE1, policy=policy, episode_cap=CAP)
-    return environment, found
+    conditions = map(Condition, TABLE1)
+    recorded = record_seed(
+        environment, SEEDS[environment], conditions, policy=policy, episode_cap=CAP
+    )
+    return environment, {c and c.anomaly: episode for c, episode in recorded.items()}
 
 
 def test_episodes_equal_their_twin_bit_for_bit_before_the_effect_and_differ_at_it(episodes):

@@ -25,7 +25,7 @@ from oodd_eval.metrics.cusum import UNIT, Standardization, cusum
 from oodd_eval.plugins.contract import Detector, Scores
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.ladder import FOUND, curve
+from oodd_eval.results.strengths import FOUND, curve
 
 ENVIRONMENT = "hopper"
 DYNAMICS, SENSOR = "components", "shutdown"

@@ -82,7 +82,7 @@ class TerminalReporter:
         """Say what is going to happen."""
         self._start = time.perf_counter()
         self._sizes = {
-            (u.environment, u.setting.label(u.seed)): len(u.anomalies) for u in plan.units
+            (u.environment, u.setting.label(u.seed)): len(u.conditions) for u in plan.units
         }
         if self.verbosity < 0:
             return

@@ -109,44 +109,6 @@ class AnomalyInfo:
 Suite = Literal["table1", "ladder", "paper"]
 
 
-def split_condition(condition: str) -> tuple[str, str]:
-    """Return the anomaly and the strength of a condition; the strength may be empty.
-
-    Parameters
-    ----------
-    condition
-        Such as ``"iid@kept99"``.
-
-    Returns
-    -------
-    tuple of str
-        Anomaly and strength.
-
-    Examples
-    --------
-    >>> split_condition("iid@kept99"), split_condition("iid")
-    (('iid', 'kept99'), ('iid', ''))
-    """
-    anomaly, _, strength = condition.partition("@")
-    return anomaly, strength
-
-
-def join_condition(anomaly: str, strength: str) -> str:
-    """Return the text of an anomaly and its strength, where it has one.
-
-    Parameters
-    ----------
-    anomaly, strength
-        Names; an empty strength is none.
-
-    Returns
-    -------
-    str
-        Such as ``"iid@kept99"``, or the anomaly alone.
-    """
-    return f"{anomaly}@{strength}" if strength else anomaly
-
-
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
     """The recipe of a split: trajectories of each part, longest episode, seeds.
@@ -187,8 +149,8 @@ class SplitDefinition:
     @property
     def recipe(self) -> dict[str, Any]:
         """All fields that were given: a manifest's ``definition``."""
-        every = {own.name: getattr(self, own.name) for own in fields(self)}
-        return {n: v for n, v in every.items() if n not in _LATER or v != _LATER[n]}
+        recipe = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {n: value for n, value in recipe.items() if n not in _LATER or value != _LATER[n]}
 
 
 _LATER: Final[dict[str, Any]] = {
@@ -262,8 +224,7 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     Parameters
     ----------
     names, known
-        Environments, anomalies or conditions. A condition that is not known, such as
-        ``"iid@0.5"``, has the place of its anomaly.
+        Environments or anomalies.
 
     Returns
     -------
@@ -275,11 +236,8 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
     ['cartpole', 'hopper', 'mine']
     """
-    place = {name: i for i, name in enumerate(known)}
-    last = len(place)
-    return sorted(
-        dict.fromkeys(names), key=lambda n: place.get(n, place.get(n.partition("@")[0], last))
-    )
+    position = {name: i for i, name in enumerate(known)}
+    return sorted(dict.fromkeys(names), key=lambda name: position.get(name, len(position)))
 
 
 def title_of(environment: str) -> str:

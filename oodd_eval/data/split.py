@@ -10,17 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order, split_condition
+from oodd_eval.data.condition import Condition, in_suite_order
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import (
-    CONDITIONS,
-    NAMES,
-    TRAIN,
-    TWINS,
-    EnvironmentData,
-    TwinCheck,
-    anomalies_in,
-)
+from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, TwinCheck, conditions_in
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
@@ -136,8 +129,8 @@ class Split:
         """Names of the environments: the benchmark's in its order, then others in theirs."""
         return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
-    def conditions(self, environment: str) -> tuple[str, ...]:
-        """Return the anomalies of an environment, each with its strength if it has several.
+    def conditions(self, environment: str) -> tuple[Condition, ...]:
+        """Return the conditions of an environment: anomalies, each at its strengths.
 
         Parameters
         ----------
@@ -149,7 +142,26 @@ class Split:
         tuple of str
             Such as ``"iid"`` or ``"iid@kept99"``, in the benchmark's order.
         """
-        return anomalies_in(self.manifest["environments"][environment]["groups"])
+        return conditions_in(self.manifest["environments"][environment]["groups"])
+
+    def strengths(self, environment: str) -> dict[Condition, float]:
+        """Return the strengths of an environment's conditions as numbers, as far as it has any.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+
+        Returns
+        -------
+        dict
+            Numbers by condition, in the unit of the kind of anomaly; empty for a split with the
+            values of the paper's Table 1.
+        """
+        entry, definition = self.manifest["environments"][environment], self.manifest["definition"]
+        numbers = entry.get("strengths") or definition.get("strengths") or {}
+        conditions = {str(condition): condition for condition in self.conditions(environment)}
+        return {conditions[name]: float(n) for name, n in numbers.items() if name in conditions}
 
     @property
     def anomalies(self) -> tuple[str, ...]:
@@ -191,9 +203,8 @@ class Split:
         return chosen, select("anomaly", anomalies, known)
 
     def _names(self, *environments: str) -> tuple[str, ...]:
-        every = in_order((c for e in environments for c in self.conditions(e)), CONDITIONS)
-        kinds = (split_condition(condition)[0] for condition in every)
-        return tuple(dict.fromkeys((*kinds, *every)))
+        conditions = in_suite_order(c for e in environments for c in self.conditions(e))
+        return tuple(dict.fromkeys((*(c.anomaly for c in conditions), *map(str, conditions))))
 
     def train_digest(self, environment: str) -> str:
         """Return the digest of an environment's training part: what a fit depends on.

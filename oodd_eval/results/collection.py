@@ -21,11 +21,11 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.episode import ScoredEpisode
 from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import FOUND, Point, curve, threshold_rows
 from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
+from oodd_eval.results.strengths import FOUND, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -204,8 +204,8 @@ class Results(Sequence[Record]):
         check_known("environment of these results", {r.environment for r in records}, environment)
         records = [r for r in records if r.environment == environment]
         kind = f"anomaly of these results in {environment}"
-        check_known(kind, {r.condition for r in records}, anomaly)
-        by_seed = {r.seed: r for r in records if r.condition == anomaly}
+        check_known(kind, {str(r.condition) for r in records}, anomaly)
+        by_seed = {r.seed: r for r in records if str(r.condition) == anomaly}
         seed = min(by_seed) if seed is None else seed
         if seed not in by_seed:
             raise UsageError(f"no detector seed {seed}: expected one of {sorted(by_seed)}")
@@ -332,7 +332,7 @@ class Results(Sequence[Record]):
                 anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
-                pairs = zip(file.parts[f"test/{record.condition}"], file.parts[TWINS], strict=True)
+                pairs = zip(file.parts[record.condition.part], file.parts[TWINS], strict=True)
                 yield [
                     ScoredEpisode(
                         record.cell,

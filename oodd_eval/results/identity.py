@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.errors import UsageError
 
 # A text value that needs quotes: it would be read as JSON, or holds what separates values.
@@ -97,18 +98,18 @@ class Cell:
 
     Parameters
     ----------
-    split, environment, anomaly
+    split, environment
         Names. A split that is not the published one carries the start of its digest: ``mini@0a1b``.
+    condition
+        The anomaly at its strength.
     setting
         The detector.
     seed
         Seed of the detector.
-    strength
-        Strength of the anomaly where the suite has several, else empty.
 
     Examples
     --------
-    >>> cell = Cell("mini", "hopper", "iid", Setting("riqn"), seed=0)
+    >>> cell = Cell("mini", "hopper", Condition("iid"), Setting("riqn"), seed=0)
     >>> str(cell)
     'mini/hopper/iid::riqn[h=1,seed=0]'
     >>> Cell.parse(str(cell)) == cell
@@ -117,16 +118,13 @@ class Cell:
 
     split: str
     environment: str
-    anomaly: str
+    condition: Condition
     setting: Setting
     seed: int = 0
-    strength: str = ""
 
     def __str__(self) -> str:
         """Return the text that is printed and that ``-k`` matches."""
-        strength = f"@{self.strength}" if self.strength else ""
-        place = f"{self.split}/{self.environment}/{self.anomaly}{strength}"
-        return f"{place}::{self.label}"
+        return f"{self.split}/{self.environment}/{self.condition}::{self.label}"
 
     @property
     def label(self) -> str:
@@ -136,16 +134,16 @@ class Cell:
     @classmethod
     def parse(cls, text: str) -> "Cell":
         """Read what `str` writes; a text of another form raises `UsageError`."""
-        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+)(?:@([^/:]+))?::([^\[]+)\[(.*)\]", text)
-        settings = _read_settings(match[6]) if match else None
+        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+(?:@[^/:]+)?)::([^\[]+)\[(.*)\]", text)
+        settings = _read_settings(match[5]) if match else None
         if match is None or settings is None or not {"h", "seed"} <= settings.keys():
             raise UsageError(
                 f"{text!r} is no cell: expected SPLIT/ENVIRONMENT/ANOMALY::DETECTOR[h=N,seed=N]"
             )
-        split, environment, anomaly, strength, detector, _ = match.groups()
+        split, environment, condition, detector, _ = match.groups()
         horizon, seed = settings.pop("h"), settings.pop("seed")
         setting = Setting.of(detector, horizon, settings)
-        return cls(split, environment, anomaly, setting, seed, strength or "")
+        return cls(split, environment, Condition.parse(condition), setting, seed)
 
 
 def _bracketed(detector: str, settings: Mapping[str, Any]) -> str:

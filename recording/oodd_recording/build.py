@@ -25,13 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import (
-    ENVIRONMENTS,
-    PART_OFFSETS,
-    SplitDefinition,
-    in_order,
-    split_condition,
-)
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
 from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
@@ -84,7 +79,7 @@ class Chunk:
     count: int
     episode_cap: int | None
     noise: float
-    conditions: tuple[tuple[str, float | None], ...]
+    conditions: tuple[tuple[Condition, float | None], ...]
     policy_digest: str
     policy: str
 
@@ -149,7 +144,7 @@ def _write(
     environment, policy = chunks[-1].environment, chunks[-1].policy_digest
     conditions = [condition for condition, _ in chunks[-1].conditions]
     info = info_of(environment)
-    kinds = {c: anomaly_info(split_condition(c)[0]).group for c in conditions}
+    kinds = {c.anomaly: anomaly_info(c.anomaly).group for c in conditions}
     files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
     with contextlib.ExitStack() as stack:
         taken: dict[str, layout.Arrays] = {}
@@ -162,7 +157,7 @@ def _write(
         }
         groups = (
             (part, taken.get(part) or _joined(part, files[part.split("/")[0]], held))
-            for part in (TRAIN, CALIBRATION, TWINS, *(f"test/{c}" for c in conditions))
+            for part in (TRAIN, CALIBRATION, TWINS, *(c.part for c in conditions))
         )
         return layout.write_environment(
             directory / f"{environment}.h5",
@@ -194,8 +189,8 @@ def _check_strengths(definition: SplitDefinition, environment: str) -> None:
             f"no strengths of anomalies are given for {environment!r}, an environment of one's own:"
             f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}"
         )
-    for condition, strength in definition.strengths.items():
-        kind = split_condition(condition)[0]
+    for condition, strength in _numbers(definition).items():
+        kind = condition.anomaly
         check_known(f"anomaly that {environment} can have", kinds_of(environment), kind)
         if not 0 <= strength <= bound_of(environment, kind):
             most, unit = bound_of(environment, kind), unit_of(environment, kind)
@@ -209,7 +204,7 @@ def _acting(definition: SplitDefinition, environment: str, path: str) -> str:
     """Return the digest of what acts in an environment: policy, and code of one's own."""
     policy = load_policy(environment, path or None)
     measure(environment, policy)
-    kinds = [split_condition(condition)[0] for condition in definition.strengths]
+    kinds = [condition.anomaly for condition in _numbers(definition)]
     code = code_digest(environment, kinds)
     return hashlib.sha256(f"{policy.digest} {code}".encode()).hexdigest() if code else policy.digest
 
@@ -236,11 +231,17 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     return kept
 
 
+def _numbers(definition: SplitDefinition) -> dict[Condition, float]:
+    """Return the strengths that a definition has of its own, by condition."""
+    return {Condition.parse(name): number for name, number in definition.strengths.items()}
+
+
 def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
     """Return the strength of each condition of a suite, as an entry of the manifest."""
     if definition.suite == "table1":
         return {}
-    return {"strengths": conditions_of(definition.suite, environment, definition.episode_cap)}
+    numbers = conditions_of(definition.suite, environment, definition.episode_cap)
+    return {"strengths": {str(condition): number for condition, number in numbers.items()}}
 
 
 def _base(
@@ -259,7 +260,7 @@ def _base(
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
     suite, cap = definition.suite, definition.episode_cap
-    conditions = tuple((definition.strengths or conditions_of(suite, environment, cap)).items())
+    conditions = tuple((_numbers(definition) or conditions_of(suite, environment, cap)).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
         own = conditions if part == "test" else ()
@@ -346,7 +347,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
     policy = load_policy(chunk.environment, chunk.policy or None)
     conditions = dict(chunk.conditions)
     environment, cap = chunk.environment, chunk.episode_cap
-    recorded: list[dict[str | None, Episode]] = []
+    recorded: list[dict[Condition | None, Episode]] = []
     for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
@@ -355,9 +356,10 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
             )
             recorded.append(found)
     arrays: dict[str, NDArray[Any]] = {}
-    for kind in [None, *conditions] if recorded else []:
-        group = chunk.part if chunk.part != "test" else f"test/{kind or 'nominal'}"
-        for name, array in _stack([r[kind] for r in recorded]).items():
+    for condition in [None, *conditions] if recorded else []:
+        nominal = TWINS if chunk.part == "test" else chunk.part
+        group = condition.part if condition else nominal
+        for name, array in _stack([episodes[condition] for episodes in recorded]).items():
             arrays[f"{group}:{name}"] = array
     with replacing(work / chunk.file_name) as partial, partial.open("wb") as out:
         np.savez(out, allow_pickle=False, **arrays)

@@ -21,9 +21,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.condition import FRACTIONS, LEVELS, PAPER
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
-from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
+from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
 from oodd_recording.policies import load_policy
@@ -75,7 +76,7 @@ def measure(
     """Return the returns of the seeds under an anomaly of a strength."""
     setup = setup_of(environment, whole=whole)
     episodes = (
-        record_anomalous(setup, f"{kind}@{strength}", strength, twin, redraws=0)
+        record_anomalous(setup, kind, strength, twin, redraws=0)
         for twin in twins_of(environment, first, count, whole=whole)
     )
     return [return_of(episode) for episode in episodes]

@@ -25,14 +25,8 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.terminal import make_console, register_custom
-from oodd_eval.data.facts import (
-    ANOMALIES,
-    ENVIRONMENTS,
-    OWN_SEED_BASES,
-    SPLITS,
-    SplitDefinition,
-    join_condition,
-)
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
 from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
@@ -60,7 +54,7 @@ def _strengths(text: str) -> list[tuple[str, float]]:
         raise UsageError(f"{text!r}, expected ANOMALY=NUMBER,...") from None
     if len(strengths) == 1:
         return [(kind, strengths[0])]
-    return [(join_condition(kind, f"{strength:g}"), strength) for strength in strengths]
+    return [(str(Condition(kind, f"{strength:g}")), strength) for strength in strengths]
 
 
 @command(

@@ -40,7 +40,7 @@ def draw_pictures(
     twin = next(t for t in twins if t.trajectory.transitions >= SHORTEST_TWIN)
     yield f"{environment}.png", png(frame(environment, twin))
     for kind, (rung, strength) in rungs.items():
-        episode = record_anomalous(setup, f"{kind}@{rung}", strength, twin)
+        episode = record_anomalous(setup, kind, strength, twin)
         title = f"{kind} at {rung} ({strength:g})"
         yield f"{environment}/{kind}.svg", plot(environment, title, episode, twin).encode()
 

@@ -23,9 +23,9 @@ from oodd_eval.metrics.catalogue import GUARANTEED, HEADLINE, LEVELS, METRICS, R
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
-from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.standings import Standing
+from oodd_eval.results.strengths import FOUND, curve
 
 _COMPARED: Final = (
     "false_episodes",

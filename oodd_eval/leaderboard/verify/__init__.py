@@ -260,7 +260,7 @@ def check_copies(name: str, records: Records, seen: _Numbers, findings: Findings
         told = tuple(round(term, 3) for term in terms[0].tolist())
         if len(set(told)) > 1:
             cells[row] += 1
-            place = record.split_digest, record.environment, record.condition, told
+            place = record.split_digest, *record.place, told
             entry, other = seen.setdefault(place, (name, row))
             copied[row, entry, other] += entry != name
     for (row, entry, other), count in copied.items():

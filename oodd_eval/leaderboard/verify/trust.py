@@ -152,7 +152,7 @@ def compare_rerun(
 
 
 def _place(record: Record) -> _Place:
-    return record.setting, record.environment, record.condition
+    return record.setting, *record.place
 
 
 def _usable(
