@@ -1,12 +1,14 @@
 """A plug-in with environments and kinds of anomalies of its own, which needs no simulator."""
 
-from oodd_eval.data import own
+from oodd_eval.data import registry
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 
 
 def forget_own():
     """Forget environments and anomalies that were registered: another test has others."""
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
+    for known in (registry._environments, registry._anomalies, registry._infos, registry.MEASURED):
+        for name in [n for n in known if n not in {*ENVIRONMENTS, *ANOMALIES}]:
+            del known[name]
 
 
 TANK = '''

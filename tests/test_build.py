@@ -13,8 +13,9 @@ import pytest
 
 pytest.importorskip("gymnasium")
 from oodd_recording import build
+from oodd_recording.benchmark import FROZEN
 from oodd_recording.build import Chunk, build_split
-from oodd_recording.policies import FROZEN, load_policy
+from oodd_recording.policies import load_policy
 from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 

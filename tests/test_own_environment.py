@@ -11,7 +11,7 @@ from helpers_plugins import install
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
-from oodd_eval.data import own
+from oodd_eval.data import registry
 
 SIZES = ["--train", "6", "--calibration", "6", "--test", "3", "--seed-base", "77"]
 
@@ -116,9 +116,9 @@ def test_what_cannot_be_recorded_is_said(tank, capsys, options, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"tank", Tank', '"hopper", Tank', "'hopper' cannot be the name of an environment"),
+        ('"tank", Tank', '"hopper", Tank', "'hopper' cannot be the name of a custom"),
         ('"tank", Tank', '"tank", lambda: Tank()', "at the top level of a module"),
-        ('"leak", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of an anomaly"),
+        ('"leak", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of a custom"),
         ("return [AnomalySpec(", "return (AnomalySpec(", "expected a list of oodd_eval.Anomaly"),
         ('EnvironmentSpec("valve"', 'EnvironmentSpec("leak"', "'leak' is offered twice"),
     ],
@@ -137,8 +137,8 @@ def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
     digests = set()
     for name in ("CartPole-v1", "Acrobot-v1"):
         make = functools.partial(gymnasium.make, name)
-        own.register([own.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
-        digests.add(own.code_digest("one", []))
+        registry.register([registry.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
+        digests.add(registry.code_digest("one", []))
     assert len(digests) == 2
 
 

@@ -6,7 +6,8 @@ import sys
 import numpy as np
 import oodd_recording.train
 import pytest
-from oodd_recording.policies import FROZEN, load_policy
+from oodd_recording.benchmark import FROZEN
+from oodd_recording.policies import load_policy
 
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
 from oodd_eval.errors import MissingExtraError, PolicyError, UnknownNameError

@@ -10,7 +10,7 @@ from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.ladder import rungs_of
-from oodd_eval.data.own import AnomalySpec, OwnSpec
+from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -29,7 +29,7 @@ def info(options: Options) -> int:
         lines = _anomaly(ANOMALIES[name])
     else:
         plugins = discovered(options)
-        custom = plugins.own_specs
+        custom = plugins.custom_specs
         try:
             lines = _custom(*custom[name]) if name in custom else _detector(plugins.offer(name))
         except UnknownNameError:
@@ -51,7 +51,7 @@ def _environment(info: EnvironmentInfo) -> Lines:
         yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
 
 
-def _custom(spec: OwnSpec, origin: str) -> Lines:
+def _custom(spec: Spec, origin: str) -> Lines:
     if isinstance(spec, AnomalySpec):
         yield "anomaly", f"{spec.name}, {origin}"
         yield "group", spec.group

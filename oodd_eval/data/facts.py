@@ -39,71 +39,55 @@ class Quantity:
 class EnvironmentInfo:
     """One environment.
 
-    Parameters
-    ----------
-    id
-        Its name here.
-    title
-        Its title in the paper.
-    simulator
-        Its name in Gymnasium.
-    family
-        Kind of simulator; actions are discrete in ``"classic"``.
-    observation_dim
-        Number of sensors.
-    action_dim
-        Width of an action row; of discrete actions, whose rows are one-hot, their number.
-    policy
-        Algorithm of the nominal policy.
-    paper_return
-        Mean return of that policy in the paper's Table 2.
-    episode_cap
-        Transitions of the longest episode.
-    sensors, actions
-        Names and units of the columns of observations and of action rows.
-    numbers
-        True when actions are discrete in another family.
+    `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A `discrete` action is a
+    one-hot row. `sensors` and `actions` are names and units of the columns of observations and of
+    action rows. `episode_cap` is the longest episode in transitions, `paper_return` the mean return
+    of the paper's policy in its Table 2.
     """
 
     id: str
     title: str
     simulator: str
-    family: Literal["classic", "bullet", "own"]
-    observation_dim: int
-    action_dim: int
-    policy: Literal["IQN", "TD3"]
-    paper_return: float
-    episode_cap: int
+    family: Literal["classic", "bullet", "custom"]
+    discrete: bool
     sensors: tuple[Quantity, ...]
     actions: tuple[Quantity, ...]
-    numbers: bool = False
+    episode_cap: int
+    paper_return: float = float("nan")
 
     @property
-    def discrete(self) -> bool:
-        """True when actions are discrete."""
-        return self.family == "classic" or self.numbers
+    def observation_dim(self) -> int:
+        """Number of sensors."""
+        return len(self.sensors)
+
+    @property
+    def action_dim(self) -> int:
+        """Width of an action row: the number of actions where they are discrete."""
+        return len(self.actions)
+
+    @property
+    def policy(self) -> Literal["IQN", "TD3"]:
+        """The algorithm of the nominal policy."""
+        return "IQN" if self.discrete else "TD3"
 
 
 @dataclass(frozen=True, slots=True)
 class AnomalyInfo:
-    """One kind of anomaly.
+    """One kind of anomaly: its name, the paper's name, its group and what it changes.
 
-    Parameters
-    ----------
-    id
-        Its name here.
-    title
-        Its name in the paper.
-    group
-        Whether it changes sensors or dynamics.
-    summary
-        What it changes, in one sentence.
+    The other fields say how it is recorded, see `oodd_eval.data.registry.AnomalySpec`.
     """
 
     id: str
     title: str
     group: Group
     summary: str
+    unit: str
+    bound: float
+    units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+    needs_discrete: tuple[str, ...] = ()
+    environments: tuple[str, ...] = ()
 
 
 Suite = Literal["table1", "ladder", "paper"]
@@ -162,17 +146,16 @@ _LATER: Final[dict[str, Any]] = {
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
-_COLUMNS: Final = json.loads(Path(__file__).with_name("quantities.json").read_text("utf-8"))
 
-
-def _quantities(environment: str) -> Any:
-    """Return what sensors and actions are, by these names."""
-    kinds = _COLUMNS[environment].items()
-    return {kind: tuple(Quantity(*row) for row in rows) for kind, rows in kinds}
+def _environment(row: Mapping[str, Any]) -> EnvironmentInfo:
+    columns = {
+        name: tuple(Quantity(*column) for column in row[name]) for name in ("sensors", "actions")
+    }
+    return EnvironmentInfo(**{**row, **columns})
 
 
 ENVIRONMENTS: Final = MappingProxyType(
-    {e["id"]: EnvironmentInfo(**e, **_quantities(e["id"])) for e in _TABLES["environment"]}
+    {row["id"]: _environment(row) for row in _TABLES["environment"]}
 )
 """Environments by id, in the order of the paper's tables."""
 
@@ -202,8 +185,8 @@ _SPLITS: Final = (
 SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 """The published splits by name."""
 
-OWN_SEED_BASES: Final = range(10, 900)
-"""Seed bases for splits of one's own: published splits have those below, policies those above."""
+CUSTOM_SEED_BASES: Final = range(10, 900)
+"""Seed bases of custom splits: published splits have those below, policies those above."""
 
 NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
 """Names of environments and anomalies: they become names of files and groups."""
@@ -241,7 +224,7 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def title_of(environment: str) -> str:
-    """Return the paper's title of an environment; of one's own, its name.
+    """Return the paper's title of an environment; of any other, its name.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from typing import ClassVar, Final, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
+from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import ENTRY, SubmittedEntry
@@ -71,7 +71,7 @@ def draw(
     found = read_order(directory)
     if found is None:
         taken = {definition.seed_base for definition in SPLITS.values()}
-        base = secrets.choice([n for n in OWN_SEED_BASES if n not in taken])
+        base = secrets.choice([n for n in CUSTOM_SEED_BASES if n not in taken])
         day = datetime.now(UTC).date().isoformat()
         found = RerunOrder(digest, base, day, list(environments), sandbox)
     if found.entry != digest:

@@ -30,19 +30,18 @@ from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in
 from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
-from oodd_eval.data.own import (
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
+from oodd_eval.data.registry import (
     MEASURED,
-    AnomalySpec,
-    EnvironmentSpec,
     Measured,
-    anomaly_info,
+    Spec,
+    anomaly_spec,
     code_digest,
     info_of,
     kinds_of,
     register,
     registered,
 )
-from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
@@ -144,7 +143,7 @@ def _write(
     environment, policy = chunks[-1].environment, chunks[-1].policy_digest
     conditions = [condition for condition, _ in chunks[-1].conditions]
     info = info_of(environment)
-    kinds = {c.anomaly: anomaly_info(c.anomaly).group for c in conditions}
+    kinds = {c.anomaly: anomaly_spec(c.anomaly).group for c in conditions}
     files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
     with contextlib.ExitStack() as stack:
         taken: dict[str, layout.Arrays] = {}
@@ -324,9 +323,7 @@ def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
         yield pool
 
 
-def _begin(
-    specs: Sequence[EnvironmentSpec | AnomalySpec], measured: Mapping[str, Measured]
-) -> None:
+def _begin(specs: Sequence[Spec], measured: Mapping[str, Measured]) -> None:
     """Make known what the build knows, and end this worker when the build is killed.
 
     It would wait for work forever.

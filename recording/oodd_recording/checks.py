@@ -1,4 +1,4 @@
-"""Checks of environments and anomalies of one's own, before days of recording rest on them."""
+"""Checks of custom environments and anomalies, before days of recording rest on them."""
 
 import functools
 import itertools
@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, info_of
+from oodd_eval.data.registry import AnomalySpec, Spec, info_of
 from oodd_eval.errors import OoddError, SimulationError
 from oodd_recording.policies import Policy, load_policy
 from oodd_recording.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
@@ -153,9 +153,7 @@ _ENVIRONMENT: Final = (check_columns, check_seed, check_policy)
 _ANOMALY: Final = (check_zero_strength, check_onset, check_draws, check_strength)
 
 
-def check_own(
-    spec: EnvironmentSpec | AnomalySpec, environment: str
-) -> Iterator[tuple[str, Callable[[], str]]]:
+def custom_checks(spec: Spec, environment: str) -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of each check, and what carries it out: it returns what is wrong, or nothing.
 
     `environment` is the one in which an anomaly is tried.

@@ -26,15 +26,15 @@ from oodd_eval.cli import (
 from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.terminal import make_console, register_custom
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, OWN_SEED_BASES, SPLITS, SplitDefinition
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
+from oodd_eval.data.facts import ANOMALIES, CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, select
 from oodd_eval.plugins.conformance import Report, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
-from oodd_recording.checks import check_own
+from oodd_recording.checks import custom_checks
 from oodd_recording.page import NAME as OVERVIEW
 from oodd_recording.page import write_pages
 from oodd_recording.policies import load_policy
@@ -169,10 +169,10 @@ def _definition(options: Options) -> SplitDefinition:
         known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
         raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
     train, calibration, test, seed_base = sizes.values()
-    if seed_base not in OWN_SEED_BASES:
+    if seed_base not in CUSTOM_SEED_BASES:
         raise UsageError(
-            f"--seed-base is {seed_base}, expected {OWN_SEED_BASES.start} to "
-            f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
+            f"--seed-base is {seed_base}, expected {CUSTOM_SEED_BASES.start} to "
+            f"{CUSTOM_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
     return SplitDefinition(
         name,
@@ -289,7 +289,7 @@ def check_custom(options: Options, selects: Predicate) -> int:
         environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
-    for name, check in check_own(spec, environment):
+    for name, check in custom_checks(spec, environment):
         if selects(name):
             start = time.perf_counter()
             problem = check()

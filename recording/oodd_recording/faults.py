@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.own import anomaly_spec, info_of
+from oodd_eval.data.registry import anomaly_spec, info_of
 from oodd_recording.environments import Row, Simulator
 from oodd_recording.values import VALUES, choose_sensors, spread_of
 
@@ -134,15 +134,13 @@ class Dynamics(Fault):
         return self._act(action, simulator)
 
 
-def make_fault(
-    environment: str, kind: str, strength: float, simulator: Simulator, rng: np.random.Generator
-) -> Fault:
+def make_fault(kind: str, strength: float, simulator: Simulator, rng: np.random.Generator) -> Fault:
     """Draw a fault of one kind for one episode.
 
     Parameters
     ----------
-    environment, kind
-        Names of the benchmark, or of one's own.
+    kind
+        Name of a registered kind of anomaly.
     strength
         From 0, which changes nothing, to the kind's bound.
     simulator
@@ -150,15 +148,9 @@ def make_fault(
     rng
         Generator of this episode's draws.
     """
-    base, intermittent = kind.removesuffix("-intermittent"), kind.endswith("-intermittent")
-    if base == "wind" and intermittent:
-        base = "wind-l2r"
-    if spec := anomaly_spec(kind):
-        fault: Fault = spec.make(float(strength), rng, simulator)
-    else:
-        fault = _MAKERS[base](environment, float(strength), simulator, rng)
+    fault: Fault = anomaly_spec(kind).make(float(strength), rng, simulator)
     fault.parameters["strength"] = float(strength)
-    return Intermittent(fault) if intermittent else fault
+    return fault
 
 
 _Maker = Callable[[str, float, Simulator, np.random.Generator], Fault]
@@ -391,7 +383,14 @@ def _replaced(action: Row, j: int, value: float) -> Row:
     return changed
 
 
-_MAKERS: Final[dict[str, _Maker]] = {
+def _intermittent(maker: _Maker) -> _Maker:
+    def make(environment: str, strength: float, simulator: Simulator, rng: Any) -> Fault:
+        return Intermittent(maker(environment, strength, simulator, rng))
+
+    return make
+
+
+MAKERS: Final[dict[str, _Maker]] = {
     "iid": _noise,
     "calibration": _calibration,
     "drift": _drift,
@@ -411,4 +410,10 @@ _MAKERS: Final[dict[str, _Maker]] = {
     "action-noise": _action_noise,
     "mass": _mass,
     "friction": _friction,
+    "iid-intermittent": _intermittent(_noise),
+    "calibration-intermittent": _intermittent(_calibration),
+    "shutdown-intermittent": _intermittent(_shutdown),
+    "wind-intermittent": _intermittent(_wind(1)),
+    "gain-intermittent": _intermittent(_gain),
 }
+"""Makers of the benchmark's faults by kind."""

@@ -14,7 +14,7 @@ from oodd_eval.data.condition import FRACTIONS, PAPER
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import write_bytes, write_text
 from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE, Rung, all_rungs_of, read_ladder, rungs_of
-from oodd_recording.policies import FROZEN
+from oodd_recording.benchmark import FROZEN
 from oodd_recording.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
 
 NAME: Final = "environments"

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import POLICY, read_npz
 from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
-from oodd_eval.data.own import code_digest, environment_spec, info_of
+from oodd_eval.data.registry import code_digest, environment_spec, info_of
 from oodd_eval.errors import PolicyError
 
-FROZEN: Final = Path(__file__).with_name("frozen")
 ACTION_GRID: Final = 2.0**16
 LAYERS: Final = {
     "TD3": ("W1", "b1", "W2", "b2", "W3", "b3"),
@@ -75,8 +74,8 @@ class IQNPolicy:
         return int(np.argmax(np.round(self.values(row) * ACTION_GRID)))
 
 
-class OwnPolicy:
-    """A function of the row, as the spec of an environment of one's own names it."""
+class CustomPolicy:
+    """A function of the row, as the spec of a custom environment names it."""
 
     def __init__(self, environment: str, act: Callable[[Any], Any]) -> None:
         self.digest = code_digest(environment, ())
@@ -88,7 +87,7 @@ class OwnPolicy:
         return int(action) if self._discrete else np.asarray(action, np.float32).ravel()
 
 
-Policy = TD3Policy | IQNPolicy | OwnPolicy  # deterministic controllers
+Policy = TD3Policy | IQNPolicy | CustomPolicy  # deterministic controllers
 
 
 def policy_digest(arrays: Arrays) -> str:
@@ -99,11 +98,9 @@ def policy_digest(arrays: Arrays) -> str:
 def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     """Load the frozen policy of an environment, or another file; `PolicyError` if it is none."""
     spec, info = environment_spec(environment), info_of(environment)
-    if spec and path is None:
-        if callable(spec.policy):
-            return OwnPolicy(environment, spec.policy())
-        path = spec.policy
-    file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
+    if path is None and callable(spec.policy):
+        return CustomPolicy(environment, spec.policy())
+    file = Path(path or str(spec.policy))
     if not file.exists():
         raise PolicyError(
             f"{file.name} does not exist: train it, `oodd-eval policies train {environment}`"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import FIRST_ONSET
-from oodd_eval.data.own import MEASURED, Measured, environment_spec, info_of, kinds_of
+from oodd_eval.data.registry import MEASURED, Measured, info_of, kinds_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
@@ -160,12 +160,12 @@ def evaluate_policy(
 
 
 def measure(environment: str, policy: Policy) -> None:
-    """Measure the sensors of an environment of one's own, once, in ten nominal episodes.
+    """Measure the sensors of a custom environment, once, in ten nominal episodes.
 
     Sensors that may break vary as the benchmark's do: they differ from their median in at least 1 %
     of the rows, and have more than 8 distinct values.
     """
-    if environment_spec(environment) is None or environment in MEASURED:
+    if environment in MEASURED:
         return
     setup = Setup(environment, policy)
     episodes = [setup.record(EVALUATION_SEED + i).trajectory for i in range(MEASURED_EPISODES)]
@@ -201,7 +201,7 @@ def record_anomalous(
     environment = setup.environment
     maker: _Maker = functools.partial(draw, environment, kind)
     if strength is not None:
-        maker = functools.partial(make_fault, environment, kind, strength)
+        maker = functools.partial(make_fault, kind, strength)
     commands = list(twin.trajectory.actions)
     if info_of(environment).discrete:
         commands = [int(row.argmax()) for row in commands]

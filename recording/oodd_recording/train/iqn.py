@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oodd_eval.data.own import info_of
+from oodd_eval.data.registry import info_of
 from oodd_recording.environments import make
 from oodd_recording.train.replay import Replay
 

@@ -1,7 +1,9 @@
-"""Environments and anomalies of one's own: what plug-ins declare, and which are known here.
+"""The registry of environments and kinds of anomalies that episodes can be recorded with.
 
-Nothing is simulated here, so that listing them stays quick. Recording takes place in processes of
-their own, which import what a spec names again: its functions stand at the top level of a module.
+Plug-ins offer them as specs through the hooks ``oodd_environments`` and ``oodd_anomalies``; the
+benchmark's are those of the plug-in `oodd_recording.benchmark`. Nothing is simulated here, so that
+listing them stays quick. Recording takes place in processes of their own, which import what a spec
+names again: its functions stand at the top level of a module.
 """
 
 from __future__ import annotations
@@ -20,13 +22,16 @@ from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
     NAME_PATTERN,
-    AnomalyInfo,
     EnvironmentInfo,
     Group,
     Quantity,
+    in_order,
 )
 from oodd_eval.errors import PluginError, UsageError
 from oodd_eval.names import check_known
+
+BENCHMARK: Final = "oodd_recording"
+"""The package of the benchmark's own specs, whose code the generator's version stands for."""
 
 
 class Attribute(NamedTuple):
@@ -97,6 +102,12 @@ class AnomalySpec:
         depend on the strength. ``simulator.env`` is the environment.
     environments
         Names of the environments that it can be recorded in; empty for any.
+    units
+        Unit and bound where they differ: by the name of an environment, or for ``"discrete"`` or
+        ``"continuous"`` actions.
+    needs, needs_discrete
+        Attributes that an environment must have, see `EnvironmentSpec`; the latter where its
+        actions are discrete.
     """
 
     name: str
@@ -106,9 +117,20 @@ class AnomalySpec:
     bound: float
     make: Callable[..., Any]
     environments: tuple[str, ...] = ()
+    units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+    needs_discrete: tuple[str, ...] = ()
+
+    def scale(self, environment: EnvironmentInfo) -> tuple[str, float]:
+        """Return unit and bound of the strength in an environment."""
+        family = "discrete" if environment.discrete else "continuous"
+        unit, bound = self.units.get(environment.id) or self.units.get(
+            family, (self.unit, self.bound)
+        )
+        return unit, bound
 
 
-OwnSpec = EnvironmentSpec | AnomalySpec
+Spec = EnvironmentSpec | AnomalySpec
 
 
 class Measured(NamedTuple):
@@ -118,39 +140,21 @@ class Measured(NamedTuple):
     sensors: tuple[int, ...]
 
 
-_SENSORS: Final = (
-    "iid",
-    "calibration",
-    "drift",
-    "shutdown",
-    "ar1",
-    "varma",
-    "delay",
-    "stuck",
-    "iid-intermittent",
-    "calibration-intermittent",
-    "shutdown-intermittent",
-)
-_COMMANDS: Final = ("stuck-joint", "latency", "action-noise")
-_ROWS: Final = ("gain", "bias", "wind-l2r", "wind-r2l", "wind-intermittent", "gain-intermittent")
-_NEEDS: Final = {"gravity": "gravity", "mass": "body_mass", "friction": "friction"}
-_NEEDS_DISCRETE: Final = {"gain": "gain", "gain-intermittent": "gain", "bias": "bias"}
-
 _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
-_infos: Final[dict[str, EnvironmentInfo]] = {}
+_infos: Final[dict[str, EnvironmentInfo]] = dict(ENVIRONMENTS)
 MEASURED: Final[dict[str, Measured]] = {}
-"""Spreads and sensors of environments of one's own, by name; recording measures them."""
+"""Spreads and sensors of environments by name; those of custom ones are measured at recording."""
 
 
-def check_spec(spec: EnvironmentSpec | AnomalySpec) -> None:
+def check_spec(spec: Spec) -> None:
     """Raise `PluginError` for a spec with a wrong or taken name, or functions of no module."""
     kind = "environment" if isinstance(spec, EnvironmentSpec) else "anomaly"
-    taken = ENVIRONMENTS if isinstance(spec, EnvironmentSpec) else ANOMALIES
-    if spec.name in taken or spec.name == "nominal" or not re.fullmatch(NAME_PATTERN, spec.name):
+    taken = {"nominal", *(ENVIRONMENTS if isinstance(spec, EnvironmentSpec) else ANOMALIES)}
+    if spec.name in taken or not re.fullmatch(NAME_PATTERN, spec.name):
         raise PluginError(
-            f"{spec.name!r} cannot be the name of an {kind} of one's own, expected lower-case "
-            "letters, digits and hyphens, and no name of the benchmark"
+            f"{spec.name!r} cannot be the name of a custom {kind}, expected lower-case letters, "
+            "digits and hyphens, and no name of the benchmark"
         )
     for function in _functions(spec):
         inner = _inner(function)
@@ -162,79 +166,73 @@ def check_spec(spec: EnvironmentSpec | AnomalySpec) -> None:
             )
 
 
-def register(specs: Iterable[EnvironmentSpec | AnomalySpec]) -> None:
-    """Make environments and anomalies known in this process; `PluginError` for a wrong spec."""
+def register(specs: Iterable[Spec]) -> None:
+    """Make environments and anomalies known in this process."""
     for spec in specs:
-        check_spec(spec)
-        if isinstance(spec, EnvironmentSpec):
-            _environments[spec.name] = spec
+        if isinstance(spec, AnomalySpec):
+            _anomalies[spec.name] = spec
+            continue
+        _environments[spec.name] = spec
+        if spec.name not in ENVIRONMENTS:
             _infos.pop(spec.name, None)
             MEASURED.pop(spec.name, None)
-        else:
-            _anomalies[spec.name] = spec
 
 
-def registered() -> list[EnvironmentSpec | AnomalySpec]:
+def registered() -> list[Spec]:
     """Return all specs that are known in this process."""
     return [*_environments.values(), *_anomalies.values()]
 
 
-def environment_spec(name: str) -> EnvironmentSpec | None:
-    """Return the spec of an environment of one's own; None for one of the benchmark."""
-    check_known("environment", [*ENVIRONMENTS, *_environments], name)
-    return _environments.get(name)
+def environment_spec(name: str) -> EnvironmentSpec:
+    """Return the spec of an environment; `UnknownNameError` without one."""
+    check_known("environment", _environments, name)
+    return _environments[name]
 
 
-def anomaly_spec(name: str) -> AnomalySpec | None:
-    """Return the spec of a kind of one's own; None for one of the benchmark."""
-    check_known("anomaly", [*ANOMALIES, *_anomalies], name)
-    return _anomalies.get(name)
+def anomaly_spec(name: str) -> AnomalySpec:
+    """Return the spec of a kind of anomaly; `UnknownNameError` without one."""
+    check_known("anomaly", _anomalies, name)
+    return _anomalies[name]
 
 
 def info_of(environment: str) -> EnvironmentInfo:
-    """Return the facts of an environment of the benchmark or of one's own.
+    """Return the facts of an environment.
 
-    The first call makes one's own environment once, to see its spaces. `UsageError` when they are
+    The first call makes a custom environment once, to see its spaces. `UsageError` when they are
     not as `EnvironmentSpec` says.
     """
-    spec = environment_spec(environment)
-    if spec is None:
-        return ENVIRONMENTS[environment]
     if environment not in _infos:
-        _infos[environment] = _seen(spec)
+        _infos[environment] = _inspected(environment_spec(environment))
     return _infos[environment]
-
-
-def anomaly_info(kind: str) -> AnomalyInfo:
-    """Return name, group and summary of a kind of the benchmark or of one's own."""
-    spec = anomaly_spec(kind)
-    return AnomalyInfo(kind, kind, spec.group, spec.summary) if spec else ANOMALIES[kind]
 
 
 def kinds_of(environment: str) -> list[str]:
     """Return the kinds of anomalies that can be recorded in an environment at any strength."""
-    own = [s.name for s in _anomalies.values() if environment in (s.environments or [environment])]
-    spec = environment_spec(environment)
-    if spec is None:
-        return [*ANOMALIES, *own]
-    found = [*_SENSORS, *_COMMANDS]
-    needs = _NEEDS | _NEEDS_DISCRETE if info_of(environment).discrete else _NEEDS
-    found += [] if info_of(environment).discrete else _ROWS
-    found += [kind for kind, attribute in needs.items() if attribute in spec.attributes]
-    return [*(kind for kind in ANOMALIES if kind in found), *own]
+    discrete, attributes = info_of(environment).discrete, environment_spec(environment).attributes
+    kinds = [
+        spec.name
+        for spec in _anomalies.values()
+        if environment in (spec.environments or [environment])
+        and {*spec.needs, *(spec.needs_discrete if discrete else ())} <= attributes.keys()
+    ]
+    return in_order(kinds, ANOMALIES)
 
 
 def code_digest(environment: str, kinds: Iterable[str]) -> str:
-    """Return the SHA-256 of the modules that specs of one's own name; empty for the benchmark's.
+    """Return the SHA-256 of the modules that custom specs name; empty without any.
 
     Arguments of a ``functools.partial`` count, too.
     """
-    specs = [environment_spec(environment), *map(anomaly_spec, kinds)]
-    named = [f for spec in specs if spec for f in _functions(spec)]
-    given = [repr((f.args, f.keywords)) for f in named if isinstance(f, functools.partial)]
-    files = sorted({_file(_inner(f)) for f in named})
+    specs: list[Spec] = [environment_spec(environment), *map(anomaly_spec, kinds)]
+    functions = [f for spec in specs for f in _functions(spec) if not _of_benchmark(f)]
+    arguments = [repr((f.args, f.keywords)) for f in functions if isinstance(f, functools.partial)]
+    files = sorted({_file(_inner(f)) for f in functions})
     digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
-    return hashlib.sha256(repr((digests, given)).encode()).hexdigest() if files else ""
+    return hashlib.sha256(repr((digests, arguments)).encode()).hexdigest() if files else ""
+
+
+def _of_benchmark(function: Callable[..., Any]) -> bool:
+    return getattr(_inner(function), "__module__", "").partition(".")[0] == BENCHMARK
 
 
 def _inner(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -250,40 +248,30 @@ def _file(function: Callable[..., Any]) -> str:
     return file if Path(file).is_file() else ""
 
 
-def _functions(spec: EnvironmentSpec | AnomalySpec) -> list[Callable[..., Any]]:
+def _functions(spec: Spec) -> list[Callable[..., Any]]:
     if isinstance(spec, AnomalySpec):
         return [spec.make]
-    named = [f for attribute in spec.attributes.values() for f in attribute]
-    return [spec.make, *([spec.policy] if callable(spec.policy) else []), *named]
+    accessors = [f for attribute in spec.attributes.values() for f in attribute]
+    return [spec.make, *([spec.policy] if callable(spec.policy) else []), *accessors]
 
 
-def _seen(spec: EnvironmentSpec) -> EnvironmentInfo:
+def _inspected(spec: EnvironmentSpec) -> EnvironmentInfo:
     """Look at the spaces of an environment."""
     env = spec.make()
-    seen, given = env.observation_space, env.action_space
+    rows, actions = env.observation_space, env.action_space
     env.close()
-    discrete = hasattr(given, "n") and hasattr(given, "start")
-    widths = (getattr(seen, "shape", None), (int(given.n),) if discrete else given.shape)
+    discrete = hasattr(actions, "n") and hasattr(actions, "start")
+    widths = (getattr(rows, "shape", None), (int(actions.n),) if discrete else actions.shape)
     expected = (len(spec.sensors),), (len(spec.actions),)
-    unit = discrete or (bool((given.low == -1).all()) and bool((given.high == 1).all()))
-    if widths != expected or not unit or (discrete and given.start != 0):
+    unit = discrete or (bool((actions.low == -1).all()) and bool((actions.high == 1).all()))
+    if widths != expected or not unit or (discrete and actions.start != 0):
         raise UsageError(
-            f"environment {spec.name!r} has observations {seen} and actions {given}, expected a "
+            f"environment {spec.name!r} has observations {rows} and actions {actions}, expected a "
             f"Box of shape {expected[0]} as it names {len(spec.sensors)} sensors, and Discrete("
             f"{len(spec.actions)}) or a Box of shape {expected[1]} from -1 to 1 as it names "
             f"{len(spec.actions)} actions"
         )
+    title, columns = spec.title or spec.name, (spec.sensors, spec.actions)
     return EnvironmentInfo(
-        spec.name,
-        spec.title or spec.name,
-        spec.name,
-        "own",
-        len(spec.sensors),
-        len(spec.actions),
-        "IQN" if discrete else "TD3",
-        float("nan"),
-        spec.episode_cap,
-        spec.sensors,
-        spec.actions,
-        discrete,
+        spec.name, title, spec.name, "custom", discrete, *columns, spec.episode_cap
     )
