@@ -12,6 +12,9 @@ from helpers_plugins import install
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data import registry
+from oodd_eval.data.condition import Condition
+from oodd_eval.errors import SplitError
+from oodd_eval.results.directory import ResultsDirectory
 
 SIZES = ["--train", "6", "--calibration", "6", "--test", "3", "--seed-base", "77"]
 
@@ -71,6 +74,31 @@ def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_b
         return np.mean([np.abs(x.observations - twin.observations).mean() for x, twin in rows])
 
     assert 0 < distance(weak) < distance(strong)
+
+
+def test_every_strength_has_a_number_in_split_and_records_and_a_column(tank, capsys):
+    assert build("one", "--env", "tank", "--strength", "leak=0.1,0.5,2,3") == 0
+    split, numbers = load_split("one"), (0.1, 0.5, 2, 3)
+    assert split.strengths("tank") == {Condition("leak", f"{n:g}"): n for n in numbers}
+    assert main(["data", "info", "one"]) == 0
+    assert "strengths of leak (share of the flow): 0.1, 0.5, 2, 3" in capsys.readouterr().out
+    out = str(tank / "results")
+    assert (
+        main(["run", "--detector", "mewma", "--split", "one", "--env", "all", "--output", out]) == 0
+    )
+    text = capsys.readouterr().out
+    columns = text.partition("Matched AUC (%) by strength")[2].splitlines()[1]
+    assert columns.split() == ["detector", "0.1", "0.5", "2", "3"]
+    assert "Anomalies have several strengths" in text
+    assert [r.magnitude for r in ResultsDirectory(tank / "results").records()] == [*numbers]
+
+
+def test_a_strength_that_is_no_number_makes_no_manifest(tank):
+    assert build("one", "--env", "valve", "--strength", "leak=0.1,2") == 0
+    file = load_split("one").path / "manifest.json"
+    file.write_text(file.read_text().replace('"leak@2": 2.0', '"leak@2": "two"'))
+    with pytest.raises(SplitError, match="leak@2"):
+        load_split("one").strengths("valve")
 
 
 def test_ones_own_anomaly_is_recorded_in_an_environment_of_the_benchmark(tank, monkeypatch):

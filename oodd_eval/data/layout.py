@@ -317,7 +317,8 @@ def _manifest_schema() -> Any:
         actions=names,
     )
     strengths = by_name(text, core_schema.float_schema(ge=0, allow_inf_nan=False))
-    for key, optional in (("own", custom), ("strengths", strengths)):
+    units = by_name(text, text)
+    for key, optional in (("own", custom), ("strengths", strengths), ("units", units)):
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)
     environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
     recipe = record()

@@ -159,7 +159,7 @@ class Split:
             values of the paper's Table 1.
         """
         entry, definition = self.manifest["environments"][environment], self.manifest["definition"]
-        numbers = entry.get("strengths") or definition.get("strengths") or {}
+        numbers = entry.get("strengths", definition.get("strengths", {}))
         conditions = {str(condition): condition for condition in self.conditions(environment)}
         return {conditions[name]: float(n) for name, n in numbers.items() if name in conditions}
 

@@ -188,8 +188,8 @@ def _check_strengths(definition: SplitDefinition, environment: str) -> None:
             f"no strengths of anomalies are given for {environment!r}, an environment of one's own:"
             f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}"
         )
-    for condition, strength in _numbers(definition).items():
-        kind = condition.anomaly
+    for condition, strength in definition.strengths.items():
+        kind = Condition.parse(condition).anomaly
         check_known(f"anomaly that {environment} can have", kinds_of(environment), kind)
         if not 0 <= strength <= bound_of(environment, kind):
             most, unit = bound_of(environment, kind), unit_of(environment, kind)
@@ -203,7 +203,7 @@ def _acting(definition: SplitDefinition, environment: str, path: str) -> str:
     """Return the digest of what acts in an environment: policy, and code of one's own."""
     policy = load_policy(environment, path or None)
     measure(environment, policy)
-    kinds = [condition.anomaly for condition in _numbers(definition)]
+    kinds = [Condition.parse(condition).anomaly for condition in definition.strengths]
     code = code_digest(environment, kinds)
     return hashlib.sha256(f"{policy.digest} {code}".encode()).hexdigest() if code else policy.digest
 
@@ -222,7 +222,8 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     for environment in split.environments:
         entry = manifest["environments"][environment]
         same_policy = digests.get(environment, entry["policy"]) == entry["policy"]
-        same = _strengths(definition, environment).items() <= entry.items()
+        numbers = _strengths(definition, environment).get("strengths")
+        same = numbers is None or entry.get("strengths", numbers) == numbers
         if manifest["generator"] == GENERATOR_VERSION and same_policy and same:
             with contextlib.suppress(SplitError):  # a damaged file is built again
                 split.environment(environment).close()
@@ -230,17 +231,21 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     return kept
 
 
-def _numbers(definition: SplitDefinition) -> dict[Condition, float]:
-    """Return the strengths that a definition has of its own, by condition."""
-    return {Condition.parse(name): number for name, number in definition.strengths.items()}
+def _conditions(definition: SplitDefinition, environment: str) -> dict[Condition, float | None]:
+    """Return the strength of each condition to record; None stands for the values of Table 1."""
+    if definition.strengths:
+        return {Condition.parse(name): number for name, number in definition.strengths.items()}
+    return conditions_of(definition.suite, environment, definition.episode_cap)
 
 
 def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
-    """Return the strength of each condition of a suite, as an entry of the manifest."""
-    if definition.suite == "table1":
+    """Return the strength of each condition, and the unit of each kind, for the manifest."""
+    conditions = _conditions(definition, environment)
+    if None in conditions.values():  # the values of Table 1
         return {}
-    numbers = conditions_of(definition.suite, environment, definition.episode_cap)
-    return {"strengths": {str(condition): number for condition, number in numbers.items()}}
+    units = {c.anomaly: unit_of(environment, c.anomaly) for c in conditions}
+    numbers = {str(condition): number for condition, number in conditions.items()}
+    return {"strengths": numbers, "units": units}
 
 
 def _base(
@@ -258,12 +263,10 @@ def _base(
 
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
-    suite, cap = definition.suite, definition.episode_cap
-    conditions = tuple((_numbers(definition) or conditions_of(suite, environment, cap)).items())
+    conditions = tuple(_conditions(definition, environment).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
-        own = conditions if part == "test" else ()
-        recipe = (definition.episode_cap, definition.noise, own)
+        recipe = definition.episode_cap, definition.noise, conditions if part == "test" else ()
         return Chunk(environment, part, first, count, *recipe, digest, path)
 
     if definition.base:  # its test seeds have twins that are long enough
