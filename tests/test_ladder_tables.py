@@ -19,7 +19,7 @@ from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
-from oodd_eval.results.strengths import FOUND, Strengths, at_strength, curve, thresholds
+from oodd_eval.results.strengths import DETECTION, Strengths, at_strength, curve, thresholds
 from oodd_eval.results.tables import ladder, layout
 
 NULL = "found_within_100_null_at_5pct"
@@ -46,7 +46,7 @@ def at(detector, place, shares, **fields):
     return [
         make_record(
             detector, *place, strength=name,
-            values={FOUND: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
+            values={DETECTION: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
                     "auc_matched": [0.5 + share / 2] * 4},
             **fields,
         ) for name, share in shares.items()
@@ -240,7 +240,7 @@ def test_thresholds_come_as_flat_rows():
 
 
 def test_a_curve_has_the_mean_over_places_at_each_rung():
-    points = curve([r for r in RECORDS if r.detector == "rf"], FOUND)
+    points = curve([r for r in RECORDS if r.detector == "rf"], DETECTION)
     assert [p.value for p in points] == pytest.approx([0, 0, 0.25, (0.75 + 0.75 + 0.25) / 3])
     strengths = [1 / 4, 1, 4, (16 * 16 * 4) ** (1 / 3)]
     assert [p.strength for p in points] == pytest.approx(strengths)
@@ -284,7 +284,7 @@ def own(detector, shares, environment="tank", **fields):
     return [
         make_record(
             detector, environment, "gravity", strength=name, magnitude=GRAVITY[name],
-            values={FOUND: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
+            values={DETECTION: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
                     "auc_matched": [0.5 + share / 2] * 4},
             **fields,
         ) for name, share in zip(GRAVITY, shares, strict=True)

@@ -92,8 +92,10 @@ class TrajectorySet(TrajectorySequence):
     def rewards(self, index: int) -> NDArray[np.float32]:
         """Return the rewards of trajectory number `index`, float32 of shape (T,)."""
         i = range(len(self))[index]
-        found: NDArray[np.float32] = self._data["rewards"][self._offsets[i] : self._offsets[i + 1]]
-        return found
+        rewards: NDArray[np.float32] = self._data["rewards"][
+            self._offsets[i] : self._offsets[i + 1]
+        ]
+        return rewards
 
     @property
     def returns(self) -> NDArray[np.float64]:
@@ -129,18 +131,18 @@ class AnomalousSet(TrajectorySet):
     @functools.cached_property
     def parameters(self) -> list[dict[str, Any]]:
         """Values that the anomaly drew for each trajectory; `SplitError` when they are no JSON."""
-        found: list[dict[str, Any]] = []
+        values: list[dict[str, Any]] = []
         for text in self._data["parameters"][:]:
             drawn: Any = None
             with contextlib.suppress(ValueError, RecursionError):
                 drawn = json.loads(text)
             if not isinstance(drawn, dict):
                 raise SplitError(
-                    f"{self.group}, parameters of trajectory {len(found)} are {text!r:.80}, "
+                    f"{self.group}, parameters of trajectory {len(values)} are {text!r:.80}, "
                     "expected a JSON object: build or fetch the split again"
                 )
-            found.append(drawn)
-        return found
+            values.append(drawn)
+        return values
 
     @property
     def tails(self) -> NDArray[np.int64]:
@@ -209,7 +211,7 @@ class TwinCheck:
                 f"{len(twins['seeds'])}, one for each twin"
             )
         onsets, effects = part["onsets"], part["effects"]
-        found = np.where(self._first < 0, onsets, self._first)
+        first = np.where(self._first < 0, onsets, self._first)
         for i in np.flatnonzero(part["seeds"] != twins["seeds"]) if self._recorded else ():
             raise SplitError(
                 f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
@@ -227,10 +229,10 @@ class TwinCheck:
             )
         if self._early:
             raise SplitError(f"{where}: {self._early} before its onset: build or fetch it again")
-        for i in np.flatnonzero(found != effects):
+        for i in np.flatnonzero(first != effects):
             raise SplitError(
                 f"{where}: trajectory {i} first differs from its twin at row "
-                f"{found[i]}, expected its effect, row {effects[i]}"
+                f"{first[i]}, expected its effect, row {effects[i]}"
             )
 
 

@@ -50,11 +50,11 @@ def data_home() -> Path:
 
 def split_directories() -> dict[str, Path]:
     """Return the directories of splits by name: shipped ones, then those in `data_home`."""
-    found: dict[str, Path] = {}
+    directories: dict[str, Path] = {}
     for home in (SHIPPED, data_home()):
         for manifest in sorted(home.glob(f"*/{MANIFEST}")):
-            found.setdefault(manifest.parent.name, manifest.parent)
-    return found
+            directories.setdefault(manifest.parent.name, manifest.parent)
+    return directories
 
 
 def load_split(name: str | Path) -> "Split":
@@ -171,10 +171,10 @@ class Split:
     @property
     def groups(self) -> dict[str, Group]:
         """Groups of all anomalies, by kind."""
-        found: dict[str, Group] = {}
+        groups: dict[str, Group] = {}
         for entry in self.manifest["environments"].values():
-            found |= layout.groups_of(entry)
-        return found
+            groups |= layout.groups_of(entry)
+        return groups
 
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
         """Return the names that comma lists, globs or ``"all"`` select.
@@ -318,11 +318,11 @@ class Split:
                 layout.check_names(file.name, parts)
                 break
             layout.check_layout(file.name, group, part)
-            found, said = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
-            if found != (said["trajectories"], said["transitions"]):
+            sizes, named = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
+            if sizes != (named["trajectories"], named["transitions"]):
                 raise SplitError(
-                    f"{file.name}, {group} has {found[0]} trajectories with {found[1]} "
-                    f"transitions, expected {said['trajectories']} with {said['transitions']}"
+                    f"{file.name}, {group} has {sizes[0]} trajectories with {sizes[1]} "
+                    f"transitions, expected {named['trajectories']} with {named['transitions']}"
                 )
         return parts
 
@@ -340,9 +340,9 @@ class Split:
             names = layout.names_digest(entry) if group == NAMES else ""
             expected = names or str(entry["groups"][group]["sha256"])
             pairs = TwinCheck(part, twins, recorded=recorded) if "onsets" in part else None
-            found = layout.content_digest(twins if group == TWINS else part, pairs)
-            yield GroupCheck(file.name, group, expected, found)
-            if pairs and found == expected:
+            digest = layout.content_digest(twins if group == TWINS else part, pairs)
+            yield GroupCheck(file.name, group, expected, digest)
+            if pairs and digest == expected:
                 pairs.finish(f"{file.name}, group {group}")
 
 
@@ -354,5 +354,5 @@ def _manifest(path: Path, _stamp: int) -> dict[str, Any]:
 @functools.cache
 def published_digests() -> dict[str, str]:
     """Return the digests of the published splits by name."""
-    found: dict[str, str] = json.loads((SHIPPED / "published.json").read_text(encoding="utf-8"))
-    return found
+    digests: dict[str, str] = json.loads((SHIPPED / "published.json").read_text(encoding="utf-8"))
+    return digests

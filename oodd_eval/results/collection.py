@@ -25,7 +25,7 @@ from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
-from oodd_eval.results.strengths import FOUND, Point, curve, threshold_rows
+from oodd_eval.results.strengths import DETECTION, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -276,7 +276,7 @@ class Results(Sequence[Record]):
         return plots.power(curves)
 
     def plot_ladder(
-        self, *rows: str, metric: str = FOUND, environments: str = "all", anomalies: str = "all"
+        self, *rows: str, metric: str = DETECTION, environments: str = "all", anomalies: str = "all"
     ) -> Figure:
         """Draw a metric against the strength of anomalies and against the return that they cost.
 

@@ -79,10 +79,10 @@ class Setting:
         True
         """
         match = re.fullmatch(r"([^\[]+)(?:\[(.*)\])?", text)
-        given = _read_settings(match[2] or "") if match else None
-        if match is None or given is None:
+        settings = _read_settings(match[2] or "") if match else None
+        if match is None or settings is None:
             raise UsageError(f"{text!r} is no setting: expected DETECTOR[h=N,NAME=VALUE,...]")
-        return cls.of(match[1], given.pop("h", 1), given)
+        return cls.of(match[1], settings.pop("h", 1), settings)
 
     def label(self, seed: int) -> str:
         """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
@@ -147,11 +147,11 @@ class Cell:
 
 
 def _bracketed(detector: str, settings: Mapping[str, Any]) -> str:
-    shown = ",".join(f"{name}={_shown(value)}" for name, value in settings.items())
-    return f"{detector}[{shown}]" if shown else detector
+    text = ",".join(f"{name}={_text(value)}" for name, value in settings.items())
+    return f"{detector}[{text}]" if text else detector
 
 
-def _shown(value: Any) -> str:
+def _text(value: Any) -> str:
     """Return a value as JSON, or a plain text without quotes where that reads back as the same."""
     if isinstance(value, str) and not _QUOTED.search(value) and _read(value) == value:
         return value

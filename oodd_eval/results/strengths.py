@@ -1,6 +1,6 @@
 """From records at several strengths to detection thresholds and to curves over the strength.
 
-A *place* is an environment with a kind of anomaly. Its strengths are those at which there are
+A *pair* is an environment and a kind of anomaly. Its strengths are those at which there are
 records that say their number, or whose strength is a rung of the benchmark's ladder.
 """
 
@@ -20,14 +20,14 @@ from oodd_eval.metrics.threshold import DetectionThreshold
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
-FOUND: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
+DETECTION: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 """The metric whose share decides: found within 100 rows, where 5 % of nominal episodes alarm."""
 
 UNIT: Final = "kept99"
-"""The rung whose strength is the unit where the ladder's strengths of places are put together."""
+"""The rung whose strength is the unit where the ladder's strengths of pairs are put together."""
 
-Place = tuple[str, str]
-Thresholds = dict[Setting, dict[Place, DetectionThreshold]]
+Pair = tuple[str, str]
+Thresholds = dict[Setting, dict[Pair, DetectionThreshold]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Strengths:
     Attributes
     ----------
     rungs
-        Strengths of each place by name, the weakest first.
+        Strengths of each pair by name, the weakest first.
     names
         Names of all strengths: rungs of the benchmark's ladder in its order, others by their mean
         number.
@@ -46,7 +46,7 @@ class Strengths:
         costs 1 % of the return. Others are in the unit of their kind of anomaly.
     """
 
-    rungs: Mapping[Place, Mapping[str, Rung]]
+    rungs: Mapping[Pair, Mapping[str, Rung]]
     names: tuple[str, ...]
     calibrated: bool
 
@@ -63,14 +63,14 @@ class Strengths:
         -------
         Strengths
         """
-        rungs: dict[Place, dict[str, Rung]] = {}
+        rungs: dict[Pair, dict[str, Rung]] = {}
         for r in records:
-            known = rungs.get(_place(r), {})
+            known = rungs.get(_pair(r), {})
             if r.strength and r.strength not in known and (rung := _rung_of(r)):
-                rungs[_place(r)] = known | {r.strength: rung}
+                rungs[_pair(r)] = known | {r.strength: rung}
         ordered = {
-            place: dict(sorted(by_name.items(), key=lambda item: item[1].strength))
-            for place, by_name in rungs.items()
+            pair: dict(sorted(by_name.items(), key=lambda item: item[1].strength))
+            for pair, by_name in rungs.items()
         }
         numbers: dict[str, list[float]] = {}
         for name, rung in (item for by_name in ordered.values() for item in by_name.items()):
@@ -79,26 +79,26 @@ class Strengths:
         names = sorted(means, key=lambda name: (_position(name), means[name]))
         return cls(ordered, tuple(names), calibrated=all(name in RUNGS for name in names))
 
-    def unit(self, place: Place) -> float:
-        """Return the strength of a place that is 1 where several places are put together."""
+    def unit(self, pair: Pair) -> float:
+        """Return the strength of a pair that is 1 where several pairs are put together."""
         if not self.calibrated:
             return 1.0
-        return {**_calibrated(*place), **self.rungs[place]}[UNIT].strength
+        return {**_calibrated(*pair), **self.rungs[pair]}[UNIT].strength
 
-    def chosen(self, name: str) -> dict[Place, str]:
-        """Return the strength of each place that counts in the column of a name.
+    def chosen(self, name: str) -> dict[Pair, str]:
+        """Return the strength of each pair that counts in the column of a name.
 
-        A place has no rung of its own for a level of the ladder where the strength of a weaker rung
+        A pair has no rung of its own for a level of the ladder where the strength of a weaker rung
         is nearest to it: its largest sensible strength costs less, or the policy fails between two
-        near strengths. The next weaker rung stands in there. A place without records at a strength
+        near strengths. The next weaker rung stands in there. A pair without records at a strength
         of that name is left out.
         """
         chosen = {}
-        for place, rungs in self.rungs.items():
-            weaker = [n for n in _calibrated(*place) if _position(n) <= _position(name)]
-            own = weaker[-1] if name in RUNGS and weaker else name
-            if own in rungs:
-                chosen[place] = own
+        for pair, rungs in self.rungs.items():
+            weaker = [n for n in _calibrated(*pair) if _position(n) <= _position(name)]
+            counted = weaker[-1] if name in RUNGS and weaker else name
+            if counted in rungs:
+                chosen[pair] = counted
         return chosen
 
 
@@ -116,7 +116,7 @@ def _rung_of(record: Record) -> Rung | None:
     What a rung of the ladder costs is known from the ladder, as is the number of those that older
     records lack.
     """
-    rung = _calibrated(*_place(record)).get(record.strength)
+    rung = _calibrated(*_pair(record)).get(record.strength)
     if record.magnitude is None or (rung and rung.strength == record.magnitude):
         return rung
     return Rung(record.magnitude) if record.strength != PAPER else None
@@ -129,11 +129,11 @@ def _position(name: str) -> int:
 def at_strength(records: Sequence[Record], name: str) -> list[Record]:
     """Return the records in the column of a strength, see `Strengths.chosen`."""
     chosen = Strengths.of(records).chosen(name)
-    return [r for r in records if r.strength and r.strength == chosen.get(_place(r))]
+    return [r for r in records if r.strength and r.strength == chosen.get(_pair(r))]
 
 
 def thresholds(records: Sequence[Record]) -> Thresholds:
-    """Return the detection thresholds of each row that has records at strengths, by place.
+    """Return the detection thresholds of each row that has records at strengths, by pair.
 
     Parameters
     ----------
@@ -143,37 +143,37 @@ def thresholds(records: Sequence[Record]) -> Thresholds:
     Returns
     -------
     dict
-        Thresholds by row and place, in the unit of the kind of anomaly. A row has one where all its
-        detector seeds have a result at every strength of the place.
+        Thresholds by row and pair, in the unit of the kind of anomaly. A row has one where all its
+        detector seeds have a result at every strength of the pair.
     """
     rungs = Strengths.of(records).rungs
-    cells: dict[Setting, dict[Place, dict[tuple[int, str], Record]]] = {}
+    cells: dict[Setting, dict[Pair, dict[tuple[int, str], Record]]] = {}
     for r in records:
-        if r.strength in rungs.get(_place(r), {}):
-            places = cells.setdefault(r.setting, {})
-            places.setdefault(_place(r), {})[r.seed, r.strength] = r
+        if r.strength in rungs.get(_pair(r), {}):
+            pairs = cells.setdefault(r.setting, {})
+            pairs.setdefault(_pair(r), {})[r.seed, r.strength] = r
     return {
         setting: {
-            place: threshold
-            for place, by_seed in places.items()
-            if (threshold := _threshold(place, by_seed, rungs[place]))
+            pair: threshold
+            for pair, by_seed in pairs.items()
+            if (threshold := _threshold(pair, by_seed, rungs[pair]))
         }
-        for setting, places in cells.items()
+        for setting, pairs in cells.items()
     }
 
 
 def _threshold(
-    place: Place, cells: Mapping[tuple[int, str], Record], rungs: Mapping[str, Rung]
+    pair: Pair, cells: Mapping[tuple[int, str], Record], rungs: Mapping[str, Rung]
 ) -> DetectionThreshold | None:
     strengths = {name: rung.strength for name, rung in rungs.items() if rung.strength > 0}
     seeds = sorted({seed for seed, _ in cells})
     rows = [[cells[seed, n] for n in strengths if (seed, n) in cells] for seed in seeds]
     whole = strengths and all(len(row) == len(strengths) for row in rows)
-    if not whole or not all(r.ok and FOUND in r.per_trajectory for row in rows for r in row):
+    if not whole or not all(r.ok and DETECTION in r.per_trajectory for row in rows for r in row):
         return None
-    terms = np.array([[r.per_trajectory[FOUND] for r in row] for row in rows])
+    terms = np.array([[r.per_trajectory[DETECTION] for r in row] for row in rows])
     threshold = DetectionThreshold.of(
-        place[0], [*strengths.values()], terms[:, :, 0], terms[:, :, 1]
+        pair[0], [*strengths.values()], terms[:, :, 0], terms[:, :, 1]
     )
     return None if math.isnan(threshold.value) else threshold
 
@@ -184,22 +184,22 @@ def threshold_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
     return [
         {
             "row": str(setting),
-            "environment": place[0],
-            "anomaly": place[1],
+            "environment": pair[0],
+            "anomaly": pair[1],
             "threshold": threshold.value,
             "low": threshold.interval[0],
             "high": threshold.interval[1],
             "weakest": threshold.weakest,
             "strongest": threshold.strongest,
-            UNIT: strengths.unit(place) if strengths.calibrated else math.nan,
+            UNIT: strengths.unit(pair) if strengths.calibrated else math.nan,
         }
-        for setting, places in thresholds(records).items()
-        for place, threshold in places.items()
+        for setting, pairs in thresholds(records).items()
+        for pair, threshold in pairs.items()
     ]
 
 
 class Point(NamedTuple):
-    """One strength of a curve, as means over places.
+    """One strength of a curve, as means over pairs.
 
     `strength` is the geometric mean in the units of `Strengths.unit`, `lost` the share of the
     return that the strength costs, NaN where that is not known.
@@ -223,11 +223,11 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
     strengths, points = Strengths.of(records), []
     for name in strengths.names:
         chosen = strengths.chosen(name)
-        cells = [r for r in records if r.ok and r.strength and r.strength == chosen.get(_place(r))]
-        rungs = {place: strengths.rungs[place][chosen[place]] for place in map(_place, cells)}
+        cells = [r for r in records if r.ok and r.strength and r.strength == chosen.get(_pair(r))]
+        rungs = {pair: strengths.rungs[pair][chosen[pair]] for pair in map(_pair, cells)}
         logs = [
-            math.log(rung.strength / strengths.unit(place))
-            for place, rung in rungs.items()
+            math.log(rung.strength / strengths.unit(pair))
+            for pair, rung in rungs.items()
             if rung.strength > 0
         ]
         lost = nan_mean(1 - rung.kept for rung in rungs.values())
@@ -236,5 +236,5 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
     return sorted(point for point in points if not math.isnan(point.value))
 
 
-def _place(record: Record) -> Place:
+def _pair(record: Record) -> Pair:
     return record.environment, record.anomaly

@@ -25,10 +25,10 @@ DEVICES: Final = ("auto", "cpu", "cuda")
 class Unit:
     """One fit: setting x seed x environment, and the conditions that it scores.
 
-    `parameters` are all that the factory gets, sorted by name; `recorded` are those that are part of the result, so not the
-    device. `plugin` is empty for a factory of this process, which has no `source` (the digest of a
-    plug-in's code) and no key of a stored fit; its scores are stored under a key, but never taken
-    from there by a later run.
+    `parameters` are all that the factory gets, sorted by name; `recorded` are those that are part of
+    the result, so not the device. `plugin` is empty for a factory of this process, which has no
+    `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored under
+    a key, but never taken from there by a later run.
     """
 
     environment: str

@@ -272,12 +272,12 @@ def _chunks(definition: SplitDefinition, environment: str, path: str, digest: st
     if definition.base:  # its test seeds have twins that are long enough
         with _base(definition.base, environment, digest) as base:
             return [chunk("test", int(seed), 1) for seed in base.twins.seeds]
-    found = []
+    chunks = []
     for part, offset in PART_OFFSETS.items():
         first, size = definition.seed_base * 10**6 + offset, getattr(definition, part)
         starts = range(0, size, CHUNK[part])
-        found += [chunk(part, first + i, min(CHUNK[part], size - i)) for i in starts]
-    return found
+        chunks += [chunk(part, first + i, min(CHUNK[part], size - i)) for i in starts]
+    return chunks
 
 
 def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> list[Chunk]:
@@ -351,15 +351,15 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
     for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
-            found = record_seed(
+            episodes = record_seed(
                 environment, seed, conditions, policy=policy, episode_cap=cap, noise=chunk.noise
             )
-            recorded.append(found)
+            recorded.append(episodes)
     arrays: dict[str, NDArray[Any]] = {}
     for condition in [None, *conditions] if recorded else []:
         nominal = TWINS if chunk.part == "test" else chunk.part
         group = condition.part if condition else nominal
-        for name, array in _stack([episodes[condition] for episodes in recorded]).items():
+        for name, array in _stack([by_condition[condition] for by_condition in recorded]).items():
             arrays[f"{group}:{name}"] = array
     with replacing(work / chunk.file_name) as partial, partial.open("wb") as out:
         np.savez(out, allow_pickle=False, **arrays)
@@ -367,7 +367,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
 
 def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     """Return the datasets of a part as a chunk holds them: with lengths instead of offsets."""
-    found: dict[str, NDArray[Any]] = {
+    arrays: dict[str, NDArray[Any]] = {
         "observations": np.concatenate([e.trajectory.observations for e in episodes]),
         "actions": np.concatenate([e.trajectory.actions for e in episodes]),
         "rewards": np.concatenate([e.rewards for e in episodes]),
@@ -376,11 +376,11 @@ def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
         "terminated": np.array([e.terminated for e in episodes], dtype=np.uint8),
     }
     if episodes[0].onset is not None:
-        found["onsets"] = np.array([e.onset for e in episodes], dtype=np.int64)
-        found["effects"] = np.array([e.effect for e in episodes], dtype=np.int64)
-        found["redraws"] = np.array([e.redraws for e in episodes], dtype=np.int64)
-        found["parameters"] = layout.pack_parameters([e.parameters for e in episodes])
-    return found
+        arrays["onsets"] = np.array([e.onset for e in episodes], dtype=np.int64)
+        arrays["effects"] = np.array([e.effect for e in episodes], dtype=np.int64)
+        arrays["redraws"] = np.array([e.redraws for e in episodes], dtype=np.int64)
+        arrays["parameters"] = layout.pack_parameters([e.parameters for e in episodes])
+    return arrays
 
 
 def _joined(part: str, files: Sequence[Path], held: Mapping[Path, Any]) -> layout.Arrays:

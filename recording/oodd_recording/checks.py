@@ -40,8 +40,8 @@ class Subject:
     @functools.cached_property
     def twins(self) -> list[Episode]:
         """Nominal episodes that are long enough for an onset."""
-        found = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
-        long = [e for e in found if e.trajectory.transitions >= SHORTEST_TWIN]
+        episodes = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
+        long = [e for e in episodes if e.trajectory.transitions >= SHORTEST_TWIN]
         if len(long) < len(SEEDS) / 2:
             raise SimulationError(
                 f"{len(long)} of {len(SEEDS)} nominal episodes have {SHORTEST_TWIN} transitions, "
@@ -68,9 +68,9 @@ def check_columns(subject: Subject) -> None:
     """Half of the nominal episodes are long enough, as wide as the spec says, and finite."""
     info = info_of(subject.environment)
     for twin in subject.twins[:2]:
-        found = twin.trajectory.observation_dim, twin.trajectory.action_dim
-        if found != (info.observation_dim, info.action_dim):
-            _fail(f"an episode has {found[0]} sensors and {found[1]} actions")
+        widths = twin.trajectory.observation_dim, twin.trajectory.action_dim
+        if widths != (info.observation_dim, info.action_dim):
+            _fail(f"an episode has {widths[0]} sensors and {widths[1]} actions")
         if not np.isfinite(twin.rewards).all():
             _fail(f"the rewards of seed {twin.seed} are not finite")
 
@@ -145,8 +145,8 @@ def check_strength(subject: Subject) -> None:
             gaps.append(np.abs(rows[common] - others[common]).mean())
         distances.append(float(np.mean(gaps)))
     if any(b < SLACK * a for a, b in itertools.pairwise(distances)):
-        shown = ", ".join(f"{d:.3g} at {p:g}" for d, p in zip(distances, PARTS, strict=True))
-        _fail(f"the mean distance from the twins is {shown} of the bound, expected it to grow")
+        profile = ", ".join(f"{d:.3g} at {p:g}" for d, p in zip(distances, PARTS, strict=True))
+        _fail(f"the mean distance from the twins is {profile} of the bound, expected it to grow")
 
 
 _ENVIRONMENT: Final = (check_columns, check_seed, check_policy)

@@ -183,9 +183,9 @@ def _ar1(environment: str, strength: float, _: Simulator, rng: np.random.Generat
 
     def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
         nonlocal state
-        found = x + std * state
+        noisy = x + std * state
         state = AR * state + np.sqrt(1 - AR**2) * rng.normal(size=len(state))
-        return found
+        return noisy
 
     return SensorFault(sensors, change)
 
@@ -212,9 +212,9 @@ def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Gener
 
     def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
         nonlocal state
-        found = x + scale * state[:k]
+        noisy = x + scale * state[:k]
         state = _product(forward, state) + _product(driven, rng.normal(size=k))
-        return found
+        return noisy
 
     return SensorFault(sensors, change)
 

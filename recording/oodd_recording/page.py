@@ -274,8 +274,8 @@ def _range(name: str, bounds: Sequence[float], nominal: float) -> str:
 
 def _returns(environment: str) -> tuple[str, str]:
     """Return the returns of our policy and the paper's, as text."""
-    told: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
-    ours = f"{told['mean_return']:.1f} ± {told['std_return']:.1f}"
+    provenance: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
+    ours = f"{provenance['mean_return']:.1f} ± {provenance['std_return']:.1f}"
     return ours, f"{ENVIRONMENTS[environment].paper_return:.1f}"
 
 

@@ -98,8 +98,8 @@ def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
     """
     rows, others = episode.trajectory.observations, twin.trajectory.observations
     effect = episode.effect or 0
-    shown = slice(effect, min(len(rows), len(others), effect + AFTER))
-    gap = np.abs(rows[shown] - others[shown]).mean(axis=0)
+    plotted = slice(effect, min(len(rows), len(others), effect + AFTER))
+    gap = np.abs(rows[plotted] - others[plotted]).mean(axis=0)
     among: list[int] = episode.parameters.get("sensors", VALUES["sensors"][environment])
     return max(among, key=lambda i: float(gap[i] / spread_of(environment)[i]))
 
@@ -152,5 +152,5 @@ def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
 
 
 def _text(x: float, y: float, text: str, anchor: str = "middle", weight: str = "normal") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-weight="{weight}"'
-    return f'<text {place} fill="{INK}">{escape(text)}</text>'
+    anchoring = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-weight="{weight}"'
+    return f'<text {anchoring} fill="{INK}">{escape(text)}</text>'

@@ -114,10 +114,10 @@ def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
     if missing := ", ".join(name for name in LAYERS[info.policy] if name not in arrays):
         raise PolicyError(f"{file} lacks the arrays {missing} of a {info.policy} policy")
     last = arrays["b3"] if info.policy == "TD3" else arrays["b4"]
-    found = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
-    if found != (info.observation_dim, info.action_dim):
+    widths = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
+    if widths != (info.observation_dim, info.action_dim):
         raise PolicyError(
-            f"{file} maps {found[0]} sensors to {found[1]} actions, expected "
+            f"{file} maps {widths[0]} sensors to {widths[1]} actions, expected "
             f"{info.observation_dim} and {info.action_dim} for {info.id}"
         )
     if bad := [name for name, a in arrays.items() if not np.isfinite(a).all()]:

@@ -267,8 +267,8 @@ def _run(
             if anomaly is not None and step == len(replayed):
                 fault = anomaly[0](simulator, anomaly[1])
                 fault.begin(simulator, rows)
-            given = actions[-1] if fault is None else fault.command(actions[-1], simulator)
-            row, reward, over = simulator.step(given)
+            command = actions[-1] if fault is None else fault.command(actions[-1], simulator)
+            row, reward, over = simulator.step(command)
             row = noisy(row)
             rows.append(row if fault is None else fault.observe(row, len(rows)))
             rewards.append(reward)

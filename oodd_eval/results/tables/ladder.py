@@ -9,7 +9,14 @@ from oodd_eval.metrics.catalogue import RANKING, UNDEFINED
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.strengths import FOUND, Place, Strengths, Thresholds, at_strength, thresholds
+from oodd_eval.results.strengths import (
+    DETECTION,
+    Pair,
+    Strengths,
+    Thresholds,
+    at_strength,
+    thresholds,
+)
 from oodd_eval.results.tables import Table, show_value
 
 REFERENCE: Final = Setting("riqn")
@@ -50,10 +57,10 @@ def tables(board: Board, *, intervals: bool = False, places: bool = False) -> li
 
 def by_place(board: Board, entry: Setting, by_row: Thresholds, *, intervals: bool = False) -> Table:
     """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
-    by_place = by_row[entry]
-    kinds = [k for k in board.anomalies if any(k == kind for _, kind in by_place)]
+    by_pair = by_row[entry]
+    kinds = [k for k in board.anomalies if any(k == kind for _, kind in by_pair)]
     rows = [
-        [title_of(e), *(_single(by_place.get((e, k)), intervals=intervals) for k in kinds)]
+        [title_of(e), *(_single(by_pair.get((e, k)), intervals=intervals) for k in kinds)]
         for e in board.environments
     ]
     title = f"{entry}: detection thresholds by anomaly, each in its own unit"
@@ -68,11 +75,11 @@ def overview(board: Board, by_row: Thresholds) -> Table:
     """
     strengths = Strengths.of(board.records)
     reference = by_row.get(REFERENCE, {})
-    means = {entry: _mean(own, reference, strengths) for entry, own in by_row.items()}
+    means = {entry: _mean(by_pair, reference, strengths) for entry, by_pair in by_row.items()}
     values = {entry: mean.value if mean else math.inf for entry, mean in means.items()}
     order = sorted(values, key=values.__getitem__)
     most = max((mean.pairs for mean in means.values() if mean), default=0)
-    shares = _by_strength(board, order, strengths.names, FOUND)
+    shares = _by_strength(board, order, strengths.names, DETECTION)
     rows = []
     for entry in order:
         mean = means[entry]
@@ -110,7 +117,7 @@ def _by_kind(board: Board, by_row: Thresholds, strengths: Strengths, *, interval
     rows = []
     for entry in (e for e in board.entries if e in by_row):
         of_kind = ({p: t for p, t in by_row[entry].items() if p[1] == k} for k in kinds)
-        means = (_mean(places, {}, strengths) for places in of_kind)
+        means = (_mean(by_pair, {}, strengths) for by_pair in of_kind)
         texts = (mean.text(interval=intervals) if mean else "" for mean in means)
         rows.append([str(entry), *texts])
     units = f"in units of {_COSTS}" if strengths.calibrated else "each in its own unit"
@@ -134,14 +141,14 @@ def _by_strength(
 
 
 def _mean(
-    by_place: Mapping[Place, DetectionThreshold],
-    reference: Mapping[Place, DetectionThreshold],
+    by_pair: Mapping[Pair, DetectionThreshold],
+    reference: Mapping[Pair, DetectionThreshold],
     strengths: Strengths,
 ) -> MeanThreshold | None:
-    """Return the mean over the places of a reference, or over all, in units, without one."""
-    chosen = [p for p in by_place if p in reference] if reference else [*by_place]
+    """Return the mean over the pairs of a reference, or over all, in units, without one."""
+    chosen = [p for p in by_pair if p in reference] if reference else [*by_pair]
     units = [reference[p] if reference else strengths.unit(p) for p in chosen]
-    return geometric_mean([by_place[p] for p in chosen], units) if chosen else None
+    return geometric_mean([by_pair[p] for p in chosen], units) if chosen else None
 
 
 def _single(threshold: DetectionThreshold | None, *, intervals: bool) -> str:
