@@ -11,7 +11,7 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.ladder import Rung
-from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
+from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
@@ -20,7 +20,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import DETECTION, Strengths, at_strength, curve, thresholds
-from oodd_eval.results.tables import ladder, layout
+from oodd_eval.results.tables import ladder
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -209,12 +209,6 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
     assert "### rf: detection thresholds" in text
 
 
-def test_the_other_tables_are_means_over_the_rungs():
-    own = [r for r in RECORDS if r.detector == "rf"]
-    mean = sum(r.value("auc_matched") for r in own) / len(own)
-    assert layout.separability(Board(own)).rows[0][1] == f"{100 * mean:.1f}"
-
-
 def test_show_prints_thresholds(tmp_path, capsys):
     ResultsDirectory(tmp_path).merge_records(RECORDS)
     assert main(["show", str(tmp_path), "--stored"]) == 0
@@ -262,15 +256,6 @@ def test_curves_are_drawn_against_strength_and_return_lost():
     assert list(right.lines[0].get_xdata()) == pytest.approx([1, 10, 50])
     by_auc = Results(RECORDS).plot_ladder(metric="auc_matched").axes[0]
     assert by_auc.get_ylabel() == "matched AUC (%)"
-
-
-def test_what_cannot_be_drawn_is_told():
-    with pytest.raises(ResultsError, match="no results at several strengths with found_within_100"):
-        Results(example()).plot_ladder()
-    with pytest.raises(UnknownNameError, match="unknown anomaly 'fog'"):
-        Results(RECORDS).plot_ladder(anomalies="fog")
-    with pytest.raises(UnknownNameError, match="unknown metric 'auk'"):
-        Results(RECORDS).plot_ladder(metric="auk")
 
 
 # Strengths of one's own
