@@ -76,7 +76,7 @@ def check_columns(subject: Subject) -> None:
 
 
 def check_seed(subject: Subject) -> None:
-    """The seed decides the episode, whatever was recorded before; others give others."""
+    """Equal seeds give equal episodes in any order; other seeds, other ones."""
     again = [subject.setup.record(twin.seed) for twin in reversed(subject.twins)]
     for first, second in zip(subject.twins, reversed(again), strict=True):
         if _content(first) != _content(second):
