@@ -1,18 +1,21 @@
 """The pages "Environments and anomalies": their text, pictures, words and numbers."""
 
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers_docs import ROOT
-from oodd_recording import page, pictures
 from oodd_recording.environments import make
 from oodd_recording.record import Episode
 
-from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.trajectory import Trajectory
+
+sys.path.insert(0, str(ROOT / "docs" / "figures"))
+import environments as page
+import pictures
 
 DOCS = ROOT / "docs"
 PAGES = DOCS / page.NAME
@@ -36,10 +39,8 @@ def test_committed_pictures_are_those_of_the_present_strengths(environment):
         assert told in found[kind], f"docs/{page.NAME}/{environment}/{kind}.svg {STALE}"
 
 
-def test_command_writes_overview_page_and_pictures(tmp_path, capsys):
-    assert main(["data", "page", str(tmp_path), "--env", "cartpole"]) == 0
-    told = capsys.readouterr().out
-    assert str(tmp_path) in told.replace("\n", "")
+def test_overview_page_and_pictures_are_written(tmp_path):
+    page.write_pages(tmp_path, environments=["cartpole"])
     written = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
     plots = {f"environments/cartpole/{kind}.svg" for kind in ANOMALIES}
     pages = {"environments.md", "environments/cartpole.md", "environments/cartpole.png"}

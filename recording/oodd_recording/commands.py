@@ -1,4 +1,4 @@
-"""Commands of oodd-eval that record: ``data build``, ``calibrate`` and ``page``, ``policies``.
+"""Commands of oodd-eval that record: ``data build`` and ``calibrate``, ``policies``.
 
 The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
@@ -35,8 +35,6 @@ from oodd_eval.plugins.conformance import Report, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks
-from oodd_recording.page import NAME as OVERVIEW
-from oodd_recording.page import write_pages
 from oodd_recording.policies import load_policy
 from oodd_recording.record import evaluate_policy
 from oodd_recording.train.train import train_policy
@@ -215,18 +213,6 @@ def calibrate(options: Options) -> int:
     make_console().print(
         f"strengths of {count} kinds in {len(strengths)} environments: {options.output}"
     )
-    return 0
-
-
-@command("data page docs")
-@click.argument("directory", type=DIRECTORY, help="directory of the documents")
-@click.option("--env", default="all", type=Names("envs"), help="environments to draw")
-def page(options: Options) -> int:
-    """Write the pages on environments and anomalies; the overview names all environments."""
-    notes = make_console(quiet=options.verbosity < 0)
-    environments = select("environment", options.env, ENVIRONMENTS)
-    write_pages(options.directory, environments=environments, progress=notes.print)
-    make_console().print(f"pages: {options.directory / OVERVIEW}.md and {len(environments)} more")
     return 0
 
 

@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-
-from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_recording.calibrate import setup_of
 from oodd_recording.environments import Bullet, Simulator, make, quiet_streams
 from oodd_recording.record import SHORTEST_TWIN, Episode, record_anomalous
 from oodd_recording.values import VALUES, spread_of
+
+from oodd_eval.data.facts import ENVIRONMENTS
 
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
 BEFORE, AFTER = 30, 90  # rows of a plot before the onset and after the effect
