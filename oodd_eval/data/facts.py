@@ -20,7 +20,7 @@ Group = Literal["sensor", "dynamics"]
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A sensor or an action: its name, and the unit of its numbers.
+    """A sensor or an action.
 
     Parameters
     ----------
@@ -39,10 +39,20 @@ class Quantity:
 class EnvironmentInfo:
     """One environment.
 
-    `id` is its name here, `title` the paper's, `simulator` Gymnasium's. A `discrete` action is a
-    one-hot row. `sensors` and `actions` are names and units of the columns of observations and of
-    action rows. `episode_cap` is the longest episode in transitions, `paper_return` the mean return
-    of the paper's policy in its Table 2.
+    Parameters
+    ----------
+    id, title, simulator
+        Its name here, the paper's, and Gymnasium's.
+    family
+        Kind of simulator: ``"classic"``, ``"bullet"``, or ``"custom"`` for a plug-in's.
+    discrete
+        Whether actions are discrete; they are one-hot rows then.
+    sensors, actions
+        Names and units of the columns of observations and of action rows.
+    episode_cap
+        Longest episode in transitions.
+    paper_return
+        Mean return of the paper's policy in its Table 2; NaN for a custom environment.
     """
 
     id: str
@@ -73,9 +83,18 @@ class EnvironmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class AnomalyInfo:
-    """One kind of anomaly: its name, the paper's name, its group and what it changes.
+    """One kind of anomaly of the benchmark.
 
-    The other fields say how it is recorded, see `oodd_eval.data.registry.AnomalySpec`.
+    Parameters
+    ----------
+    id, title
+        Its name here and the paper's.
+    group
+        ``"sensor"`` or ``"dynamics"``.
+    summary
+        One line: what changes.
+    unit, bound, units, needs, needs_discrete, environments
+        How it is recorded, see `oodd_eval.data.registry.AnomalySpec`.
     """
 
     id: str
@@ -95,7 +114,7 @@ Suite = Literal["table1", "ladder", "paper"]
 
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
-    """The recipe of a split: trajectories of each part, longest episode, seeds.
+    """The recipe of a split.
 
     Parameters
     ----------
@@ -132,17 +151,12 @@ class SplitDefinition:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """All fields that were given: a manifest's ``definition``."""
+        """The manifest's ``definition``: all fields but those that are at their default."""
         recipe = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {n: value for n, value in recipe.items() if n not in _LATER or value != _LATER[n]}
+        # Older manifests lack these.
+        later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}}
+        return {n: value for n, value in recipe.items() if n not in later or value != later[n]}
 
-
-_LATER: Final[dict[str, Any]] = {
-    "suite": "table1",
-    "base": "",
-    "noise": 0.0,
-    "strengths": {},
-}  # older manifests lack these
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 

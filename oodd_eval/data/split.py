@@ -139,8 +139,8 @@ class Split:
 
         Returns
         -------
-        tuple of str
-            Such as ``"iid"`` or ``"iid@kept99"``, in the benchmark's order.
+        tuple of Condition
+            In the benchmark's order.
         """
         return conditions_in(self.manifest["environments"][environment]["groups"])
 
@@ -260,7 +260,7 @@ class Split:
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
-        """Give what opens environments, each once; all are closed when the block is left.
+        """Open environments, each once; all are closed when the block is left.
 
         Yields
         ------

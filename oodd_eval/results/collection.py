@@ -226,7 +226,8 @@ class Results(Sequence[Record]):
         list of dict
             Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
             unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
-            ``strongest``. ``kept99`` is the strength that costs 1 % of the return.
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, NaN for strengths
+            of your own.
         """
         return threshold_rows(self.records)
 
@@ -289,7 +290,8 @@ class Results(Sequence[Record]):
             nominal episodes have one; dotted is what false alarms alone give.
         environments, anomalies
             What is averaged over: comma lists and globs, as on the command line. Strengths are in
-            units of the strength that costs 1 % of the return, as each anomaly has its own unit.
+            units of the strength that costs 1 % of the return, as each anomaly has its own unit;
+            strengths of your own are in the unit of the anomaly.
 
         Returns
         -------
@@ -310,7 +312,9 @@ class Results(Sequence[Record]):
             for name in filter(None, (metric, info.null))
         ]
         if not any(curves[0].values()):
-            raise ResultsError(f"no results at several strengths with {metric}: run a ladder split")
+            raise ResultsError(
+                f"no results at several strengths with {metric}: run a split that has some"
+            )
         return plots.ladder(curves[0], curves[-1] if info.null else {}, info)
 
     def _row(self, name: str) -> Setting:

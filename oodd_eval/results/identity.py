@@ -49,7 +49,19 @@ class Setting:
     def of(
         cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
     ) -> "Setting":
-        """Make a setting from a mapping of the parameters that are not at their default."""
+        """Make a setting from a mapping of the parameters that are not at their default.
+
+        Parameters
+        ----------
+        detector, horizon
+            As those of the class.
+        overrides
+            Values by name.
+
+        Returns
+        -------
+        Setting
+        """
         if not overrides:  # as in most of the tens of thousands of records that a board reads
             return _plain(detector, horizon)
         names = sorted(overrides)

@@ -4,10 +4,11 @@ To list them is quick: simulators and numpy are imported when one is made.
 """
 
 import functools
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, EnvironmentInfo
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
 from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec
 from oodd_eval.plugins import hookimpl
 
@@ -27,18 +28,12 @@ def oodd_environments() -> list[EnvironmentSpec]:
 @hookimpl
 def oodd_anomalies() -> list[AnomalySpec]:
     """Offer the kinds of the paper, and further ones."""
+    shared = {field.name for field in fields(AnomalySpec)} & {f.name for f in fields(AnomalyInfo)}
     return [
         AnomalySpec(
-            info.id,
-            info.group,
-            info.summary,
-            info.unit,
-            info.bound,
-            functools.partial(make_anomaly, info.id),
-            tuple(info.environments),
-            info.units,
-            tuple(info.needs),
-            tuple(info.needs_discrete),
+            name=info.id,
+            make=functools.partial(make_anomaly, info.id),
+            **{name: getattr(info, name) for name in shared},
         )
         for info in ANOMALIES.values()
     ]

@@ -314,7 +314,7 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
 
 @contextlib.contextmanager
 def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
-    """Give worker processes for recording, by default one per core; they end with this one."""
+    """Start worker processes for recording, by default one per core; they end with this one."""
     context, count = multiprocessing.get_context("spawn"), jobs or os.cpu_count() or 1
     # Sums depend on the number of threads of matrix libraries, which these read when they load,
     # before any code of ours runs in a child.
