@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("gymnasium", reason="needs the extra sim")
 from helpers_own import TANK, forget_own
 from helpers_plugins import install
+from oodd_recording.info import code_digest
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
@@ -166,7 +167,7 @@ def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
     for name in ("CartPole-v1", "Acrobot-v1"):
         make = functools.partial(gymnasium.make, name)
         registry.register([registry.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
-        digests.add(registry.code_digest("one", []))
+        digests.add(code_digest("one", []))
     assert len(digests) == 2
 
 

@@ -9,7 +9,6 @@ names again: its functions stand at the top level of a module.
 from __future__ import annotations
 
 import functools
-import hashlib
 import inspect
 import re
 import sys
@@ -25,13 +24,9 @@ from oodd_eval.data.facts import (
     EnvironmentInfo,
     Group,
     Quantity,
-    in_order,
 )
-from oodd_eval.errors import PluginError, UsageError
+from oodd_eval.errors import PluginError
 from oodd_eval.names import check_known
-
-BENCHMARK: Final = "oodd_recording"
-"""The package of the benchmark's own specs, whose code the generator's version stands for."""
 
 
 class Attribute(NamedTuple):
@@ -122,7 +117,18 @@ class AnomalySpec:
     needs_discrete: tuple[str, ...] = ()
 
     def scale(self, environment: EnvironmentInfo) -> tuple[str, float]:
-        """Return unit and bound of the strength in an environment."""
+        """Return unit and bound of the strength in an environment.
+
+        Parameters
+        ----------
+        environment
+            Its facts.
+
+        Returns
+        -------
+        tuple
+            The text of the unit, and the number.
+        """
         family = "discrete" if environment.discrete else "continuous"
         unit, bound = self.units.get(environment.id) or self.units.get(
             family, (self.unit, self.bound)
@@ -133,18 +139,8 @@ class AnomalySpec:
 Spec = EnvironmentSpec | AnomalySpec
 
 
-class Measured(NamedTuple):
-    """The spread of each sensor in nominal rows, and the numbers of the sensors that may break."""
-
-    spread: tuple[float, ...]
-    sensors: tuple[int, ...]
-
-
 _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
-_infos: Final[dict[str, EnvironmentInfo]] = dict(ENVIRONMENTS)
-MEASURED: Final[dict[str, Measured]] = {}
-"""Spreads and sensors of environments by name; those of custom ones are measured at recording."""
 
 
 def check_spec(spec: Spec) -> None:
@@ -156,10 +152,14 @@ def check_spec(spec: Spec) -> None:
             f"{spec.name!r} cannot be the name of a custom {kind}, expected lower-case letters, "
             "digits and hyphens, and no name of the benchmark"
         )
-    for function in _functions(spec):
-        inner = _inner(function)
+    for function in functions_of(spec):
+        inner = inner_of(function)
         name, home = getattr(inner, "__qualname__", ""), getattr(inner, "__module__", "")
-        if not name or getattr(sys.modules.get(home), name, None) is not inner or not _file(inner):
+        if (
+            not name
+            or getattr(sys.modules.get(home), name, None) is not inner
+            or not file_of(inner)
+        ):
             raise PluginError(
                 f"{kind} {spec.name!r} names {inner!r:.80}, expected a function or class at the "
                 "top level of a module in a file, which other processes can import"
@@ -171,11 +171,8 @@ def register(specs: Iterable[Spec]) -> None:
     for spec in specs:
         if isinstance(spec, AnomalySpec):
             _anomalies[spec.name] = spec
-            continue
-        _environments[spec.name] = spec
-        if spec.name not in ENVIRONMENTS:
-            _infos.pop(spec.name, None)
-            MEASURED.pop(spec.name, None)
+        else:
+            _environments[spec.name] = spec
 
 
 def registered() -> list[Spec]:
@@ -195,51 +192,12 @@ def anomaly_spec(name: str) -> AnomalySpec:
     return _anomalies[name]
 
 
-def info_of(environment: str) -> EnvironmentInfo:
-    """Return the facts of an environment.
-
-    The first call makes a custom environment once, to see its spaces. `UsageError` when they are
-    not as `EnvironmentSpec` says.
-    """
-    if environment not in _infos:
-        _infos[environment] = _inspected(environment_spec(environment))
-    return _infos[environment]
-
-
-def kinds_of(environment: str) -> list[str]:
-    """Return the kinds of anomalies that can be recorded in an environment at any strength."""
-    discrete, attributes = info_of(environment).discrete, environment_spec(environment).attributes
-    kinds = [
-        spec.name
-        for spec in _anomalies.values()
-        if environment in (spec.environments or [environment])
-        and {*spec.needs, *(spec.needs_discrete if discrete else ())} <= attributes.keys()
-    ]
-    return in_order(kinds, ANOMALIES)
-
-
-def code_digest(environment: str, kinds: Iterable[str]) -> str:
-    """Return the SHA-256 of the modules that custom specs name; empty without any.
-
-    Arguments of a ``functools.partial`` count, too.
-    """
-    specs: list[Spec] = [environment_spec(environment), *map(anomaly_spec, kinds)]
-    functions = [f for spec in specs for f in _functions(spec) if not _of_benchmark(f)]
-    arguments = [repr((f.args, f.keywords)) for f in functions if isinstance(f, functools.partial)]
-    files = sorted({_file(_inner(f)) for f in functions})
-    digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
-    return hashlib.sha256(repr((digests, arguments)).encode()).hexdigest() if files else ""
-
-
-def _of_benchmark(function: Callable[..., Any]) -> bool:
-    return getattr(_inner(function), "__module__", "").partition(".")[0] == BENCHMARK
-
-
-def _inner(function: Callable[..., Any]) -> Callable[..., Any]:
+def inner_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function that a ``functools.partial`` calls, or the function itself."""
     return function.func if isinstance(function, functools.partial) else function
 
 
-def _file(function: Callable[..., Any]) -> str:
+def file_of(function: Callable[..., Any]) -> str:
     """Return the file of a function's code; empty where it is in none."""
     try:
         file = inspect.getsourcefile(function) or ""
@@ -248,30 +206,9 @@ def _file(function: Callable[..., Any]) -> str:
     return file if Path(file).is_file() else ""
 
 
-def _functions(spec: Spec) -> list[Callable[..., Any]]:
+def functions_of(spec: Spec) -> list[Callable[..., Any]]:
+    """Return all functions that a spec names."""
     if isinstance(spec, AnomalySpec):
         return [spec.make]
     accessors = [f for attribute in spec.attributes.values() for f in attribute]
     return [spec.make, *([spec.policy] if callable(spec.policy) else []), *accessors]
-
-
-def _inspected(spec: EnvironmentSpec) -> EnvironmentInfo:
-    """Look at the spaces of an environment."""
-    env = spec.make()
-    rows, actions = env.observation_space, env.action_space
-    env.close()
-    discrete = hasattr(actions, "n") and hasattr(actions, "start")
-    widths = (getattr(rows, "shape", None), (int(actions.n),) if discrete else actions.shape)
-    expected = (len(spec.sensors),), (len(spec.actions),)
-    unit = discrete or (bool((actions.low == -1).all()) and bool((actions.high == 1).all()))
-    if widths != expected or not unit or (discrete and actions.start != 0):
-        raise UsageError(
-            f"environment {spec.name!r} has observations {rows} and actions {actions}, expected a "
-            f"Box of shape {expected[0]} as it names {len(spec.sensors)} sensors, and Discrete("
-            f"{len(spec.actions)}) or a Box of shape {expected[1]} from -1 to 1 as it names "
-            f"{len(spec.actions)} actions"
-        )
-    title, columns = spec.title or spec.name, (spec.sensors, spec.actions)
-    return EnvironmentInfo(
-        spec.name, title, spec.name, "custom", discrete, *columns, spec.episode_cap
-    )

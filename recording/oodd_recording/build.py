@@ -31,20 +31,11 @@ from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
-from oodd_eval.data.registry import (
-    MEASURED,
-    Measured,
-    Spec,
-    anomaly_spec,
-    code_digest,
-    info_of,
-    kinds_of,
-    register,
-    registered,
-)
+from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
+from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
     GENERATOR_VERSION,

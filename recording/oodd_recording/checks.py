@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.registry import AnomalySpec, Spec, info_of
+from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import OoddError, SimulationError
+from oodd_recording.info import info_of
 from oodd_recording.policies import Policy, load_policy
 from oodd_recording.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
 from oodd_recording.values import bound_of

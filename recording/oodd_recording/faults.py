@@ -12,8 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.registry import anomaly_spec, info_of
+from oodd_eval.data.registry import anomaly_spec
 from oodd_recording.environments import Row, Simulator
+from oodd_recording.info import info_of
 from oodd_recording.values import VALUES, choose_sensors, spread_of
 
 ON, PERIOD = 10, 50  # an intermittent fault acts on 10 rows, then rests for 40

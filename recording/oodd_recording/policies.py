@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import POLICY, read_npz
 from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
-from oodd_eval.data.registry import code_digest, environment_spec, info_of
+from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import PolicyError
+from oodd_recording.info import code_digest, info_of
 
 ACTION_GRID: Final = 2.0**16
 LAYERS: Final = {

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import FIRST_ONSET
-from oodd_eval.data.registry import MEASURED, Measured, info_of, kinds_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
 from oodd_recording.anomalies import draw
 from oodd_recording.environments import Simulator, make
 from oodd_recording.faults import Fault, make_fault
+from oodd_recording.info import MEASURED, Measured, info_of, kinds_of
 from oodd_recording.policies import Policy
 from oodd_recording.values import spread_of
 

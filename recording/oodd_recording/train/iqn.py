@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oodd_eval.data.registry import info_of
 from oodd_recording.environments import make
+from oodd_recording.info import info_of
 from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {

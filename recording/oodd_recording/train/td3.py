@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from oodd_eval.data.registry import info_of
 from oodd_recording.environments import make
+from oodd_recording.info import info_of
 from oodd_recording.policies import LAYERS
 from oodd_recording.train.replay import Replay
 
