@@ -54,9 +54,14 @@ class Fault:
         Parameters
         ----------
         action
-            What the policy commanded.
+            Command of the policy.
         simulator
             The episode's.
+
+        Returns
+        -------
+        int or float32 array of shape (A,)
+            Command for the simulator.
         """
         return action
 
@@ -66,9 +71,13 @@ class Fault:
         Parameters
         ----------
         row
-            What the simulator gave, float32 of shape (D,).
+            Row of the simulator, float32 of shape (D,).
         step
             Its number in the episode.
+
+        Returns
+        -------
+        float32 array of shape (D,)
         """
         return row
 
