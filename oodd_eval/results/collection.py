@@ -226,8 +226,8 @@ class Results(Sequence[Record]):
         list of dict
             Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
             unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
-            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, NaN for strengths
-            of your own.
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, NaN where
+            strengths are your own.
         """
         return threshold_rows(self.records)
 
