@@ -12,7 +12,7 @@ from oodd_eval._version import __version__
 if TYPE_CHECKING:
     from oodd_eval.api import evaluate, load_results
     from oodd_eval.data.facts import Quantity
-    from oodd_eval.data.own import AnomalySpec, Attribute, EnvironmentSpec
+    from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
@@ -38,9 +38,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AnomalySpec": "data.own",
-    "Attribute": "data.own",
-    "EnvironmentSpec": "data.own",
+    "AnomalySpec": "data.registry",
+    "Attribute": "data.registry",
+    "EnvironmentSpec": "data.registry",
     "Quantity": "data.facts",
     "Detector": "plugins.contract",
     "DetectorSpec": "plugins.contract",

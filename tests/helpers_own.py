@@ -1,12 +1,20 @@
 """A plug-in with environments and kinds of anomalies of its own, which needs no simulator."""
 
-from oodd_eval.data import own
+import sys
+
+from oodd_eval.data import registry
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 
 
 def forget_own():
     """Forget environments and anomalies that were registered: another test has others."""
-    for known in (own._environments, own._anomalies, own._infos, own.MEASURED):
-        known.clear()
+    known_by_module = [registry._environments, registry._anomalies]
+    if "oodd_recording.info" in sys.modules:
+        info = sys.modules["oodd_recording.info"]
+        known_by_module += [info._infos, info.MEASURED]
+    for known in known_by_module:
+        for name in [n for n in known if n not in {*ENVIRONMENTS, *ANOMALIES}]:
+            del known[name]
 
 
 TANK = '''

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ENVIRONMENTS
 
 SEEDS = {"acrobot": 1, "cartpole": 1, "lunarlander": 1, "ant": 2, "halfcheetah": 1, "hopper": 0,
@@ -36,6 +37,7 @@ def record(environment, anomaly, seed, *, policy, episode_cap=None):
     """Record one episode: nominal, or with an anomaly from a random onset on."""
     from oodd_recording.record import record_seed
 
-    names = [] if anomaly is None else [anomaly]
+    condition = None if anomaly is None else Condition(anomaly)
     options = {"policy": policy, "episode_cap": episode_cap}
-    return record_seed(environment, seed, names, **options)[anomaly]
+    conditions = [condition] if condition else []
+    return record_seed(environment, seed, conditions, **options)[condition]

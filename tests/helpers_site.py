@@ -29,8 +29,8 @@ from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
-from oodd_eval.results.ladder import FOUND
 from oodd_eval.results.record import Metric
+from oodd_eval.results.strengths import DETECTION
 
 DIGEST = "ab" * 32
 
@@ -74,7 +74,7 @@ def graded(root):
     lines = []
     for row, (first, last) in GRADED_ROWS.items():
         for name, share in zip(names, np.linspace(first, last, len(names)), strict=True):
-            values = {FOUND: [float(i < 8 * share) for i in range(8)], RANKING: [0.5] * 8}
+            values = {DETECTION: [float(i < 8 * share) for i in range(8)], RANKING: [0.5] * 8}
             fields = {"strength": name, "values": values}
             lines.append(make_record(row, "cartpole", "iid", **fields).to_json() + "\n")
     own = root / "suites" / "small"

@@ -13,12 +13,14 @@ import pytest
 
 pytest.importorskip("gymnasium")
 from oodd_recording import build
+from oodd_recording.benchmark import FROZEN
 from oodd_recording.build import Chunk, build_split
-from oodd_recording.policies import FROZEN, load_policy
+from oodd_recording.policies import load_policy
 from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 
-from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 
@@ -58,9 +60,10 @@ def test_a_built_split_holds_what_recording_gives(built):
     assert data.train.seeds.tolist() == [950_000_000 + i for i in range(4)]
     assert data.calibration.seeds.tolist() == [950_300_000, 950_300_001]
     assert data.twins.seeds.tolist() == [950_600_000, 950_600_001]
+    gravity = Condition("gravity")
     episode = record_seed(
-        "cartpole", 950_600_001, ["gravity"], policy=load_policy("cartpole"), episode_cap=60
-    )["gravity"]
+        "cartpole", 950_600_001, [gravity], policy=load_policy("cartpole"), episode_cap=60
+    )[gravity]
     stored = data.anomalous("gravity")
     np.testing.assert_array_equal(stored[1].observations, episode.trajectory.observations)
     np.testing.assert_array_equal(stored[1].actions, episode.trajectory.actions)
@@ -216,3 +219,9 @@ def test_wrong_requests_fail_before_any_work(tmp_path):
         with pytest.raises(UsageError, match=message):
             build_split(dataclasses.replace(SMALL, **change), target, **FEW)
     assert not target.exists()
+
+
+def test_reduced_differs_from_standard_in_sizes_alone():
+    sizes = {"train": 500, "calibration": 200, "test": 50}
+    reduced = dataclasses.replace(SPLITS["reduced"], name="standard", **sizes)
+    assert reduced == SPLITS["standard"]

@@ -74,7 +74,7 @@ def test_every_hook_has_a_test_of_its_name():
 
 def test_oodd_environments(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "tank", TANK, header="")
-    found = discover(only=["tank"]).own_specs
+    found = discover(only=["tank"]).custom_specs
     spec, origin = found["valve"]
     assert origin == "plug-in 'tank' of oodd-tank"
     assert [quantity.name for quantity in spec.actions] == ["close", "open"]
@@ -82,7 +82,7 @@ def test_oodd_environments(monkeypatch, tmp_path):
 
 def test_oodd_anomalies(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "tank", TANK, header="")
-    spec, _ = discover(only=["tank"]).own_specs["leak"]
+    spec, _ = discover(only=["tank"]).custom_specs["leak"]
     assert (spec.group, spec.bound) == ("dynamics", 3.0)
 
 

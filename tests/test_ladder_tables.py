@@ -1,5 +1,6 @@
 """Tables, thresholds and plots of results at several strengths, from records made by hand."""
 
+import dataclasses
 import io
 import math
 
@@ -10,16 +11,16 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.ladder import Rung
-from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
+from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
-from oodd_eval.results import ladder as of_records
+from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.ladder import FOUND, at_rung, curve, ladders, thresholds
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
-from oodd_eval.results.tables import ladder, layout
+from oodd_eval.results.strengths import DETECTION, Strengths, at_strength, curve, thresholds
+from oodd_eval.results.tables import ladder
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -45,7 +46,7 @@ def at(detector, place, shares, **fields):
     return [
         make_record(
             detector, *place, strength=name,
-            values={FOUND: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
+            values={DETECTION: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
                     "auc_matched": [0.5 + share / 2] * 4},
             **fields,
         ) for name, share in shares.items()
@@ -164,29 +165,29 @@ def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
         return {n: r for n, r in usual(*place).items() if place[0] != "ant" or n != "kept90"}
 
     monkeypatch.setattr(of_records, "rungs_of", without)
-    found = {(r.environment, r.anomaly): r.strength for r in at_rung(RECORDS, "kept90")}
+    found = {(r.environment, r.anomaly): r.strength for r in at_strength(RECORDS, "kept90")}
     assert found["ant", "iid"] == found["ant", "gravity"] == "kept99"
     assert found["hopper", "iid"] == "kept90"
 
 
 def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
-    at_end = at_rung(RECORDS, "kept50")
+    at_end = at_strength(RECORDS, "kept50")
     assert {(r.environment, r.anomaly, r.strength) for r in at_end} == {
         ("ant", "iid", "kept50"), ("hopper", "iid", "kept50"), ("ant", "gravity", "kept90"),
     }  # fmt: skip
     # A rung that was not run is missing.
     fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
-    assert {r.environment for r in at_rung(fewer, "kept50")} == {"ant"}
+    assert {r.environment for r in at_strength(fewer, "kept50")} == {"ant"}
     fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
-    assert not at_rung(fewer, "kept50")
+    assert not at_strength(fewer, "kept50")
 
 
 def test_strengths_that_no_ladder_has_are_left_out():
     cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
     other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
-    assert ladders(other) == {}
+    assert Strengths.of(other).rungs == {}
     assert not ladder.tables(Board(other))
-    assert ladders(RECORDS + other).keys() == UNITS.keys()
+    assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
 
 
 def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
@@ -206,12 +207,6 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
         assert f"### {title}" in text
         assert title in shown.getvalue()
     assert "### rf: detection thresholds" in text
-
-
-def test_the_other_tables_are_means_over_the_rungs():
-    own = [r for r in RECORDS if r.detector == "rf"]
-    mean = sum(r.value("auc_matched") for r in own) / len(own)
-    assert layout.separability(Board(own)).rows[0][1] == f"{100 * mean:.1f}"
 
 
 def test_show_prints_thresholds(tmp_path, capsys):
@@ -239,7 +234,7 @@ def test_thresholds_come_as_flat_rows():
 
 
 def test_a_curve_has_the_mean_over_places_at_each_rung():
-    points = curve([r for r in RECORDS if r.detector == "rf"], FOUND)
+    points = curve([r for r in RECORDS if r.detector == "rf"], DETECTION)
     assert [p.value for p in points] == pytest.approx([0, 0, 0.25, (0.75 + 0.75 + 0.25) / 3])
     strengths = [1 / 4, 1, 4, (16 * 16 * 4) ** (1 / 3)]
     assert [p.strength for p in points] == pytest.approx(strengths)
@@ -263,10 +258,61 @@ def test_curves_are_drawn_against_strength_and_return_lost():
     assert by_auc.get_ylabel() == "matched AUC (%)"
 
 
-def test_what_cannot_be_drawn_is_told():
-    with pytest.raises(ResultsError, match="no results at several strengths with found_within_100"):
-        Results(example()).plot_ladder()
-    with pytest.raises(UnknownNameError, match="unknown anomaly 'fog'"):
-        Results(RECORDS).plot_ladder(anomalies="fog")
-    with pytest.raises(UnknownNameError, match="unknown metric 'auk'"):
-        Results(RECORDS).plot_ladder(metric="auk")
+# Strengths of one's own
+
+
+GRAVITY = {"0.1": 0.1, "0.5": 0.5, "1": 1.0, "10": 10.0}
+
+
+def own(detector, shares, environment="tank", **fields):
+    """Records at four strengths that no ladder has; a share of 4 episodes is found at each."""
+    return [
+        make_record(
+            detector, environment, "gravity", strength=name, magnitude=GRAVITY[name],
+            values={DETECTION: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
+                    "auc_matched": [0.5 + share / 2] * 4},
+            **fields,
+        ) for name, share in zip(GRAVITY, shares, strict=True)
+    ]  # fmt: skip
+
+
+def test_strengths_of_ones_own_give_a_threshold_and_a_column_each():
+    """A quarter is found at 0.1 and three at 0.5: one half lies at their geometric mean."""
+    records = [*own("rf", (0.25, 0.75, 0.75, 1)), *own("pe", (0, 0, 0.5, 1))]
+    values = {r["row"]: r["threshold"] for r in Results(records).thresholds()}
+    assert values == {"rf": pytest.approx(math.sqrt(0.05)), "pe": pytest.approx(1)}
+    table = table_of(records, "Detection thresholds, lower")
+    assert table.header[-4:] == ["0.1", "0.5", "1", "10"]  # by number, not by text
+    assert rows_of(table)["rf"]["threshold"].startswith("0.224 [")
+    assert [rows_of(table)["pe"][name] for name in GRAVITY] == ["0.0", "0.0", "50.0", "100.0"]
+    assert "in the units of the anomalies" in table.note
+    aucs = rows_of(table_of(records, "Matched AUC"))["rf"]
+    assert [aucs[name] for name in GRAVITY] == ["62.5", "87.5", "87.5", "100.0"]
+    by_kind = table_of(records, "Detection thresholds by anomaly")
+    assert rows_of(by_kind)["pe"]["gravity"] == "1"
+    assert by_kind.title.endswith("each in its own unit")
+    assert rows_of(table_of(records, "rf: detection", places=True))["tank"]["gravity"] == "0.224"
+
+
+def test_a_column_has_the_places_with_its_strength_alone():
+    records = own("rf", (0, 0, 1, 1)) + own("rf", (0.5, 0.5, 0.5, 0.5), environment="ant")[:2]
+    rows = rows_of(table_of(records, "Matched AUC"))
+    assert [rows["rf"][name] for name in GRAVITY] == ["62.5", "62.5", "100.0", "100.0"]
+
+
+def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
+    (record,) = [r for r in RECORDS if r.detector == "rf" and r.place == ("hopper", "iid@kept90")]
+    (rung,) = Strengths.of([record]).rungs["hopper", "iid"].values()
+    assert (rung.strength, rung.kept) == (40.0, 0.9)
+    other = dataclasses.replace(record, magnitude=30.0)
+    (rung,) = Strengths.of([other]).rungs["hopper", "iid"].values()
+    assert rung.strength == 30.0
+    assert math.isnan(rung.kept)
+
+
+def test_curves_of_ones_own_strengths_are_drawn_against_them():
+    pytest.importorskip("matplotlib")
+    (axis,) = Results(own("rf", (0, 0.25, 0.5, 1))).plot_ladder().axes
+    assert list(axis.lines[0].get_xdata()) == pytest.approx([*GRAVITY.values()])
+    assert list(axis.lines[0].get_ydata()) == pytest.approx([0, 25, 50, 100])
+    assert axis.get_xlabel() == "strength"

@@ -8,10 +8,14 @@ import pytest
 pytest.importorskip("gymnasium", reason="needs the extra sim")
 from helpers_own import TANK, forget_own
 from helpers_plugins import install
+from oodd_recording.info import code_digest
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
-from oodd_eval.data import own
+from oodd_eval.data import registry
+from oodd_eval.data.condition import Condition
+from oodd_eval.errors import SplitError
+from oodd_eval.results.directory import ResultsDirectory
 
 SIZES = ["--train", "6", "--calibration", "6", "--test", "3", "--seed-base", "77"]
 
@@ -58,7 +62,7 @@ def test_a_split_of_ones_own_is_recorded_and_evaluated(tank, capsys):
 def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_byte(tank):
     assert build("one", "--env", "valve", "--strength", "leak=0.1,2") == 0
     split = load_split("one")
-    assert split.conditions("valve") == ("leak@0.1", "leak@2")
+    assert split.anomalies == ("leak", "leak@0.1", "leak@2")
     assert split.environment("valve").discrete
     again = ["--jobs", "2", "--output", str(tank / "again")]
     assert build("one", "--env", "valve", "--strength", "leak=0.1,2", *again) == 0
@@ -71,6 +75,31 @@ def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_b
         return np.mean([np.abs(x.observations - twin.observations).mean() for x, twin in rows])
 
     assert 0 < distance(weak) < distance(strong)
+
+
+def test_every_strength_has_a_number_in_split_and_records_and_a_column(tank, capsys):
+    assert build("one", "--env", "tank", "--strength", "leak=0.1,0.5,2,3") == 0
+    split, numbers = load_split("one"), (0.1, 0.5, 2, 3)
+    assert split.strengths("tank") == {Condition("leak", f"{n:g}"): n for n in numbers}
+    assert main(["data", "info", "one"]) == 0
+    assert "strengths of leak (share of the flow): 0.1, 0.5, 2, 3" in capsys.readouterr().out
+    out = str(tank / "results")
+    assert (
+        main(["run", "--detector", "mewma", "--split", "one", "--env", "all", "--output", out]) == 0
+    )
+    text = capsys.readouterr().out
+    columns = text.partition("Matched AUC (%) by strength")[2].splitlines()[1]
+    assert columns.split() == ["detector", "0.1", "0.5", "2", "3"]
+    assert "Anomalies have several strengths" in text
+    assert [r.magnitude for r in ResultsDirectory(tank / "results").records()] == [*numbers]
+
+
+def test_a_strength_that_is_no_number_makes_no_manifest(tank):
+    assert build("one", "--env", "valve", "--strength", "leak=0.1,2") == 0
+    file = load_split("one").path / "manifest.json"
+    file.write_text(file.read_text().replace('"leak@2": 2.0', '"leak@2": "two"'))
+    with pytest.raises(SplitError, match="leak@2"):
+        load_split("one").strengths("valve")
 
 
 def test_ones_own_anomaly_is_recorded_in_an_environment_of_the_benchmark(tank, monkeypatch):
@@ -116,9 +145,9 @@ def test_what_cannot_be_recorded_is_said(tank, capsys, options, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"tank", Tank', '"hopper", Tank', "'hopper' cannot be the name of an environment"),
+        ('"tank", Tank', '"hopper", Tank', "'hopper' cannot be the name of a custom"),
         ('"tank", Tank', '"tank", lambda: Tank()', "at the top level of a module"),
-        ('"leak", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of an anomaly"),
+        ('"leak", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of a custom"),
         ("return [AnomalySpec(", "return (AnomalySpec(", "expected a list of oodd_eval.Anomaly"),
         ('EnvironmentSpec("valve"', 'EnvironmentSpec("leak"', "'leak' is offered twice"),
     ],
@@ -137,8 +166,8 @@ def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
     digests = set()
     for name in ("CartPole-v1", "Acrobot-v1"):
         make = functools.partial(gymnasium.make, name)
-        own.register([own.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
-        digests.add(own.code_digest("one", []))
+        registry.register([registry.EnvironmentSpec("one", make, "policy.npz", (), (), 99)])
+        digests.add(code_digest("one", []))
     assert len(digests) == 2
 
 

@@ -18,7 +18,7 @@ from oodd_eval.leaderboard.placing import neighbours, placement, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
 from oodd_eval.leaderboard.sections import sections
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import FOUND
+from oodd_eval.results.strengths import DETECTION
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
@@ -122,7 +122,7 @@ def test_show_prints_further_suites_unless_one_board_is_asked_for(
     board, tmp_path, monkeypatch, capsys
 ):
     rung = row("graded-one", 0.9, strength="kept99")
-    lines = (published.slim(r, ["auc_matched", FOUND], suite="graded").to_json() for r in rung)
+    lines = (published.slim(r, ["auc_matched", DETECTION], suite="graded").to_json() for r in rung)
     place = tmp_path / published.PUBLISHED
     place.write_bytes(published_bytes([board], "".join(f"{line}\n" for line in lines)))
     monkeypatch.setattr(published, "published_file", lambda: place)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.errors import OutputError, ResultsError, UsageError
 from oodd_eval.results import provenance
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -272,7 +273,7 @@ VALUES = st.recursive(
 def test_a_cell_is_read_back_from_its_text(overrides, horizon, seed, strength):
     overrides = {k: v for k, v in overrides.items() if k not in {"h", "seed"}}
     setting = Setting.of("pyod:IForest", horizon, overrides)
-    cell = Cell("mini@0a1b", "ant", "wind-l2r", setting, seed, strength)
+    cell = Cell("mini@0a1b", "ant", Condition("wind-l2r", strength), setting, seed)
     assert Cell.parse(str(cell)) == cell
 
 

@@ -17,6 +17,7 @@ from oodd_paper.run import (
 )
 
 from oodd_eval import load_split
+from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.identity import Setting
@@ -32,7 +33,8 @@ def mini():
 
 
 def make_unit(setting=RIQN, fit="a", seed=0, key=""):
-    return Unit("ant", setting, seed, ("iid", "drift"), {}, {}, "riqn", "oodd-eval", "1.0",
+    conditions = Condition("iid"), Condition("drift")
+    return Unit("ant", setting, seed, conditions, {}, {}, "riqn", "oodd-eval", "1.0",
                 scores_key=key, fit_key=fit)  # fmt: skip
 
 
@@ -41,7 +43,7 @@ def test_every_unit_is_there_once(mini):
     assert len(set(labels)) == len(labels) == 315
     assert len({u.scores_key for u in mini}) == 315
     assert {u.environment for u in mini} == set(ENVIRONMENTS)
-    assert all(len(u.anomalies) == 8 for u in mini)
+    assert all(len(u.conditions) == 8 for u in mini)
 
 
 def test_a_device_reaches_the_detectors_that_have_one_and_changes_no_row(mini):
@@ -135,9 +137,11 @@ def test_durations_are_readable(seconds, text):
 
 
 def finish(progress, unit, resumed=False, **changes):
-    for anomaly in unit.anomalies:
-        record = make_record(unit.setting.detector, unit.environment, anomaly, seed=unit.seed,
-                             horizon=unit.setting.horizon)  # fmt: skip
+    for condition in unit.conditions:
+        record = make_record(
+            unit.setting.detector, unit.environment, condition.anomaly, seed=unit.seed,
+            horizon=unit.setting.horizon,
+        )  # fmt: skip
         progress.oodd_cell_finished(dataclasses.replace(record, **changes), resumed=resumed)
 
 

@@ -9,7 +9,7 @@ from oodd_recording.rerun import check_installed, plan_of
 from test_submission_trust import entry, fresh, of_three  # noqa: F401  fixtures
 
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS
+from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import read_entry
@@ -41,7 +41,7 @@ def on(read, split):
 def test_seeds_are_drawn_once_and_stay(read, tmp_path):
     assert read_order(tmp_path / "again") is None
     first = draw(read, tmp_path / "again", NAMES, sandbox=True)
-    assert first.seed_base in OWN_SEED_BASES
+    assert first.seed_base in CUSTOM_SEED_BASES
     assert first == draw(read, tmp_path / "again", NAMES, sandbox=True)
     assert first == read_order(tmp_path / "again")
     others = {draw(read, tmp_path / str(k), NAMES, sandbox=True).seed_base for k in range(9)}

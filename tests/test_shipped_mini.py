@@ -47,39 +47,6 @@ def test_columns_are_named_as_in_the_facts(data):
     assert (data.sensors, data.actions) == (info.sensors, info.actions)
 
 
-def test_episodes_are_their_twins_bit_for_bit_before_the_effect_and_differ_at_it(data):
-    for anomaly in TABLE1:
-        part = data.anomalous(anomaly)
-        assert part.seeds.tolist() == data.twins.seeds.tolist()
-        for i, (x, twin) in enumerate(zip(part, data.twins, strict=True)):
-            onset, effect = part.onsets[i], part.effects[i]
-            assert 30 <= onset <= int(0.6 * twin.transitions)
-            assert onset <= effect < min(len(x), len(twin)), (anomaly, i)
-            same = x.observations[:effect].tobytes() == twin.observations[:effect].tobytes()
-            assert same, (anomaly, i)
-            assert (x.observations[effect] != twin.observations[effect]).any(), (anomaly, i)
-            assert x.actions[:effect].tobytes() == twin.actions[:effect].tobytes(), (anomaly, i)
-
-
-def test_tails_have_more_than_20_transitions_unless_100_redraws_failed(data):
-    for anomaly in TABLE1:
-        part = data.anomalous(anomaly)
-        tails = part.lengths - part.onsets
-        assert ((tails > 20) | (part.redraws == 100)).all(), anomaly
-        assert part.brief == (np.median(tails) < 20), anomaly
-
-
-def test_a_fifth_of_the_sensors_is_corrupted_and_never_a_discrete_one(data):
-    rows = np.concatenate([x.observations for x in data.train])
-    distinct = [len(np.unique(column)) for column in rows.T]
-    for anomaly in SENSOR:
-        for parameters in data.anomalous(anomaly).parameters:
-            chosen = parameters["sensors"]
-            assert len(set(chosen)) == len(chosen) == max(1, len(data.sensors) // 5)
-            assert not [data.sensors[s].name for s in chosen if "contact" in data.sensors[s].name]
-            assert min(distinct[s] for s in chosen) > 8
-
-
 # Stock simulators, driven by nothing but what the split stores
 
 CASES = [

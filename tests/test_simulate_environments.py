@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from gymnasium.envs.box2d import lunar_lander
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from helpers_simulate import SEEDS, Reflex
 from oodd_recording.anomalies import VALUES
@@ -13,7 +12,6 @@ from oodd_recording.record import record_nominal
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.split import load_split
-from oodd_eval.errors import UnknownNameError
 
 NOMINAL = {
     ("acrobot", "gravity"): 9.8, ("acrobot", "link_length_1"): 1.0,
@@ -98,11 +96,6 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(environment)
     assert first.shape[1] == ENVIRONMENTS[environment].observation_dim
 
 
-def test_unknown_environments_are_refused():
-    with pytest.raises(UnknownNameError, match="acrobot"):
-        make("acrobat")
-
-
 # Acrobot
 
 
@@ -125,13 +118,6 @@ def test_acrobot_swings_with_the_gravity_it_was_given():
 
 
 @pytest.mark.parametrize("simulator", ["acrobot"], indirect=True)
-def test_acrobot_centres_of_mass_follow_the_lengths(simulator):
-    simulator.set("link_length_2", 1.6)
-    assert simulator.env.LINK_COM_POS_2 == 0.8
-    assert simulator.env.LINK_COM_POS_1 == 0.5
-
-
-@pytest.mark.parametrize("simulator", ["acrobot"], indirect=True)
 def test_acrobot_wind_removes_torque_against_it_and_adds_one_unit_with_it(simulator):
     torques = {}
     for wind in (-1, 0, 1):
@@ -142,14 +128,6 @@ def test_acrobot_wind_removes_torque_against_it_and_adds_one_unit_with_it(simula
 
 
 # CartPole
-
-
-@pytest.mark.parametrize("simulator", ["cartpole"], indirect=True)
-def test_cartpole_derived_quantities_follow(simulator):
-    simulator.set("pole_mass", 0.4)
-    simulator.set("pole_length", 1.5)
-    assert simulator.env.total_mass == pytest.approx(1.4)
-    assert simulator.env.polemass_length == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize(
@@ -202,20 +180,6 @@ def test_lunarlander_engine_1_pushes_to_negative_x_and_wind_doubles_or_stops_it(
     assert speed_change(1, 1) == speed_change(-1, 3) == 0.0
 
 
-def test_lunarlander_module_constants_are_never_touched():
-    before = (lunar_lander.MAIN_ENGINE_POWER, lunar_lander.SIDE_ENGINE_POWER)
-    made = make("lunarlander")
-    made.reset(1)
-    made.set("main_engine_power", 10.5)
-    made.set("side_engine_power", 0.1)
-    made.wind = 1
-    for action in (1, 2, 3):
-        made.step(action)
-    made.close()
-    now = (lunar_lander.MAIN_ENGINE_POWER, lunar_lander.SIDE_ENGINE_POWER)
-    assert now == before
-
-
 def test_lunarlander_falls_with_the_gravity_it_was_given():
     falls = []
     for gravity in (None, 9.0):
@@ -246,15 +210,6 @@ def test_bullet_wind_is_added_to_every_motor_and_clipped(simulator):
     assert command.tolist() == [-1.0, 0.0, np.float32(0.9)]
 
 
-def test_bullet_clients_are_closed():
-    made = make("hopper")
-    made.reset(0)
-    client = made.env._p
-    assert client.isConnected()
-    made.close()
-    assert not client.isConnected()
-
-
 # Sensors that anomalies may corrupt
 
 
@@ -273,39 +228,3 @@ def test_listed_sensors_are_those_that_the_rule_gives_on_the_training_part_of_mi
     )
     listed = VALUES["sensors"][environment]
     assert sensors_to_corrupt(rows).tolist() == listed
-    # Counted once more, by hand.
-    for i, column in enumerate(rows.T.tolist()):
-        middle = sorted(column)[len(column) // 2]
-        moved = sum(abs(value - middle) > 1e-6 for value in column)
-        assert (moved >= 0.01 * len(column) and len(set(column)) > 8) == (i in listed), i
-
-
-def test_a_sensor_is_corrupted_if_it_varies_and_has_more_than_8_values():
-    n = np.arange(1000)
-    columns = {
-        "continuous": np.sin(n), "constant": 0 * n, "contact": n % 2, "eight values": n % 8,
-        "nine values": n % 9, "rounding only": 1 + 1e-9 * n,
-        "9 of 1000 rows differ": np.maximum(n - 990, 0), "10 do": np.maximum(n - 989, 0),
-    }  # fmt: skip
-    rows = np.stack(list(columns.values()), axis=1)
-    chosen = [list(columns)[i] for i in sensors_to_corrupt(rows)]
-    assert chosen == ["continuous", "nine values", "10 do"]
-
-
-def test_each_bullet_client_has_functions_of_its_own():
-    first, second = make("hopper"), make("hopper")
-    for simulator in (first, second):
-        simulator.reset(1)
-    clients = [
-        vars(s.env._p)["stepSimulation"].keywords["physicsClientId"] for s in (first, second)
-    ]
-    assert len(set(clients)) == 2
-    action = np.full(3, 0.5, np.float32)
-    rows = [first.step(action)[0] for _ in range(5)]
-    second.close()
-    rows.append(first.step(action)[0])
-    first.close()
-    alone = make("hopper")
-    alone.reset(1)
-    assert np.array_equal(rows, [alone.step(action)[0] for _ in range(6)])
-    alone.close()

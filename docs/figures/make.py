@@ -25,7 +25,7 @@ from oodd_eval.metrics.cusum import UNIT, Standardization, cusum
 from oodd_eval.plugins.contract import Detector, Scores
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.ladder import FOUND, curve
+from oodd_eval.results.strengths import DETECTION, curve
 
 ENVIRONMENT = "hopper"
 DYNAMICS, SENSOR = "components", "shutdown"
@@ -280,7 +280,7 @@ def draw_power() -> Figure:
     records = list(ResultsDirectory(LADDER).records())
     for name, colour in DRAWN.items():
         own = [r for r in records if str(r.setting) == name]
-        points = curve(own, FOUND)
+        points = curve(own, DETECTION)
         axes.plot(
             [p.strength for p in points],
             [100 * p.value for p in points],

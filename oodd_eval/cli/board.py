@@ -19,12 +19,12 @@ from oodd_eval.names import check_known, select
 from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
 from oodd_eval.results.render.terminal import print_sections
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import Section
+from oodd_eval.results.strengths import thresholds
 from oodd_eval.results.tables import ladder, layout
 
 _format_options: Final = together(

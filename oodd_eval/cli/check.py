@@ -59,7 +59,7 @@ def check(options: Options) -> int:
     try:
         offer = plugins.offer(options.name)
     except UnknownNameError:
-        if options.name in plugins.own_specs:
+        if options.name in plugins.custom_specs:
             return int(load("oodd_recording.commands:check_custom")(options, selects))
         raise
     offer.require()

@@ -9,8 +9,8 @@ from tabulate import tabulate
 from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
-from oodd_eval.data.ladder import rungs_of
-from oodd_eval.data.own import AnomalySpec, OwnSpec
+from oodd_eval.data.ladder import read_ladder, rungs_of
+from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -29,7 +29,7 @@ def info(options: Options) -> int:
         lines = _anomaly(ANOMALIES[name])
     else:
         plugins = discovered(options)
-        custom = plugins.own_specs
+        custom = plugins.custom_specs
         try:
             lines = _custom(*custom[name]) if name in custom else _detector(plugins.offer(name))
         except UnknownNameError:
@@ -51,7 +51,7 @@ def _environment(info: EnvironmentInfo) -> Lines:
         yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
 
 
-def _custom(spec: OwnSpec, origin: str) -> Lines:
+def _custom(spec: Spec, origin: str) -> Lines:
     if isinstance(spec, AnomalySpec):
         yield "anomaly", f"{spec.name}, {origin}"
         yield "group", spec.group
@@ -68,12 +68,16 @@ def _custom(spec: OwnSpec, origin: str) -> Lines:
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:
-    unit_of = load("oodd_recording.values:unit_of")
+    unit_of, bound_of = (load(f"oodd_recording.values:{name}") for name in ("unit_of", "bound_of"))
     of_paper = " of the paper" if info.id in TABLE1 else ""
     yield "anomaly", f"{info.id} ({info.title}{of_paper})"
     yield "group", info.group
     yield "what it changes", info.summary
     for environment in ENVIRONMENTS:
+        if info.id not in read_ladder().get(environment, {}):
+            bound, unit = bound_of(environment, info.id), unit_of(environment, info.id)
+            yield f"strength in {environment}", f"0 to {bound:g} ({unit}): not calibrated"
+            continue
         rungs = rungs_of(environment, info.id)
         ends = f"{rungs['kept99'].strength:.3g} to {[*rungs.values()][-1].strength:.3g}"
         strongest = [*rungs][-1]

@@ -9,7 +9,7 @@ from tabulate import tabulate
 
 from oodd_eval.cli import Options, command
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
+from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
 from oodd_eval.names import check_known
 from oodd_eval.plugins.discovery import Plugins, discover
@@ -56,7 +56,7 @@ def rows(kind: str, plugins: Plugins) -> Rows:
 
 def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
     """Yield the environments, or the anomalies, of plug-ins with their origin."""
-    for spec, origin in plugins.own_specs.values():
+    for spec, origin in plugins.custom_specs.values():
         if isinstance(spec, kind):
             yield spec, origin
 

@@ -41,7 +41,6 @@ DATA: Final[Commands] = {
     "export": ("write a split in another project's format", "oodd_eval.cli.data:export"),
     "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
     "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
-    "page": ("write the pages on environments (extra sim)", "oodd_recording.commands:page"),
 }
 
 LEADERBOARD: Final[Commands] = {

@@ -14,7 +14,7 @@ from rich.text import Text
 from oodd_eval._version import __version__
 from oodd_eval.cli import Options, say
 from oodd_eval.data.facts import PROTOCOL
-from oodd_eval.data.own import OwnSpec, register
+from oodd_eval.data.registry import Spec, register
 from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins, discover, printable
@@ -47,9 +47,9 @@ def discovered(options: Options) -> Plugins:
     return plugins
 
 
-def register_custom(options: Options) -> list[OwnSpec]:
+def register_custom(options: Options) -> list[Spec]:
     """Make environments and anomalies of plug-ins known in this process; return them."""
-    specs = [spec for spec, _ in discovered(options).own_specs.values()]
+    specs = [spec for spec, _ in discovered(options).custom_specs.values()]
     register(specs)
     return specs
 
@@ -82,7 +82,7 @@ class TerminalReporter:
         """Say what is going to happen."""
         self._start = time.perf_counter()
         self._sizes = {
-            (u.environment, u.setting.label(u.seed)): len(u.anomalies) for u in plan.units
+            (u.environment, u.setting.label(u.seed)): len(u.conditions) for u in plan.units
         }
         if self.verbosity < 0:
             return

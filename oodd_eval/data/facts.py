@@ -20,7 +20,7 @@ Group = Literal["sensor", "dynamics"]
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A sensor or an action: its name, and the unit of its numbers.
+    """A sensor or an action.
 
     Parameters
     ----------
@@ -41,115 +41,80 @@ class EnvironmentInfo:
 
     Parameters
     ----------
-    id
-        Its name here.
-    title
-        Its title in the paper.
-    simulator
-        Its name in Gymnasium.
+    id, title, simulator
+        Its name here, the paper's, and Gymnasium's.
     family
-        Kind of simulator; actions are discrete in ``"classic"``.
-    observation_dim
-        Number of sensors.
-    action_dim
-        Width of an action row; of discrete actions, whose rows are one-hot, their number.
-    policy
-        Algorithm of the nominal policy.
-    paper_return
-        Mean return of that policy in the paper's Table 2.
-    episode_cap
-        Transitions of the longest episode.
+        Kind of simulator: ``"classic"``, ``"bullet"``, or ``"custom"`` for a plug-in's.
+    discrete
+        Whether actions are discrete; they are one-hot rows then.
     sensors, actions
         Names and units of the columns of observations and of action rows.
-    numbers
-        True when actions are discrete in another family.
+    episode_cap
+        Longest episode in transitions.
+    paper_return
+        Mean return of the paper's policy in its Table 2; NaN for a custom environment.
     """
 
     id: str
     title: str
     simulator: str
-    family: Literal["classic", "bullet", "own"]
-    observation_dim: int
-    action_dim: int
-    policy: Literal["IQN", "TD3"]
-    paper_return: float
-    episode_cap: int
+    family: Literal["classic", "bullet", "custom"]
+    discrete: bool
     sensors: tuple[Quantity, ...]
     actions: tuple[Quantity, ...]
-    numbers: bool = False
+    episode_cap: int
+    paper_return: float = float("nan")
 
     @property
-    def discrete(self) -> bool:
-        """True when actions are discrete."""
-        return self.family == "classic" or self.numbers
+    def observation_dim(self) -> int:
+        """Number of sensors."""
+        return len(self.sensors)
+
+    @property
+    def action_dim(self) -> int:
+        """Width of an action row: the number of actions where they are discrete."""
+        return len(self.actions)
+
+    @property
+    def policy(self) -> Literal["IQN", "TD3"]:
+        """The algorithm of the nominal policy."""
+        return "IQN" if self.discrete else "TD3"
 
 
 @dataclass(frozen=True, slots=True)
 class AnomalyInfo:
-    """One kind of anomaly.
+    """One kind of anomaly of the benchmark.
 
     Parameters
     ----------
-    id
-        Its name here.
-    title
-        Its name in the paper.
+    id, title
+        Its name here and the paper's.
     group
-        Whether it changes sensors or dynamics.
+        ``"sensor"`` or ``"dynamics"``.
     summary
-        What it changes, in one sentence.
+        One line: what changes.
+    unit, bound, units, needs, needs_discrete, environments
+        How it is recorded, see `oodd_eval.data.registry.AnomalySpec`.
     """
 
     id: str
     title: str
     group: Group
     summary: str
+    unit: str
+    bound: float
+    units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+    needs_discrete: tuple[str, ...] = ()
+    environments: tuple[str, ...] = ()
 
 
 Suite = Literal["table1", "ladder", "paper"]
 
 
-def split_condition(condition: str) -> tuple[str, str]:
-    """Return the anomaly and the strength of a condition; the strength may be empty.
-
-    Parameters
-    ----------
-    condition
-        Such as ``"iid@kept99"``.
-
-    Returns
-    -------
-    tuple of str
-        Anomaly and strength.
-
-    Examples
-    --------
-    >>> split_condition("iid@kept99"), split_condition("iid")
-    (('iid', 'kept99'), ('iid', ''))
-    """
-    anomaly, _, strength = condition.partition("@")
-    return anomaly, strength
-
-
-def join_condition(anomaly: str, strength: str) -> str:
-    """Return the text of an anomaly and its strength, where it has one.
-
-    Parameters
-    ----------
-    anomaly, strength
-        Names; an empty strength is none.
-
-    Returns
-    -------
-    str
-        Such as ``"iid@kept99"``, or the anomaly alone.
-    """
-    return f"{anomaly}@{strength}" if strength else anomaly
-
-
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
-    """The recipe of a split: trajectories of each part, longest episode, seeds.
+    """The recipe of a split.
 
     Parameters
     ----------
@@ -186,31 +151,25 @@ class SplitDefinition:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """All fields that were given: a manifest's ``definition``."""
-        every = {own.name: getattr(self, own.name) for own in fields(self)}
-        return {n: v for n, v in every.items() if n not in _LATER or v != _LATER[n]}
+        """The manifest's ``definition``: all fields but those that are at their default."""
+        recipe = {field.name: getattr(self, field.name) for field in fields(self)}
+        # Older manifests lack these.
+        later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}}
+        return {n: value for n, value in recipe.items() if n not in later or value != later[n]}
 
-
-_LATER: Final[dict[str, Any]] = {
-    "suite": "table1",
-    "base": "",
-    "noise": 0.0,
-    "strengths": {},
-}  # older manifests lack these
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
-_COLUMNS: Final = json.loads(Path(__file__).with_name("quantities.json").read_text("utf-8"))
 
-
-def _quantities(environment: str) -> Any:
-    """Return what sensors and actions are, by these names."""
-    kinds = _COLUMNS[environment].items()
-    return {kind: tuple(Quantity(*row) for row in rows) for kind, rows in kinds}
+def _environment(row: Mapping[str, Any]) -> EnvironmentInfo:
+    columns = {
+        name: tuple(Quantity(*column) for column in row[name]) for name in ("sensors", "actions")
+    }
+    return EnvironmentInfo(**{**row, **columns})
 
 
 ENVIRONMENTS: Final = MappingProxyType(
-    {e["id"]: EnvironmentInfo(**e, **_quantities(e["id"])) for e in _TABLES["environment"]}
+    {row["id"]: _environment(row) for row in _TABLES["environment"]}
 )
 """Environments by id, in the order of the paper's tables."""
 
@@ -240,8 +199,8 @@ _SPLITS: Final = (
 SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 """The published splits by name."""
 
-OWN_SEED_BASES: Final = range(10, 900)
-"""Seed bases for splits of one's own: published splits have those below, policies those above."""
+CUSTOM_SEED_BASES: Final = range(10, 900)
+"""Seed bases of custom splits: published splits have those below, policies those above."""
 
 NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
 """Names of environments and anomalies: they become names of files and groups."""
@@ -262,8 +221,7 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     Parameters
     ----------
     names, known
-        Environments, anomalies or conditions. A condition that is not known, such as
-        ``"iid@0.5"``, has the place of its anomaly.
+        Environments or anomalies.
 
     Returns
     -------
@@ -275,15 +233,12 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
     >>> in_order(["mine", "hopper", "cartpole", "mine"], ENVIRONMENTS)
     ['cartpole', 'hopper', 'mine']
     """
-    place = {name: i for i, name in enumerate(known)}
-    last = len(place)
-    return sorted(
-        dict.fromkeys(names), key=lambda n: place.get(n, place.get(n.partition("@")[0], last))
-    )
+    position = {name: i for i, name in enumerate(known)}
+    return sorted(dict.fromkeys(names), key=lambda name: position.get(name, len(position)))
 
 
 def title_of(environment: str) -> str:
-    """Return the paper's title of an environment; of one's own, its name.
+    """Return the paper's title of an environment; of any other, its name.
 
     Parameters
     ----------

@@ -48,10 +48,11 @@ def describe(split: Split) -> str:
         title = f"{title_of(name)}: {size:.2f} MB, policy {entry['policy'][:12]}"
         with closing(split.environment(name)) as data:
             lines += ["", _table(title, HEADER, group_rows(data)), "", *column_lines(data)]
+            lines += strength_lines(split, name)
             returns[name] = collect_returns(data)
     title = "Table 2: mean return of the policies, nominal and under each anomaly"
-    found = {kind for own in returns.values() for kind in own}
-    kinds = ["nominal", *(name for name in split.anomalies if name in found and "@" not in name)]
+    recorded = {kind for by_kind in returns.values() for kind in by_kind}
+    kinds = ["nominal", *(n for n in split.anomalies if n in recorded and "@" not in n)]
     return "\n".join(
         [*lines, "", _table(title, ["Environment", "", *kinds], return_rows(returns, kinds))]
     )
@@ -89,6 +90,20 @@ def column_lines(data: EnvironmentData) -> list[str]:
     return lines
 
 
+def strength_lines(split: Split, environment: str) -> list[str]:
+    """Return the strengths of each kind of anomaly with their numbers and unit, one line a kind."""
+    units = split.manifest["environments"][environment].get("units", {})
+    kinds: dict[str, list[str]] = {}
+    for condition, number in split.strengths(environment).items():
+        name = condition.strength
+        text = f"{number:g}" if name in {"", f"{number:g}"} else f"{name} = {number:g}"
+        kinds.setdefault(condition.anomaly, []).append(text)
+    return [
+        f"strengths of {kind}{f' ({units[kind]})' if kind in units else ''}: {', '.join(texts)}"
+        for kind, texts in kinds.items()
+    ]
+
+
 def collect_returns(data: EnvironmentData) -> Returns:
     """Return the returns of the test part by kind."""
     return {"nominal": data.twins.returns} | {a: data.anomalous(a).returns for a in data.anomalies}
@@ -97,12 +112,11 @@ def collect_returns(data: EnvironmentData) -> Returns:
 def return_rows(returns: Mapping[str, Returns], kinds: Sequence[str]) -> Rows:
     """Return mean returns by environment and kind, ours above the paper's, which has no cap."""
     rows = []
-    for environment, found in returns.items():
-        ours = [f"{found[k].mean():.1f}" if k in found and len(found[k]) else "" for k in kinds]
+    for environment, by_kind in returns.items():
+        ours = [f"{by_kind[k].mean():.1f}" if len(by_kind.get(k, ())) else "" for k in kinds]
         rows.append([title_of(environment), "ours", *ours])
         if paper := paper_tables()["table2_policy_return"].get(environment):
-            known = [f"{paper[k]:.1f}" if k in paper else "" for k in kinds]
-            rows.append(["", "paper", *known])
+            rows.append(["", "paper", *(f"{paper[k]:.1f}" if k in paper else "" for k in kinds)])
     return rows
 
 

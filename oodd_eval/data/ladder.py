@@ -10,31 +10,20 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite, join_condition
+from oodd_eval.data.condition import PAPER, Condition
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite
 from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
 LADDER: Final = Path(__file__).with_name("ladder.json")
 
-LEVELS: Final = MappingProxyType(
-    {"kept99": 0.99, "kept95": 0.95, "kept90": 0.90, "kept75": 0.75, "kept50": 0.50}
-)
-"""Share of the nominal return that the policy keeps, by rung, weakest first."""
-
-FRACTIONS: Final = MappingProxyType({"64th": 1 / 64, "16th": 1 / 16, "4th": 1 / 4})
-"""Parts of the strength of ``kept99``, by rung, weakest first."""
-
-PAPER: Final = "paper"  # the rung at which the return's ratio is that of the paper's Table 2
-WHOLE: Final = "paper-whole"  # the same for robots, measured on whole episodes
+WHOLE: Final = "paper-whole"
+"""The rung ``paper`` of robots, measured on whole episodes."""
 
 ROBOTS_CAP: Final = 300
 """Longest episode of a robot at all other rungs, as in mini; other episodes run to their end."""
-
-RUNGS: Final = (*FRACTIONS, *LEVELS, PAPER)
-"""Names of all strengths, weakest first, and the paper's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,19 +53,18 @@ class Rung:
 @functools.cache
 def read_ladder(path: Path = LADDER) -> Mapping[str, Mapping[str, Any]]:
     """Return what ``ladder.json`` has for each environment and kind."""
-    found: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+    ladder: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+    return ladder
 
 
 def _entry(environment: str, kind: str) -> Mapping[str, Any]:
     check_known("anomaly", ANOMALIES, kind)
-    found = read_ladder().get(environment, {}).get(kind)
-    if found is None:
+    entry: Mapping[str, Any] | None = read_ladder().get(environment, {}).get(kind)
+    if entry is None:
         raise SplitError(
             f"no strengths of {kind} are calibrated in {environment}: name others, or measure them "
             f"with `oodd-eval data calibrate --env {environment}`"
         )
-    entry: Mapping[str, Any] = found
     return entry
 
 
@@ -99,30 +87,30 @@ def all_rungs_of(environment: str, kind: str) -> dict[str, Rung]:
 
 def strength_of(environment: str, kind: str, rung: str) -> float:
     """Return the strength of a rung, the paper's among them; `UnknownNameError` for another."""
-    known = all_rungs_of(environment, kind)
-    check_known(f"rung of {kind} in {environment}", known, rung)
-    return known[rung].strength
+    rungs = all_rungs_of(environment, kind)
+    check_known(f"rung of {kind} in {environment}", rungs, rung)
+    return rungs[rung].strength
 
 
 def conditions_of(
     suite: Suite, environment: str, episode_cap: int | None = None
-) -> dict[str, float | None]:
+) -> dict[Condition, float | None]:
     """Return the strength of each condition of a suite; None stands for the values of Table 1.
 
     What an anomaly costs a robot depends on the length of episodes: without `episode_cap` the
     suite ``paper`` takes the strengths that were measured on whole ones.
     """
     if suite == "table1":
-        return dict.fromkeys(TABLE1)
+        return {Condition(kind): None for kind in TABLE1}
     if suite == "paper":
         whole = episode_cap is None and not ENVIRONMENTS[environment].discrete
         rung = WHOLE if whole else PAPER
-        return {join_condition(a, PAPER): strength_of(environment, a, rung) for a in TABLE1}
+        return {Condition(a, PAPER): strength_of(environment, a, rung) for a in TABLE1}
     kinds = [kind for kind in ANOMALIES if kind in read_ladder().get(environment, {})]
     if not kinds:
         _entry(environment, next(iter(ANOMALIES)))
     return {
-        join_condition(kind, name): rung.strength
+        Condition(kind, name): rung.strength
         for kind in kinds
         for name, rung in rungs_of(environment, kind).items()
     }

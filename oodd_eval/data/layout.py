@@ -29,10 +29,9 @@ from oodd_eval.data.facts import (
     Group,
     Quantity,
     SplitDefinition,
-    split_condition,
 )
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, anomalies_in
+from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
@@ -194,8 +193,7 @@ def own_facts(environment: str, *, discrete: bool, groups: Mapping[str, Group]) 
 
     `groups` are those of all anomalies in the environment's file.
     """
-    kinds = {split_condition(name)[0]: group for name, group in groups.items()}
-    kinds = {kind: group for kind, group in kinds.items() if kind not in ANOMALIES}
+    kinds = {kind: group for kind, group in groups.items() if kind not in ANOMALIES}
     if environment in ENVIRONMENTS and not kinds:
         return {}
     return {"own": {"discrete": discrete, "anomalies": kinds}}
@@ -209,7 +207,7 @@ def discrete_actions(environment: str, entry: Mapping[str, Any]) -> bool:
 def groups_of(entry: Mapping[str, Any]) -> dict[str, Group]:
     """Return the groups of the anomalies of a manifest entry, by kind."""
     custom = entry["own"]["anomalies"] if "own" in entry else {}
-    kinds = (split_condition(condition)[0] for condition in anomalies_in(entry["groups"]))
+    kinds = (condition.anomaly for condition in conditions_in(entry["groups"]))
     return {kind: ANOMALIES[kind].group if kind in ANOMALIES else custom[kind] for kind in kinds}
 
 
@@ -318,9 +316,14 @@ def _manifest_schema() -> Any:
         sensors=names,
         actions=names,
     )
-    environment["fields"]["own"] = core_schema.typed_dict_field(custom, required=False)
+    strengths = by_name(text, core_schema.float_schema(ge=0, allow_inf_nan=False))
+    units = by_name(text, text)
+    for key, optional in (("own", custom), ("strengths", strengths), ("units", units)):
+        environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)
     environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
-    named = {"name": text, "definition": by_name(text), "generator": core_schema.int_schema()}
+    recipe = record()
+    recipe["fields"]["strengths"] = core_schema.typed_dict_field(strengths, required=False)
+    named = {"name": text, "definition": recipe, "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
     return SchemaValidator(manifest, core_schema.CoreConfig(strict=True))
 
@@ -408,6 +411,6 @@ def _problems(environments: Mapping[str, Any]) -> Iterator[str]:
         for part in (part for part in NOMINAL if part not in entry["groups"]):
             yield f"no group {part!r} of {environment}"
         described = entry["own"]["anomalies"] if "own" in entry else {}
-        kinds = {split_condition(condition)[0] for condition in anomalies_in(entry["groups"])}
+        kinds = {condition.anomaly for condition in conditions_in(entry["groups"])}
         for kind in sorted(kinds - {*ANOMALIES, *described}):
             yield f"an unknown anomaly {kind!r} in {environment} without a description"

@@ -12,15 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import (
-    ANOMALIES,
-    BRIEF_TAIL,
-    FIRST_ONSET,
-    Quantity,
-    in_order,
-    join_condition,
-)
-from oodd_eval.data.ladder import RUNGS
+from oodd_eval.data.condition import Condition, in_suite_order
+from oodd_eval.data.facts import BRIEF_TAIL, FIRST_ONSET, Quantity
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import SplitError
@@ -33,20 +26,15 @@ TWINS: Final = "test/nominal"
 NOMINAL: Final = (TRAIN, CALIBRATION, TWINS)
 """The nominal parts, which every environment has. Each part is a group of its file."""
 
-CONDITIONS: Final = tuple(
-    join_condition(anomaly, strength) for anomaly in ANOMALIES for strength in ("", *RUNGS)
-)
-"""Every anomaly of the benchmark, at every strength that a suite may have, in its order."""
-
 NAMES: Final = "names"  # the group that names the columns of observations and actions
 _ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 
 
-def anomalies_in(groups: Iterable[str]) -> tuple[str, ...]:
-    """Return the anomalies among groups such as ``"test/iid"``, in the benchmark's order."""
-    tests = (group.removeprefix("test/") for group in groups if group not in NOMINAL)
-    return tuple(in_order(sorted(tests), CONDITIONS))
+def conditions_in(groups: Iterable[str]) -> tuple[Condition, ...]:
+    """Return the conditions among groups such as ``"test/iid"``, in the benchmark's order."""
+    tests = sorted(group.removeprefix("test/") for group in groups if group not in NOMINAL)
+    return tuple(in_suite_order(map(Condition.parse, tests)))
 
 
 class TrajectorySet(TrajectorySequence):
@@ -104,8 +92,10 @@ class TrajectorySet(TrajectorySequence):
     def rewards(self, index: int) -> NDArray[np.float32]:
         """Return the rewards of trajectory number `index`, float32 of shape (T,)."""
         i = range(len(self))[index]
-        found: NDArray[np.float32] = self._data["rewards"][self._offsets[i] : self._offsets[i + 1]]
-        return found
+        rewards: NDArray[np.float32] = self._data["rewards"][
+            self._offsets[i] : self._offsets[i + 1]
+        ]
+        return rewards
 
     @property
     def returns(self) -> NDArray[np.float64]:
@@ -141,18 +131,18 @@ class AnomalousSet(TrajectorySet):
     @functools.cached_property
     def parameters(self) -> list[dict[str, Any]]:
         """Values that the anomaly drew for each trajectory; `SplitError` when they are no JSON."""
-        found: list[dict[str, Any]] = []
+        values: list[dict[str, Any]] = []
         for text in self._data["parameters"][:]:
             drawn: Any = None
             with contextlib.suppress(ValueError, RecursionError):
                 drawn = json.loads(text)
             if not isinstance(drawn, dict):
                 raise SplitError(
-                    f"{self.group}, parameters of trajectory {len(found)} are {text!r:.80}, "
+                    f"{self.group}, parameters of trajectory {len(values)} are {text!r:.80}, "
                     "expected a JSON object: build or fetch the split again"
                 )
-            found.append(drawn)
-        return found
+            values.append(drawn)
+        return values
 
     @property
     def tails(self) -> NDArray[np.int64]:
@@ -221,7 +211,7 @@ class TwinCheck:
                 f"{len(twins['seeds'])}, one for each twin"
             )
         onsets, effects = part["onsets"], part["effects"]
-        found = np.where(self._first < 0, onsets, self._first)
+        first = np.where(self._first < 0, onsets, self._first)
         for i in np.flatnonzero(part["seeds"] != twins["seeds"]) if self._recorded else ():
             raise SplitError(
                 f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
@@ -239,10 +229,10 @@ class TwinCheck:
             )
         if self._early:
             raise SplitError(f"{where}: {self._early} before its onset: build or fetch it again")
-        for i in np.flatnonzero(found != effects):
+        for i in np.flatnonzero(first != effects):
             raise SplitError(
                 f"{where}: trajectory {i} first differs from its twin at row "
-                f"{found[i]}, expected its effect, row {effects[i]}"
+                f"{first[i]}, expected its effect, row {effects[i]}"
             )
 
 
@@ -283,19 +273,19 @@ class EnvironmentData:
         self._file, self._parts = file, parts
         nominal = (TrajectorySet(parts, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
-        self.anomalies = anomalies_in(part for part in parts if part != NAMES)
+        self.anomalies = tuple(map(str, conditions_in(part for part in parts if part != NAMES)))
         self.sensors, self.actions = (
             tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, names[:]))
             for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
         )
 
-    def anomalous(self, anomaly: str) -> AnomalousSet:
+    def anomalous(self, anomaly: str | Condition) -> AnomalousSet:
         """Return the test trajectories with one anomaly, in the order of their twins.
 
         Parameters
         ----------
         anomaly
-            One of `anomalies`.
+            One of `anomalies`, or the condition that it names.
 
         Returns
         -------
@@ -307,7 +297,7 @@ class EnvironmentData:
         UnknownNameError
             When this split has no such anomaly.
         """
-        check_known(f"anomaly of {self._file.name}", self.anomalies, anomaly)
+        check_known(f"anomaly of {self._file.name}", self.anomalies, str(anomaly))
         return AnomalousSet(self._parts, f"test/{anomaly}")
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:
@@ -330,7 +320,9 @@ class EnvironmentData:
         self._file.close()
 
 
-def parts_of(data: EnvironmentData, anomalies: Iterable[str]) -> dict[str, TrajectorySet]:
+def parts_of(
+    data: EnvironmentData, anomalies: Iterable[str | Condition]
+) -> dict[str, TrajectorySet]:
     """Return the parts to score by name: calibration, the twins and the anomalies."""
     anomalous = {f"test/{a}": data.anomalous(a) for a in anomalies}
     return {CALIBRATION: data.calibration, TWINS: data.twins, **anomalous}

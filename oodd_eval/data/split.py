@@ -10,17 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order, split_condition
+from oodd_eval.data.condition import Condition, in_suite_order
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import (
-    CONDITIONS,
-    NAMES,
-    TRAIN,
-    TWINS,
-    EnvironmentData,
-    TwinCheck,
-    anomalies_in,
-)
+from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, TwinCheck, conditions_in
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
@@ -57,11 +50,11 @@ def data_home() -> Path:
 
 def split_directories() -> dict[str, Path]:
     """Return the directories of splits by name: shipped ones, then those in `data_home`."""
-    found: dict[str, Path] = {}
+    directories: dict[str, Path] = {}
     for home in (SHIPPED, data_home()):
         for manifest in sorted(home.glob(f"*/{MANIFEST}")):
-            found.setdefault(manifest.parent.name, manifest.parent)
-    return found
+            directories.setdefault(manifest.parent.name, manifest.parent)
+    return directories
 
 
 def load_split(name: str | Path) -> "Split":
@@ -136,8 +129,8 @@ class Split:
         """Names of the environments: the benchmark's in its order, then others in theirs."""
         return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
-    def conditions(self, environment: str) -> tuple[str, ...]:
-        """Return the anomalies of an environment, each with its strength if it has several.
+    def conditions(self, environment: str) -> tuple[Condition, ...]:
+        """Return the conditions of an environment: anomalies, each at its strengths.
 
         Parameters
         ----------
@@ -146,10 +139,29 @@ class Split:
 
         Returns
         -------
-        tuple of str
-            Such as ``"iid"`` or ``"iid@kept99"``, in the benchmark's order.
+        tuple of Condition
+            In the benchmark's order.
         """
-        return anomalies_in(self.manifest["environments"][environment]["groups"])
+        return conditions_in(self.manifest["environments"][environment]["groups"])
+
+    def strengths(self, environment: str) -> dict[Condition, float]:
+        """Return the strengths of an environment's conditions as numbers, as far as it has any.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+
+        Returns
+        -------
+        dict
+            Numbers by condition, in the unit of the kind of anomaly; empty for a split with the
+            values of the paper's Table 1.
+        """
+        entry, definition = self.manifest["environments"][environment], self.manifest["definition"]
+        numbers = entry.get("strengths", definition.get("strengths", {}))
+        conditions = {str(condition): condition for condition in self.conditions(environment)}
+        return {conditions[name]: float(n) for name, n in numbers.items() if name in conditions}
 
     @property
     def anomalies(self) -> tuple[str, ...]:
@@ -159,10 +171,10 @@ class Split:
     @property
     def groups(self) -> dict[str, Group]:
         """Groups of all anomalies, by kind."""
-        found: dict[str, Group] = {}
+        groups: dict[str, Group] = {}
         for entry in self.manifest["environments"].values():
-            found |= layout.groups_of(entry)
-        return found
+            groups |= layout.groups_of(entry)
+        return groups
 
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
         """Return the names that comma lists, globs or ``"all"`` select.
@@ -191,9 +203,8 @@ class Split:
         return chosen, select("anomaly", anomalies, known)
 
     def _names(self, *environments: str) -> tuple[str, ...]:
-        every = in_order((c for e in environments for c in self.conditions(e)), CONDITIONS)
-        kinds = (split_condition(condition)[0] for condition in every)
-        return tuple(dict.fromkeys((*kinds, *every)))
+        conditions = in_suite_order(c for e in environments for c in self.conditions(e))
+        return tuple(dict.fromkeys((*(c.anomaly for c in conditions), *map(str, conditions))))
 
     def train_digest(self, environment: str) -> str:
         """Return the digest of an environment's training part: what a fit depends on.
@@ -249,7 +260,7 @@ class Split:
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
-        """Give what opens environments, each once; all are closed when the block is left.
+        """Open environments, each once; all are closed when the block is left.
 
         Yields
         ------
@@ -307,11 +318,11 @@ class Split:
                 layout.check_names(file.name, parts)
                 break
             layout.check_layout(file.name, group, part)
-            found, said = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
-            if found != (said["trajectories"], said["transitions"]):
+            sizes, named = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
+            if sizes != (named["trajectories"], named["transitions"]):
                 raise SplitError(
-                    f"{file.name}, {group} has {found[0]} trajectories with {found[1]} "
-                    f"transitions, expected {said['trajectories']} with {said['transitions']}"
+                    f"{file.name}, {group} has {sizes[0]} trajectories with {sizes[1]} "
+                    f"transitions, expected {named['trajectories']} with {named['transitions']}"
                 )
         return parts
 
@@ -329,9 +340,9 @@ class Split:
             names = layout.names_digest(entry) if group == NAMES else ""
             expected = names or str(entry["groups"][group]["sha256"])
             pairs = TwinCheck(part, twins, recorded=recorded) if "onsets" in part else None
-            found = layout.content_digest(twins if group == TWINS else part, pairs)
-            yield GroupCheck(file.name, group, expected, found)
-            if pairs and found == expected:
+            digest = layout.content_digest(twins if group == TWINS else part, pairs)
+            yield GroupCheck(file.name, group, expected, digest)
+            if pairs and digest == expected:
                 pairs.finish(f"{file.name}, group {group}")
 
 
@@ -343,5 +354,5 @@ def _manifest(path: Path, _stamp: int) -> dict[str, Any]:
 @functools.cache
 def published_digests() -> dict[str, str]:
     """Return the digests of the published splits by name."""
-    found: dict[str, str] = json.loads((SHIPPED / "published.json").read_text(encoding="utf-8"))
-    return found
+    digests: dict[str, str] = json.loads((SHIPPED / "published.json").read_text(encoding="utf-8"))
+    return digests

@@ -143,7 +143,7 @@ def commands_of(records: Sequence[Record]) -> list[str]:
         environments, seeds, anomalies = rows.setdefault(record.setting, (set(), set(), set()))
         environments.add(record.environment)
         seeds.add(record.seed)
-        anomalies.add(record.condition)
+        anomalies.add(str(record.condition))
     alike: dict[tuple[str, ...], list[str]] = {}
     for setting, (environments, seeds, anomalies) in sorted(rows.items(), key=_in_order):
         whole = environments == set(ENVIRONMENTS)

@@ -17,9 +17,9 @@ from oodd_eval.metrics.catalogue import ALARM_RANKING, FOUND_WITHIN, HEADLINE, R
 from oodd_eval.results.board import Board, Conditions, boards, grouped
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import FOUND
 from oodd_eval.results.record import NAN, Metric, Record
 from oodd_eval.results.standings import RankedBoard, ranked
+from oodd_eval.results.strengths import DETECTION
 
 PUBLISHED: Final = "published.jsonl.gz"
 
@@ -96,7 +96,7 @@ def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") ->
 def suite_lines(suites: Iterable[SuiteSection]) -> str:
     """Return the lines of further test suites, of those that are graded."""
     return _text(
-        slim(record, (FOUND,), suite=suite.name)
+        slim(record, (DETECTION,), suite=suite.name)
         for suite in suites
         if suite.graded
         for record in suite.board.records

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import pluggy
 
 if TYPE_CHECKING:
-    from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
+    from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
     from oodd_eval.plugins.contract import DetectorSpec
 
 PROJECT: Final = "oodd_eval"

@@ -28,7 +28,7 @@ from oodd_eval.plugins.contract import DetectorSpec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
-    from oodd_eval.data.own import OwnSpec
+    from oodd_eval.data.registry import Spec
 
 _Spec = TypeVar("_Spec")
 
@@ -96,11 +96,11 @@ class Plugin:
             check_detector_spec(spec)
         return specs
 
-    def own_specs(self) -> list[OwnSpec]:
+    def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
-        from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, check_spec  # noqa: PLC0415
+        from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, check_spec  # noqa: PLC0415
 
-        specs: list[OwnSpec] = []
+        specs: list[Spec] = []
         for returned in self.hook.oodd_environments():
             specs += _list_of(returned, EnvironmentSpec, f"oodd_environments of {self}")
         for returned in self.hook.oodd_anomalies():
@@ -136,15 +136,15 @@ class Plugins:
         return {point.name for point in (*self._points, *self.observer_points)}
 
     @property
-    def own_specs(self) -> dict[str, tuple[OwnSpec, str]]:
+    def custom_specs(self) -> dict[str, tuple[Spec, str]]:
         """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
         for point in list(self._waiting):
             self._load(point)
-        offered: dict[str, tuple[OwnSpec, str]] = {}
+        offered: dict[str, tuple[Spec, str]] = {}
         for plugin in list(self.loaded.values()):
             with self.blaming(plugin.point):
-                of_plugin: dict[str, tuple[OwnSpec, str]] = {}
-                for spec in plugin.own_specs():
+                of_plugin: dict[str, tuple[Spec, str]] = {}
+                for spec in plugin.custom_specs():
                     if previous := offered.get(spec.name) or of_plugin.get(spec.name):
                         by = f"{previous[1]} and by {plugin}"
                         raise PluginError(f"{spec.name!r} is offered twice, by {by}")

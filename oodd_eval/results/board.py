@@ -10,7 +10,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, in_order, split_condition
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, in_order
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
@@ -78,7 +79,7 @@ class Board:
         self.protocol, self.limit = self.conditions.protocol, self.conditions.limit
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         cells = expected or expected_cells(self.records)
-        self._expected = {(e, split_condition(condition)[0]) for e, condition in cells}
+        self._expected = {(e, Condition.parse(condition).anomaly) for e, condition in cells}
         self._plugins: dict[Setting, str] = {}
         for r in self.records:
             self._plugins.setdefault(r.setting, r.plugin)
@@ -180,7 +181,7 @@ def expected_cells(records: Sequence[Record]) -> set[Position]:
     name = conditions.split
     if name in SPLITS and published_digests().get(name) == conditions.split_digest:
         suite, cap = SPLITS[name].suite, SPLITS[name].episode_cap
-        return {(e, condition) for e in ENVIRONMENTS for condition in conditions_of(suite, e, cap)}
+        return {(e, str(c)) for e in ENVIRONMENTS for c in conditions_of(suite, e, cap)}
     rows = grouped(records, lambda r: r.setting).values()
     counts = Counter(cell for row in rows for cell in {r.position for r in row})
     return {cell for cell, n in counts.items() if 2 * n >= len(rows)}

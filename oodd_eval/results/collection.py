@@ -21,11 +21,11 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.episode import ScoredEpisode
 from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.ladder import FOUND, Point, curve, threshold_rows
 from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
+from oodd_eval.results.strengths import DETECTION, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -204,8 +204,8 @@ class Results(Sequence[Record]):
         check_known("environment of these results", {r.environment for r in records}, environment)
         records = [r for r in records if r.environment == environment]
         kind = f"anomaly of these results in {environment}"
-        check_known(kind, {r.condition for r in records}, anomaly)
-        by_seed = {r.seed: r for r in records if r.condition == anomaly}
+        check_known(kind, {str(r.condition) for r in records}, anomaly)
+        by_seed = {r.seed: r for r in records if str(r.condition) == anomaly}
         seed = min(by_seed) if seed is None else seed
         if seed not in by_seed:
             raise UsageError(f"no detector seed {seed}: expected one of {sorted(by_seed)}")
@@ -226,7 +226,8 @@ class Results(Sequence[Record]):
         list of dict
             Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
             unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
-            ``strongest``. ``kept99`` is the strength that costs 1 % of the return.
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, NaN where
+            strengths are your own.
         """
         return threshold_rows(self.records)
 
@@ -276,7 +277,7 @@ class Results(Sequence[Record]):
         return plots.power(curves)
 
     def plot_ladder(
-        self, *rows: str, metric: str = FOUND, environments: str = "all", anomalies: str = "all"
+        self, *rows: str, metric: str = DETECTION, environments: str = "all", anomalies: str = "all"
     ) -> Figure:
         """Draw a metric against the strength of anomalies and against the return that they cost.
 
@@ -289,7 +290,8 @@ class Results(Sequence[Record]):
             nominal episodes have one; dotted is what false alarms alone give.
         environments, anomalies
             What is averaged over: comma lists and globs, as on the command line. Strengths are in
-            units of the strength that costs 1 % of the return, as each anomaly has its own unit.
+            units of the strength that costs 1 % of the return, as each anomaly has its own unit;
+            strengths of your own are in the unit of the anomaly.
 
         Returns
         -------
@@ -310,7 +312,9 @@ class Results(Sequence[Record]):
             for name in filter(None, (metric, info.null))
         ]
         if not any(curves[0].values()):
-            raise ResultsError(f"no results at several strengths with {metric}: run a ladder split")
+            raise ResultsError(
+                f"no results at several strengths with {metric}: run a split that has some"
+            )
         return plots.ladder(curves[0], curves[-1] if info.null else {}, info)
 
     def _row(self, name: str) -> Setting:
@@ -332,7 +336,7 @@ class Results(Sequence[Record]):
                 anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
-                pairs = zip(file.parts[f"test/{record.condition}"], file.parts[TWINS], strict=True)
+                pairs = zip(file.parts[record.condition.part], file.parts[TWINS], strict=True)
                 yield [
                     ScoredEpisode(
                         record.cell,

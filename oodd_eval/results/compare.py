@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from oodd_eval.data.facts import join_condition
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
@@ -237,8 +236,7 @@ def _require_common(now: RecordSet, reference: RecordSet, common: Sequence[Condi
 
 
 def _parts(cell: Cell) -> _Unit:
-    condition = join_condition(cell.anomaly, cell.strength)
-    return cell.split, f"{cell.environment}/{condition}", cell.label
+    return cell.split, f"{cell.environment}/{cell.condition}", cell.label
 
 
 def _units(cells: Mapping[Cell, Record], by: By) -> dict[_Unit, list[Cell]]:

@@ -45,7 +45,7 @@ def make_curves(
                 at = thresholds(scores[TWINS], rule)
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
-            anomalous = scores[f"test/{record.condition}"]
+            anomalous = scores[record.condition.part]
             known = data.anomalous(record.condition)
             onsets, effects = (
                 part[: len(anomalous)].tolist() for part in (known.onsets, known.effects)
@@ -112,9 +112,14 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
 
 
 def strict_model(**types: Any) -> Any:
-    """Return a model of JSON objects that have these fields, no others, and only finite numbers."""
+    """Return a model of JSON objects that have these fields, no others, and only finite numbers.
+
+    A type in a pair with a default may be missing.
+    """
     strict = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-    fields: dict[str, Any] = {name: (kind, ...) for name, kind in types.items()}
+    fields: dict[str, Any] = {
+        name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in types.items()
+    }
     return create_model("Part", __config__=strict, **fields)
 
 

@@ -101,9 +101,9 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
 
 
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
-    anomalous, known = scores.parts[f"test/{record.condition}"], data.anomalous(record.condition)
+    anomalous, known = scores.parts[record.condition.part], data.anomalous(record.condition)
     starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
-    explained = scores.explained.get(f"test/{record.condition}", [])
+    explained = scores.explained.get(record.condition.part, [])
     metrics, contributions = cell_metrics(
         anomalous,
         scores.parts[TWINS],

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from oodd_eval.data.condition import Condition
 from oodd_eval.errors import UsageError
 
 # A text value that needs quotes: it would be read as JSON, or holds what separates values.
@@ -48,7 +49,19 @@ class Setting:
     def of(
         cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
     ) -> "Setting":
-        """Make a setting from a mapping of the parameters that are not at their default."""
+        """Make a setting from a mapping of the parameters that are not at their default.
+
+        Parameters
+        ----------
+        detector, horizon
+            As those of the class.
+        overrides
+            Values by name.
+
+        Returns
+        -------
+        Setting
+        """
         if not overrides:  # as in most of the tens of thousands of records that a board reads
             return _plain(detector, horizon)
         names = sorted(overrides)
@@ -78,10 +91,10 @@ class Setting:
         True
         """
         match = re.fullmatch(r"([^\[]+)(?:\[(.*)\])?", text)
-        given = _read_settings(match[2] or "") if match else None
-        if match is None or given is None:
+        settings = _read_settings(match[2] or "") if match else None
+        if match is None or settings is None:
             raise UsageError(f"{text!r} is no setting: expected DETECTOR[h=N,NAME=VALUE,...]")
-        return cls.of(match[1], given.pop("h", 1), given)
+        return cls.of(match[1], settings.pop("h", 1), settings)
 
     def label(self, seed: int) -> str:
         """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
@@ -97,18 +110,18 @@ class Cell:
 
     Parameters
     ----------
-    split, environment, anomaly
+    split, environment
         Names. A split that is not the published one carries the start of its digest: ``mini@0a1b``.
+    condition
+        The anomaly at its strength.
     setting
         The detector.
     seed
         Seed of the detector.
-    strength
-        Strength of the anomaly where the suite has several, else empty.
 
     Examples
     --------
-    >>> cell = Cell("mini", "hopper", "iid", Setting("riqn"), seed=0)
+    >>> cell = Cell("mini", "hopper", Condition("iid"), Setting("riqn"), seed=0)
     >>> str(cell)
     'mini/hopper/iid::riqn[h=1,seed=0]'
     >>> Cell.parse(str(cell)) == cell
@@ -117,16 +130,13 @@ class Cell:
 
     split: str
     environment: str
-    anomaly: str
+    condition: Condition
     setting: Setting
     seed: int = 0
-    strength: str = ""
 
     def __str__(self) -> str:
         """Return the text that is printed and that ``-k`` matches."""
-        strength = f"@{self.strength}" if self.strength else ""
-        place = f"{self.split}/{self.environment}/{self.anomaly}{strength}"
-        return f"{place}::{self.label}"
+        return f"{self.split}/{self.environment}/{self.condition}::{self.label}"
 
     @property
     def label(self) -> str:
@@ -136,24 +146,24 @@ class Cell:
     @classmethod
     def parse(cls, text: str) -> "Cell":
         """Read what `str` writes; a text of another form raises `UsageError`."""
-        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+)(?:@([^/:]+))?::([^\[]+)\[(.*)\]", text)
-        settings = _read_settings(match[6]) if match else None
+        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+(?:@[^/:]+)?)::([^\[]+)\[(.*)\]", text)
+        settings = _read_settings(match[5]) if match else None
         if match is None or settings is None or not {"h", "seed"} <= settings.keys():
             raise UsageError(
                 f"{text!r} is no cell: expected SPLIT/ENVIRONMENT/ANOMALY::DETECTOR[h=N,seed=N]"
             )
-        split, environment, anomaly, strength, detector, _ = match.groups()
+        split, environment, condition, detector, _ = match.groups()
         horizon, seed = settings.pop("h"), settings.pop("seed")
         setting = Setting.of(detector, horizon, settings)
-        return cls(split, environment, anomaly, setting, seed, strength or "")
+        return cls(split, environment, Condition.parse(condition), setting, seed)
 
 
 def _bracketed(detector: str, settings: Mapping[str, Any]) -> str:
-    shown = ",".join(f"{name}={_shown(value)}" for name, value in settings.items())
-    return f"{detector}[{shown}]" if shown else detector
+    text = ",".join(f"{name}={_text(value)}" for name, value in settings.items())
+    return f"{detector}[{text}]" if text else detector
 
 
-def _shown(value: Any) -> str:
+def _text(value: Any) -> str:
     """Return a value as JSON, or a plain text without quotes where that reads back as the same."""
     if isinstance(value, str) and not _QUOTED.search(value) and _read(value) == value:
         return value

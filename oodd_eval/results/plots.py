@@ -10,7 +10,7 @@ import numpy as np
 from oodd_eval.errors import MissingExtraError, ResultsError
 from oodd_eval.metrics.catalogue import MetricInfo
 from oodd_eval.results.episode import ScoredEpisode
-from oodd_eval.results.ladder import Point
+from oodd_eval.results.strengths import Point
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -124,15 +124,16 @@ def ladder(
 
     What chance or false alarms alone give is dotted.
     """
-    figure, (left, right) = _subplots(1, 3.6, columns=2)
+    costs = any(not np.isnan(p.lost) for points in curves.values() for p in points)
+    figure, grid = _subplots(1, 3.6, columns=1 + costs)
+    axes = np.atleast_1d(grid)
+    left = axes[0]
     percent = 100 if metric.unit == "percent" else 1
     for (name, points), colour in zip(curves.items(), COLOURS * 9, strict=False):
         for drawn, style in ((points, "o-"), (nulls.get(name, ()), ":")):
             label = name if style == "o-" else None
-            for axis, x in (
-                (left, [p.strength for p in drawn]),
-                (right, [100 * p.lost for p in drawn]),
-            ):
+            against = [p.strength for p in drawn], [100 * p.lost for p in drawn]
+            for axis, x in zip(axes, against, strict=False):
                 known = ~np.isnan(x)
                 y = percent * np.array([p.value for p in drawn])
                 axis.plot(
@@ -145,10 +146,10 @@ def ladder(
                     label=label,
                 )
     left.set_xscale("log")
-    left.set_xlabel("strength (1: costs 1 % of the return)")
-    right.set_xlabel("return lost (%)")
+    left.set_xlabel("strength (1: costs 1 % of the return)" if costs else "strength")
+    axes[-1].set_xlabel("return lost (%)" if costs else "strength")
     left.set_ylabel(metric.title + (" (%)" if metric.unit == "percent" else ""))
     if metric.unit == "percent":
         left.set_ylim(0, 102)
-    _beside(right)
+    _beside(axes[-1])
     return figure

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, GetPydanticSchema, TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import join_condition
+from oodd_eval.data.condition import Condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.identity import Cell, Setting
@@ -82,8 +82,11 @@ class Record:
     deterministic
         Whether its seed changes nothing.
     environment, anomaly, strength, group, horizon, seed, split, split_digest, limit
-        The evaluation. `strength` is empty where an anomaly has only one; `limit` is the number of
-        trajectories of each part that were used, None for all.
+        The evaluation. `strength` is a name, empty where an anomaly has only one; `limit` is the
+        number of trajectories of each part that were used, None for all.
+    magnitude
+        The strength as a number in the anomaly's unit; None where the split names none, and in
+        records that were written before it was kept.
     status, reason
         ``"ok"``, or the way in which the detector failed and one line about it.
     metrics
@@ -126,6 +129,7 @@ class Record:
     alarm: Literal["cusum", "score"] = "cusum"
     deterministic: bool = False
     strength: str = ""
+    magnitude: float | None = None
     limit: int | None = None
     reason: str = ""
     metrics: dict[str, Metric] = field(default_factory=dict)
@@ -164,19 +168,17 @@ class Record:
     @property
     def cell(self) -> Cell:
         """The evaluation; its text is what users see."""
-        return Cell(
-            self.split, self.environment, self.anomaly, self.setting, self.seed, self.strength
-        )
+        return Cell(self.split, self.environment, self.condition, self.setting, self.seed)
 
     @property
-    def condition(self) -> str:
-        """The anomaly, with its strength where it has several."""
-        return join_condition(self.anomaly, self.strength)
+    def condition(self) -> Condition:
+        """The anomaly at its strength."""
+        return Condition(self.anomaly, self.strength)
 
     @property
     def position(self) -> tuple[str, str]:
         """Environment and condition: the column of a board that the record belongs to."""
-        return self.environment, self.condition
+        return self.environment, str(self.condition)
 
     @property
     def identity(self) -> tuple[str, ...]:
@@ -195,8 +197,13 @@ class Record:
         return self.metrics[metric].value
 
     def to_json(self) -> str:
-        """Return one line of JSON, keys in a fixed order, NaN as null."""
+        """Return one line of JSON, keys in a fixed order, NaN as null.
+
+        Without a number of its strength the record has no ``magnitude``, as before there was one.
+        """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        if self.magnitude is None:
+            del plain["magnitude"]
         plain |= {name: _finite(plain[name]) for name in _COSTS}
         plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
         plain["metrics"] = {

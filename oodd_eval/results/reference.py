@@ -8,9 +8,9 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from oodd_eval.data.condition import in_suite_order
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.files import packed, write_bytes
-from oodd_eval.data.parts import CONDITIONS
 from oodd_eval.errors import ResultsError
 from oodd_eval.names import Predicate
 from oodd_eval.results.board import Conditions
@@ -71,7 +71,7 @@ def write_reference(
     """
     records = list(records)
     environments = in_order((r.environment for r in records), ENVIRONMENTS)
-    conditions = in_order((r.condition for r in records), CONDITIONS)
+    conditions = in_suite_order(r.condition for r in records)
 
     def order(r: Record) -> tuple[str, str, int, int, str]:
         position = environments.index(r.environment), conditions.index(r.condition)

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.results.board import Board, boards
-from oodd_eval.results.ladder import thresholds
 from oodd_eval.results.record import Record
+from oodd_eval.results.strengths import thresholds
 from oodd_eval.results.tables import Table, ladder, layout
 
 Detail = Literal["brief", "wide", "full"]

@@ -1,13 +1,14 @@
-"""A plan: the units of a run (one fit each) and their cells (one anomaly each). Data only.
+"""A plan: the units of a run (one fit each) and their cells (one condition each). Data only.
 
 From names to a plan: settings are resolved and keys are made here, once.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
-from oodd_eval.data.facts import PROTOCOL, Group, split_condition
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
@@ -22,19 +23,18 @@ DEVICES: Final = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One fit: setting x seed x environment, and the anomalies that it scores.
+    """One fit: setting x seed x environment, and the conditions that it scores.
 
-    `anomalies` are conditions, such as ``"iid"`` or ``"iid@kept99"``. `parameters` are all that the
-    factory gets, sorted by name; `recorded` are those that are part of the result, so not the
-    device. `plugin` is empty for a factory of this process, which has no `source` (the digest of a
-    plug-in's code) and no key of a stored fit; its scores are stored under a key, but never taken
-    from there by a later run.
+    `parameters` are all that the factory gets, sorted by name; `recorded` are those that are part
+    of the result, so not the device. `plugin` is empty for a factory of this process, which has no
+    `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored
+    under a key, but never taken from there by a later run.
     """
 
     environment: str
     setting: Setting
     seed: int
-    anomalies: tuple[str, ...]
+    conditions: tuple[Condition, ...]
     parameters: Mapping[str, Any]
     recorded: Mapping[str, Any]
     plugin: str
@@ -58,7 +58,7 @@ class Plan:
     """All units of a run, in the order in which they are begun and recorded.
 
     Of each part the first `limit` trajectories are used; None means all. `groups` are those of
-    anomalies by name.
+    anomalies by name, `strengths` the numbers of the split's strengths by environment.
     """
 
     split: str
@@ -66,28 +66,27 @@ class Plan:
     units: tuple[Unit, ...]
     groups: Mapping[str, Group]
     limit: int | None = None
+    strengths: Mapping[str, Mapping[Condition, float]] = field(default_factory=dict)
 
     @property
     def cells(self) -> list[Cell]:
         """All cells, in order."""
-        return [self.cell(unit, anomaly) for unit in self.units for anomaly in unit.anomalies]
+        return [self.cell(unit, condition) for unit in self.units for condition in unit.conditions]
 
-    def cell(self, unit: Unit, anomaly: str) -> Cell:
+    def cell(self, unit: Unit, condition: Condition) -> Cell:
         """Return one cell of a unit."""
-        kind, strength = split_condition(anomaly)
-        return Cell(self.split, unit.environment, kind, unit.setting, unit.seed, strength)
+        return Cell(self.split, unit.environment, condition, unit.setting, unit.seed)
 
     def matching(self, predicate: Predicate) -> "Plan":
         """Return the plan with those cells only whose text passes, without empty units."""
         units = (
-            replace(u, anomalies=tuple(a for a in u.anomalies if predicate(str(self.cell(u, a)))))
+            replace(u, conditions=tuple(c for c in u.conditions if predicate(str(self.cell(u, c)))))
             for u in self.units
         )
-        return replace(self, units=tuple(u for u in units if u.anomalies))
+        return replace(self, units=tuple(u for u in units if u.conditions))
 
-    def blank(self, unit: Unit, anomaly: str, **outcome: Any) -> Record:
+    def blank(self, unit: Unit, condition: Condition, **outcome: Any) -> Record:
         """Return the record of a cell with its identity filled in, and no metrics."""
-        kind, strength = split_condition(anomaly)
         return Record(
             detector=unit.setting.detector,
             horizon=unit.setting.horizon,
@@ -101,9 +100,10 @@ class Plan:
             alarm=unit.alarm,
             deterministic=unit.deterministic,
             environment=unit.environment,
-            anomaly=kind,
-            strength=strength,
-            group=self.groups[kind],
+            anomaly=condition.anomaly,
+            strength=condition.strength,
+            magnitude=self.strengths.get(unit.environment, {}).get(condition),
+            group=self.groups[condition.anomaly],
             split=self.split,
             split_digest=self.split_digest,
             limit=self.limit,
@@ -144,7 +144,8 @@ def make_plan(
         for horizon in horizons
         for seed in seeds
     )
-    return Plan(split.name, split.digest, units, split.groups, limit)
+    strengths = {environment: split.strengths(environment) for environment in environments}
+    return Plan(split.name, split.digest, units, split.groups, limit, strengths)
 
 
 def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str, Any]]) -> None:
@@ -160,11 +161,11 @@ def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str,
         chosen["device"] = device
 
 
-def _chosen(conditions: Sequence[str], names: Sequence[str] | None) -> tuple[str, ...]:
+def _chosen(conditions: Sequence[Condition], names: Sequence[str] | None) -> tuple[Condition, ...]:
     """Return the conditions that some names choose, in the order of the names."""
     if names is None:
         return tuple(conditions)
-    chosen = (c for name in names for c in conditions if name in (c, split_condition(c)[0]))
+    chosen = (c for name in names for c in conditions if name in (str(c), c.anomaly))
     return tuple(dict.fromkeys(chosen))
 
 
@@ -173,7 +174,7 @@ def make_unit(
     values: Mapping[str, Any],
     split: Split,
     environment: str,
-    anomalies: Sequence[str],
+    conditions: Sequence[Condition],
     horizon: int,
     seed: int,
     limit: int | None,
@@ -215,7 +216,7 @@ def make_unit(
         environment=environment,
         setting=Setting.of(spec.name, horizon, overrides),
         seed=seed,
-        anomalies=tuple(anomalies),
+        conditions=tuple(conditions),
         parameters=resolved,
         recorded=recorded,
         plugin=offer.plugin,

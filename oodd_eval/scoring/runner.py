@@ -179,7 +179,7 @@ def _in_dependence(
 
 
 def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Record]:
-    """Return the records of a unit's cells, in the order of its anomalies."""
+    """Return the records of a unit's cells, in the order of its conditions."""
     plan, unit, cost = job.plan, job.unit, scored.file.cost
     counts = {"train": job.data.train, "calibration": job.data.calibration, "test": job.data.twins}
     # A whole number, also when it was read back from a file of floats.
@@ -193,5 +193,5 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
         "provenance": {**origin, **device},
         **{name: cost[name] for name in COSTS if name in cost},
     }
-    records = [plan.blank(unit, anomaly, **outcome) for anomaly in unit.anomalies]
+    records = [plan.blank(unit, condition, **outcome) for condition in unit.conditions]
     return evaluated(records, scored.file, job.data) if scored.status == "ok" else records

@@ -67,7 +67,7 @@ class UnitJob:
         self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
     ) -> Scored:
         """Return the unit's scores, or how its detector failed."""
-        work = GroupedScoring(self, parts_of(self.data, self.unit.anomalies))
+        work = GroupedScoring(self, parts_of(self.data, self.unit.conditions))
         if self.unit.local:
             return work.in_process()
         if reason := self.offer.unavailable():
@@ -89,7 +89,7 @@ class UnitJob:
         """Return the scores that an earlier run has kept, if they are there and fit."""
         if results is None:
             return None
-        lengths = lengths_of(parts_of(self.data, self.unit.anomalies), self.plan.limit)
+        lengths = lengths_of(parts_of(self.data, self.unit.conditions), self.plan.limit)
         kept = results.scores(self.unit.scores_key, lengths)
         return Scored(file=kept, resumed=True) if kept else None
 

@@ -13,7 +13,8 @@ from typing import Final, NamedTuple
 
 from pydantic import TypeAdapter
 
-from oodd_eval.data.facts import TABLE1, split_condition
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.files import forms, write_bytes
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
@@ -123,7 +124,8 @@ def keep_inputs(directory: Path, reproduction: Reproduction, split: Split) -> No
     for name in split.environments:
         with contextlib.closing(split.environment(name)) as data:
             sets = {"nominal": data.twins} | {c: data.anomalous(c) for c in data.anomalies}
-            returns[name] = {split_condition(c)[0]: s.returns.tolist() for c, s in sets.items()}
+            by_part = {Condition.parse(c).anomaly: s.returns.tolist() for c, s in sets.items()}
+            returns[name] = by_part
     write_changed(directory / RETURNS, dump_returns(returns, split.digest))
 
 

@@ -81,7 +81,7 @@ def stage_of(unit: Unit) -> int:
 def unfinished(units: Iterable[Unit], records: Iterable[Record]) -> list[Unit]:
     """Return the units of which not all cells have been scored without failure."""
     finished = {(record.scores, record.condition) for record in records if record.ok}
-    return [u for u in units if any((u.scores_key, a) not in finished for a in u.anomalies)]
+    return [u for u in units if any((u.scores_key, c) not in finished for c in u.conditions)]
 
 
 def scored_rows(split: Split) -> dict[str, int]:
@@ -166,7 +166,7 @@ class Progress:
         """Tell of a unit when its last cell is there."""
         key = record.environment, record.cell.label
         self._cells[key] += 1
-        if key not in self._open or self._cells[key] < len(self._open[key].anomalies):
+        if key not in self._open or self._cells[key] < len(self._open[key].conditions):
             return
         self._fitted.add(self._open.pop(key).fit_key)
         took = record.seconds_fit + record.seconds_score

@@ -36,7 +36,7 @@ class Draw(Fault):
         self.attributes = attributes or {}
 
     def begin(self, simulator: Simulator, rows: Any) -> None:
-        """Give the simulator's attributes their new values."""
+        """Set the simulator's attributes to their new values."""
         for attribute, value in self.attributes.items():
             simulator.set(attribute, value)
 

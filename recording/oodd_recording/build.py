@@ -25,32 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.facts import (
-    ENVIRONMENTS,
-    PART_OFFSETS,
-    SplitDefinition,
-    in_order,
-    split_condition,
-)
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
 from oodd_eval.data.files import remove_abandoned, replacing
 from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
-from oodd_eval.data.own import (
-    MEASURED,
-    AnomalySpec,
-    EnvironmentSpec,
-    Measured,
-    anomaly_info,
-    code_digest,
-    info_of,
-    kinds_of,
-    register,
-    registered,
-)
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
+from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
+from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
     GENERATOR_VERSION,
@@ -84,7 +69,7 @@ class Chunk:
     count: int
     episode_cap: int | None
     noise: float
-    conditions: tuple[tuple[str, float | None], ...]
+    conditions: tuple[tuple[Condition, float | None], ...]
     policy_digest: str
     policy: str
 
@@ -149,7 +134,7 @@ def _write(
     environment, policy = chunks[-1].environment, chunks[-1].policy_digest
     conditions = [condition for condition, _ in chunks[-1].conditions]
     info = info_of(environment)
-    kinds = {c: anomaly_info(split_condition(c)[0]).group for c in conditions}
+    kinds = {c.anomaly: anomaly_spec(c.anomaly).group for c in conditions}
     files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
     with contextlib.ExitStack() as stack:
         taken: dict[str, layout.Arrays] = {}
@@ -162,7 +147,7 @@ def _write(
         }
         groups = (
             (part, taken.get(part) or _joined(part, files[part.split("/")[0]], held))
-            for part in (TRAIN, CALIBRATION, TWINS, *(f"test/{c}" for c in conditions))
+            for part in (TRAIN, CALIBRATION, TWINS, *(c.part for c in conditions))
         )
         return layout.write_environment(
             directory / f"{environment}.h5",
@@ -195,7 +180,7 @@ def _check_strengths(definition: SplitDefinition, environment: str) -> None:
             f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}"
         )
     for condition, strength in definition.strengths.items():
-        kind = split_condition(condition)[0]
+        kind = Condition.parse(condition).anomaly
         check_known(f"anomaly that {environment} can have", kinds_of(environment), kind)
         if not 0 <= strength <= bound_of(environment, kind):
             most, unit = bound_of(environment, kind), unit_of(environment, kind)
@@ -209,7 +194,7 @@ def _acting(definition: SplitDefinition, environment: str, path: str) -> str:
     """Return the digest of what acts in an environment: policy, and code of one's own."""
     policy = load_policy(environment, path or None)
     measure(environment, policy)
-    kinds = [split_condition(condition)[0] for condition in definition.strengths]
+    kinds = [Condition.parse(condition).anomaly for condition in definition.strengths]
     code = code_digest(environment, kinds)
     return hashlib.sha256(f"{policy.digest} {code}".encode()).hexdigest() if code else policy.digest
 
@@ -228,7 +213,8 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     for environment in split.environments:
         entry = manifest["environments"][environment]
         same_policy = digests.get(environment, entry["policy"]) == entry["policy"]
-        same = _strengths(definition, environment).items() <= entry.items()
+        numbers = _strengths(definition, environment).get("strengths")
+        same = numbers is None or entry.get("strengths", numbers) == numbers
         if manifest["generator"] == GENERATOR_VERSION and same_policy and same:
             with contextlib.suppress(SplitError):  # a damaged file is built again
                 split.environment(environment).close()
@@ -236,11 +222,21 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
     return kept
 
 
+def _conditions(definition: SplitDefinition, environment: str) -> dict[Condition, float | None]:
+    """Return the strength of each condition to record; None stands for the values of Table 1."""
+    if definition.strengths:
+        return {Condition.parse(name): number for name, number in definition.strengths.items()}
+    return conditions_of(definition.suite, environment, definition.episode_cap)
+
+
 def _strengths(definition: SplitDefinition, environment: str) -> dict[str, Any]:
-    """Return the strength of each condition of a suite, as an entry of the manifest."""
-    if definition.suite == "table1":
+    """Return the strength of each condition, and the unit of each kind, for the manifest."""
+    conditions = _conditions(definition, environment)
+    if None in conditions.values():  # the values of Table 1
         return {}
-    return {"strengths": conditions_of(definition.suite, environment, definition.episode_cap)}
+    units = {c.anomaly: unit_of(environment, c.anomaly) for c in conditions}
+    numbers = {str(condition): number for condition, number in conditions.items()}
+    return {"strengths": numbers, "units": units}
 
 
 def _base(
@@ -258,23 +254,21 @@ def _base(
 
 
 def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
-    suite, cap = definition.suite, definition.episode_cap
-    conditions = tuple((definition.strengths or conditions_of(suite, environment, cap)).items())
+    conditions = tuple(_conditions(definition, environment).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
-        own = conditions if part == "test" else ()
-        recipe = (definition.episode_cap, definition.noise, own)
+        recipe = definition.episode_cap, definition.noise, conditions if part == "test" else ()
         return Chunk(environment, part, first, count, *recipe, digest, path)
 
     if definition.base:  # its test seeds have twins that are long enough
         with _base(definition.base, environment, digest) as base:
             return [chunk("test", int(seed), 1) for seed in base.twins.seeds]
-    found = []
+    chunks = []
     for part, offset in PART_OFFSETS.items():
         first, size = definition.seed_base * 10**6 + offset, getattr(definition, part)
         starts = range(0, size, CHUNK[part])
-        found += [chunk(part, first + i, min(CHUNK[part], size - i)) for i in starts]
-    return found
+        chunks += [chunk(part, first + i, min(CHUNK[part], size - i)) for i in starts]
+    return chunks
 
 
 def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> list[Chunk]:
@@ -311,7 +305,7 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
 
 @contextlib.contextmanager
 def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
-    """Give worker processes for recording, by default one per core; they end with this one."""
+    """Start worker processes for recording, by default one per core; they end with this one."""
     context, count = multiprocessing.get_context("spawn"), jobs or os.cpu_count() or 1
     # Sums depend on the number of threads of matrix libraries, which these read when they load,
     # before any code of ours runs in a child.
@@ -323,9 +317,7 @@ def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
         yield pool
 
 
-def _begin(
-    specs: Sequence[EnvironmentSpec | AnomalySpec], measured: Mapping[str, Measured]
-) -> None:
+def _begin(specs: Sequence[Spec], measured: Mapping[str, Measured]) -> None:
     """Make known what the build knows, and end this worker when the build is killed.
 
     It would wait for work forever.
@@ -346,18 +338,19 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
     policy = load_policy(chunk.environment, chunk.policy or None)
     conditions = dict(chunk.conditions)
     environment, cap = chunk.environment, chunk.episode_cap
-    recorded: list[dict[str | None, Episode]] = []
+    recorded: list[dict[Condition | None, Episode]] = []
     for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
-            found = record_seed(
+            episodes = record_seed(
                 environment, seed, conditions, policy=policy, episode_cap=cap, noise=chunk.noise
             )
-            recorded.append(found)
+            recorded.append(episodes)
     arrays: dict[str, NDArray[Any]] = {}
-    for kind in [None, *conditions] if recorded else []:
-        group = chunk.part if chunk.part != "test" else f"test/{kind or 'nominal'}"
-        for name, array in _stack([r[kind] for r in recorded]).items():
+    for condition in [None, *conditions] if recorded else []:
+        nominal = TWINS if chunk.part == "test" else chunk.part
+        group = condition.part if condition else nominal
+        for name, array in _stack([by_condition[condition] for by_condition in recorded]).items():
             arrays[f"{group}:{name}"] = array
     with replacing(work / chunk.file_name) as partial, partial.open("wb") as out:
         np.savez(out, allow_pickle=False, **arrays)
@@ -365,7 +358,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
 
 def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     """Return the datasets of a part as a chunk holds them: with lengths instead of offsets."""
-    found: dict[str, NDArray[Any]] = {
+    arrays: dict[str, NDArray[Any]] = {
         "observations": np.concatenate([e.trajectory.observations for e in episodes]),
         "actions": np.concatenate([e.trajectory.actions for e in episodes]),
         "rewards": np.concatenate([e.rewards for e in episodes]),
@@ -374,11 +367,11 @@ def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
         "terminated": np.array([e.terminated for e in episodes], dtype=np.uint8),
     }
     if episodes[0].onset is not None:
-        found["onsets"] = np.array([e.onset for e in episodes], dtype=np.int64)
-        found["effects"] = np.array([e.effect for e in episodes], dtype=np.int64)
-        found["redraws"] = np.array([e.redraws for e in episodes], dtype=np.int64)
-        found["parameters"] = layout.pack_parameters([e.parameters for e in episodes])
-    return found
+        arrays["onsets"] = np.array([e.onset for e in episodes], dtype=np.int64)
+        arrays["effects"] = np.array([e.effect for e in episodes], dtype=np.int64)
+        arrays["redraws"] = np.array([e.redraws for e in episodes], dtype=np.int64)
+        arrays["parameters"] = layout.pack_parameters([e.parameters for e in episodes])
+    return arrays
 
 
 def _joined(part: str, files: Sequence[Path], held: Mapping[Path, Any]) -> layout.Arrays:

@@ -21,9 +21,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.condition import FRACTIONS, LEVELS, PAPER
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
-from oodd_eval.data.ladder import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
+from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
 from oodd_recording.policies import load_policy
@@ -75,7 +76,7 @@ def measure(
     """Return the returns of the seeds under an anomaly of a strength."""
     setup = setup_of(environment, whole=whole)
     episodes = (
-        record_anomalous(setup, f"{kind}@{strength}", strength, twin, redraws=0)
+        record_anomalous(setup, kind, strength, twin, redraws=0)
         for twin in twins_of(environment, first, count, whole=whole)
     )
     return [return_of(episode) for episode in episodes]
@@ -124,14 +125,14 @@ def nearest(curve: Floats, level: float) -> int:
 def levels_of(environment: str, kind: str, *, whole: bool = False) -> dict[str, float]:
     """Return the shares to find, by rung; for a kind of the paper that of its Table 2, too.
 
-    On `whole` episodes only the latter is found.
+    On `whole` episodes it is the latter alone.
     """
-    found = {} if whole else dict(LEVELS)
+    levels = {} if whole else dict(LEVELS)
     if kind in TABLE1:
         table = paper_tables()["table2_policy_return"][environment]
         nominal, changed = float(table["nominal"]), float(table[kind])
-        found[WHOLE if whole else PAPER] = 1 - (nominal - changed) / abs(nominal)
-    return found
+        levels[WHOLE if whole else PAPER] = 1 - (nominal - changed) / abs(nominal)
+    return levels
 
 
 def next_strength(
@@ -186,7 +187,9 @@ def find_rungs(
 
     def rung(level: float) -> dict[str, Any]:
         i = nearest(fitted, level)
-        crossings = [min(crossing(strengths, own, level), bound) for own in curves]
+        crossings = [
+            min(crossing(strengths, falling_curve, level), bound) for falling_curve in curves
+        ]
         low, high = np.percentile(crossings, [2.5, 97.5])
         kept_low, kept_high = np.percentile(draws[i], [2.5, 97.5])
         return {
@@ -204,9 +207,9 @@ def find_rungs(
         return {WHOLE: rung(levels[WHOLE])}
     rungs: dict[str, dict[str, Any]] = {}
     for name in LEVELS:
-        found = rung(levels[name])
-        if not rungs or found["strength"] > max(r["strength"] for r in rungs.values()):
-            rungs[name] = found
+        candidate = rung(levels[name])
+        if not rungs or candidate["strength"] > max(r["strength"] for r in rungs.values()):
+            rungs[name] = candidate
     weak = {
         n: {"strength": _rounded(f * rungs["kept99"]["strength"])} for n, f in FRACTIONS.items()
     }
@@ -233,7 +236,7 @@ def calibrate(
     `whole` finds the rung of robots for whole episodes, and of the paper's kinds alone. Returns
     that `work` holds are not measured again. Other entries and rungs in `output` are kept.
     """
-    places = [
+    pairs = [
         (e, kind)
         for e in environments
         for kind in kinds
@@ -242,7 +245,7 @@ def calibrate(
     measured, broken = _read_work(work)
     caps = [WHOLE] if whole else []
     key = {
-        e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps] for e, _ in places
+        e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps] for e, _ in pairs
     }
     work.parent.mkdir(parents=True, exist_ok=True)
     with workers(jobs) as pool, work.open("a", encoding="utf-8") as lines:
@@ -265,11 +268,11 @@ def calibrate(
                 future = pool.submit(measure, e, kind, strength, whole=whole)
                 pending[future] = e, kind, strength
 
-        for e in dict.fromkeys(e for e, _ in places):
+        for e in dict.fromkeys(e for e, _ in pairs):
             if not curve(e, ""):
                 keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e, whole=whole)])
-        for place in places:
-            go_on(*place)
+        for pair in pairs:
+            go_on(*pair)
         count = 0
         while pending:
             done = next(as_completed(pending))
@@ -278,11 +281,11 @@ def calibrate(
             count += 1
             progress(f"{count}  {e} {kind}")
             go_on(e, kind)
-        found = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
-        for e, kind in places:
-            own = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0], whole=whole)
-            found[e] = found.get(e, {}) | {kind: found.get(e, {}).get(kind, {}) | own}
-    ordered = {e: found[e] for e in ENVIRONMENTS if e in found}
+        ladder = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+        for e, kind in pairs:
+            rungs = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0], whole=whole)
+            ladder[e] = ladder.get(e, {}) | {kind: ladder.get(e, {}).get(kind, {}) | rungs}
+    ordered = {e: ladder[e] for e in ENVIRONMENTS if e in ladder}
     write_text(output, json.dumps(ordered, indent=1) + "\n")
     return ordered
 
@@ -293,11 +296,11 @@ def _identity(line: Mapping[str, Any]) -> tuple[str, str, str, float]:
 
 def _read_work(work: Path) -> tuple[dict[tuple[str, str, str, float], list[float]], bool]:
     """Return measured returns, and whether the last line is the begin of an interrupted write."""
-    found, content = {}, work.read_text(encoding="utf-8") if work.exists() else ""
+    measured, content = {}, work.read_text(encoding="utf-8") if work.exists() else ""
     for text in content.splitlines():
         try:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue
-        found[_identity(line)] = line["returns"]
-    return found, not content.endswith("\n") and bool(content)
+        measured[_identity(line)] = line["returns"]
+    return measured, not content.endswith("\n") and bool(content)

@@ -1,4 +1,4 @@
-"""Checks of environments and anomalies of one's own, before days of recording rest on them."""
+"""Checks of custom environments and anomalies, before days of recording rest on them."""
 
 import functools
 import itertools
@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec, info_of
+from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import OoddError, SimulationError
+from oodd_recording.info import info_of
 from oodd_recording.policies import Policy, load_policy
 from oodd_recording.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
 from oodd_recording.values import bound_of
@@ -40,8 +41,8 @@ class Subject:
     @functools.cached_property
     def twins(self) -> list[Episode]:
         """Nominal episodes that are long enough for an onset."""
-        found = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
-        long = [e for e in found if e.trajectory.transitions >= SHORTEST_TWIN]
+        episodes = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
+        long = [e for e in episodes if e.trajectory.transitions >= SHORTEST_TWIN]
         if len(long) < len(SEEDS) / 2:
             raise SimulationError(
                 f"{len(long)} of {len(SEEDS)} nominal episodes have {SHORTEST_TWIN} transitions, "
@@ -68,15 +69,15 @@ def check_columns(subject: Subject) -> None:
     """Half of the nominal episodes are long enough, as wide as the spec says, and finite."""
     info = info_of(subject.environment)
     for twin in subject.twins[:2]:
-        found = twin.trajectory.observation_dim, twin.trajectory.action_dim
-        if found != (info.observation_dim, info.action_dim):
-            _fail(f"an episode has {found[0]} sensors and {found[1]} actions")
+        widths = twin.trajectory.observation_dim, twin.trajectory.action_dim
+        if widths != (info.observation_dim, info.action_dim):
+            _fail(f"an episode has {widths[0]} sensors and {widths[1]} actions")
         if not np.isfinite(twin.rewards).all():
             _fail(f"the rewards of seed {twin.seed} are not finite")
 
 
 def check_seed(subject: Subject) -> None:
-    """The seed decides the episode, whatever was recorded before; others give others."""
+    """Equal seeds give equal episodes in any order; other seeds, other ones."""
     again = [subject.setup.record(twin.seed) for twin in reversed(subject.twins)]
     for first, second in zip(subject.twins, reversed(again), strict=True):
         if _content(first) != _content(second):
@@ -145,17 +146,15 @@ def check_strength(subject: Subject) -> None:
             gaps.append(np.abs(rows[common] - others[common]).mean())
         distances.append(float(np.mean(gaps)))
     if any(b < SLACK * a for a, b in itertools.pairwise(distances)):
-        shown = ", ".join(f"{d:.3g} at {p:g}" for d, p in zip(distances, PARTS, strict=True))
-        _fail(f"the mean distance from the twins is {shown} of the bound, expected it to grow")
+        profile = ", ".join(f"{d:.3g} at {p:g}" for d, p in zip(distances, PARTS, strict=True))
+        _fail(f"the mean distance from the twins is {profile} of the bound, expected it to grow")
 
 
 _ENVIRONMENT: Final = (check_columns, check_seed, check_policy)
 _ANOMALY: Final = (check_zero_strength, check_onset, check_draws, check_strength)
 
 
-def check_own(
-    spec: EnvironmentSpec | AnomalySpec, environment: str
-) -> Iterator[tuple[str, Callable[[], str]]]:
+def custom_checks(spec: Spec, environment: str) -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of each check, and what carries it out: it returns what is wrong, or nothing.
 
     `environment` is the one in which an anomaly is tried.

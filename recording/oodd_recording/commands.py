@@ -1,4 +1,4 @@
-"""Commands of oodd-eval that record: ``data build``, ``calibrate`` and ``page``, ``policies``.
+"""Commands of oodd-eval that record: ``data build`` and ``calibrate``, ``policies``.
 
 The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
@@ -25,24 +25,16 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.terminal import make_console, register_custom
-from oodd_eval.data.facts import (
-    ANOMALIES,
-    ENVIRONMENTS,
-    OWN_SEED_BASES,
-    SPLITS,
-    SplitDefinition,
-    join_condition,
-)
-from oodd_eval.data.own import AnomalySpec, EnvironmentSpec
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import ANOMALIES, CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, select
 from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
-from oodd_recording.checks import check_own
-from oodd_recording.page import NAME as OVERVIEW
-from oodd_recording.page import write_pages
+from oodd_recording.checks import custom_checks
 from oodd_recording.policies import load_policy
 from oodd_recording.record import evaluate_policy
 from oodd_recording.train.train import train_policy
@@ -60,7 +52,7 @@ def _strengths(text: str) -> list[tuple[str, float]]:
         raise UsageError(f"{text!r}, expected ANOMALY=NUMBER,...") from None
     if len(strengths) == 1:
         return [(kind, strengths[0])]
-    return [(join_condition(kind, f"{strength:g}"), strength) for strength in strengths]
+    return [(str(Condition(kind, f"{strength:g}")), strength) for strength in strengths]
 
 
 @command(
@@ -175,10 +167,10 @@ def _definition(options: Options) -> SplitDefinition:
         known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
         raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
     train, calibration, test, seed_base = sizes.values()
-    if seed_base not in OWN_SEED_BASES:
+    if seed_base not in CUSTOM_SEED_BASES:
         raise UsageError(
-            f"--seed-base is {seed_base}, expected {OWN_SEED_BASES.start} to "
-            f"{OWN_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
+            f"--seed-base is {seed_base}, expected {CUSTOM_SEED_BASES.start} to "
+            f"{CUSTOM_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
     return SplitDefinition(
         name,
@@ -221,18 +213,6 @@ def calibrate(options: Options) -> int:
     make_console().print(
         f"strengths of {count} kinds in {len(strengths)} environments: {options.output}"
     )
-    return 0
-
-
-@command("data page docs")
-@click.argument("directory", type=DIRECTORY, help="directory of the documents")
-@click.option("--env", default="all", type=Names("envs"), help="environments to draw")
-def page(options: Options) -> int:
-    """Write the pages on environments and anomalies; the overview names all environments."""
-    notes = make_console(quiet=options.verbosity < 0)
-    environments = select("environment", options.env, ENVIRONMENTS)
-    write_pages(options.directory, environments=environments, progress=notes.print)
-    make_console().print(f"pages: {options.directory / OVERVIEW}.md and {len(environments)} more")
     return 0
 
 
@@ -295,7 +275,7 @@ def check_custom(options: Options, selects: Predicate) -> int:
         environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
-    for name, check in check_own(spec, environment):
+    for name, check in custom_checks(spec, environment):
         if selects(name):
             start = time.perf_counter()
             problem = check()

@@ -11,17 +11,16 @@ import math
 import os
 import types
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import redirected
-from oodd_eval.data.own import EnvironmentSpec, environment_spec
+from oodd_eval.data.registry import EnvironmentSpec, environment_spec
 from oodd_eval.errors import MissingExtraError
 
 
@@ -57,9 +56,10 @@ class Simulator:
     """One episode of one environment.
 
     `wind` is the direction of its pushes, -1, 0 or +1, where actions are discrete; elsewhere it is
-    added to every command.
+    added to every command. `environment` is its name.
     """
 
+    environment = ""
     names: ClassVar[Mapping[str, str]] = {}
     """The environment's names of attributes that it calls otherwise."""
 
@@ -286,9 +286,8 @@ _FUNCTIONS = {
 class Bullet(Simulator):
     """One of the four PyBullet robots in a client of its own; wind adds to every motor command."""
 
-    def __init__(self, environment: str) -> None:
-        robot = ENVIRONMENTS[environment].title
-        super().__init__(getattr(bullet, f"{robot}BulletEnv")())
+    def __init__(self, make_env: Callable[[], Any]) -> None:
+        super().__init__(make_env())
 
     def reset(self, seed: int) -> Row:
         with quiet_streams():
@@ -334,11 +333,11 @@ class Bullet(Simulator):
             super().close()
 
 
-class Own(Simulator):
-    """An environment of one's own; wind adds to every command of continuous actions."""
+class Custom(Simulator):
+    """A plug-in's environment; wind adds to every command of continuous actions."""
 
-    def __init__(self, spec: EnvironmentSpec) -> None:
-        super().__init__(spec.make())
+    def __init__(self, env: Any, spec: EnvironmentSpec) -> None:
+        super().__init__(env)
         self._attributes = spec.attributes
 
     def command(self, action: Any) -> Any:
@@ -353,8 +352,20 @@ class Own(Simulator):
 
 def make(environment: str) -> Simulator:
     """Return a fresh simulator of an environment, to be used for one episode and closed."""
-    if spec := environment_spec(environment):
-        return Own(spec)
-    classic: dict[str, Any] = {"acrobot": Acrobot, "cartpole": CartPole, "lunarlander": LunarLander}
-    found: Simulator = classic.get(environment, functools.partial(Bullet, environment))()
-    return found
+    spec = environment_spec(environment)
+    env = spec.make()
+    simulator = env if isinstance(env, Simulator) else Custom(env, spec)
+    simulator.environment = environment
+    return simulator
+
+
+SIMULATORS: Final[Mapping[str, Callable[[], Simulator]]] = {
+    "acrobot": Acrobot,
+    "cartpole": CartPole,
+    "lunarlander": LunarLander,
+    "ant": functools.partial(Bullet, bullet.AntBulletEnv),
+    "halfcheetah": functools.partial(Bullet, bullet.HalfCheetahBulletEnv),
+    "hopper": functools.partial(Bullet, bullet.HopperBulletEnv),
+    "walker2d": functools.partial(Bullet, bullet.Walker2DBulletEnv),
+}
+"""Simulators of the benchmark by environment."""

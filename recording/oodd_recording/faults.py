@@ -12,8 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.own import anomaly_spec, info_of
+from oodd_eval.data.registry import anomaly_spec
 from oodd_recording.environments import Row, Simulator
+from oodd_recording.info import info_of
 from oodd_recording.values import VALUES, choose_sensors, spread_of
 
 ON, PERIOD = 10, 50  # an intermittent fault acts on 10 rows, then rests for 40
@@ -53,9 +54,14 @@ class Fault:
         Parameters
         ----------
         action
-            What the policy commanded.
+            Command of the policy.
         simulator
             The episode's.
+
+        Returns
+        -------
+        int or float32 array of shape (A,)
+            Command for the simulator.
         """
         return action
 
@@ -65,9 +71,13 @@ class Fault:
         Parameters
         ----------
         row
-            What the simulator gave, float32 of shape (D,).
+            Row of the simulator, float32 of shape (D,).
         step
             Its number in the episode.
+
+        Returns
+        -------
+        float32 array of shape (D,)
         """
         return row
 
@@ -134,15 +144,13 @@ class Dynamics(Fault):
         return self._act(action, simulator)
 
 
-def make_fault(
-    environment: str, kind: str, strength: float, simulator: Simulator, rng: np.random.Generator
-) -> Fault:
+def make_fault(kind: str, strength: float, simulator: Simulator, rng: np.random.Generator) -> Fault:
     """Draw a fault of one kind for one episode.
 
     Parameters
     ----------
-    environment, kind
-        Names of the benchmark, or of one's own.
+    kind
+        Name of a registered kind of anomaly.
     strength
         From 0, which changes nothing, to the kind's bound.
     simulator
@@ -150,15 +158,9 @@ def make_fault(
     rng
         Generator of this episode's draws.
     """
-    base, intermittent = kind.removesuffix("-intermittent"), kind.endswith("-intermittent")
-    if base == "wind" and intermittent:
-        base = "wind-l2r"
-    if spec := anomaly_spec(kind):
-        fault: Fault = spec.make(float(strength), rng, simulator)
-    else:
-        fault = _MAKERS[base](environment, float(strength), simulator, rng)
+    fault: Fault = anomaly_spec(kind).make(float(strength), rng, simulator)
     fault.parameters["strength"] = float(strength)
-    return Intermittent(fault) if intermittent else fault
+    return fault
 
 
 _Maker = Callable[[str, float, Simulator, np.random.Generator], Fault]
@@ -191,9 +193,9 @@ def _ar1(environment: str, strength: float, _: Simulator, rng: np.random.Generat
 
     def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
         nonlocal state
-        found = x + std * state
+        noisy = x + std * state
         state = AR * state + np.sqrt(1 - AR**2) * rng.normal(size=len(state))
-        return found
+        return noisy
 
     return SensorFault(sensors, change)
 
@@ -220,9 +222,9 @@ def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Gener
 
     def change(x: NDArray[np.float64], _: int) -> NDArray[np.float64]:
         nonlocal state
-        found = x + scale * state[:k]
+        noisy = x + scale * state[:k]
         state = _product(forward, state) + _product(driven, rng.normal(size=k))
-        return found
+        return noisy
 
     return SensorFault(sensors, change)
 
@@ -391,7 +393,14 @@ def _replaced(action: Row, j: int, value: float) -> Row:
     return changed
 
 
-_MAKERS: Final[dict[str, _Maker]] = {
+def _intermittent(maker: _Maker) -> _Maker:
+    def make(environment: str, strength: float, simulator: Simulator, rng: Any) -> Fault:
+        return Intermittent(maker(environment, strength, simulator, rng))
+
+    return make
+
+
+MAKERS: Final[dict[str, _Maker]] = {
     "iid": _noise,
     "calibration": _calibration,
     "drift": _drift,
@@ -411,4 +420,10 @@ _MAKERS: Final[dict[str, _Maker]] = {
     "action-noise": _action_noise,
     "mass": _mass,
     "friction": _friction,
+    "iid-intermittent": _intermittent(_noise),
+    "calibration-intermittent": _intermittent(_calibration),
+    "shutdown-intermittent": _intermittent(_shutdown),
+    "wind-intermittent": _intermittent(_wind(1)),
+    "gain-intermittent": _intermittent(_gain),
 }
+"""Makers of the benchmark's faults by kind."""

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import POLICY, read_npz
 from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
-from oodd_eval.data.own import code_digest, environment_spec, info_of
+from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import PolicyError
+from oodd_recording.info import code_digest, info_of
 
-FROZEN: Final = Path(__file__).with_name("frozen")
 ACTION_GRID: Final = 2.0**16
 LAYERS: Final = {
     "TD3": ("W1", "b1", "W2", "b2", "W3", "b3"),
@@ -75,8 +75,8 @@ class IQNPolicy:
         return int(np.argmax(np.round(self.values(row) * ACTION_GRID)))
 
 
-class OwnPolicy:
-    """A function of the row, as the spec of an environment of one's own names it."""
+class CustomPolicy:
+    """A function of the row, as the spec of a custom environment names it."""
 
     def __init__(self, environment: str, act: Callable[[Any], Any]) -> None:
         self.digest = code_digest(environment, ())
@@ -88,7 +88,7 @@ class OwnPolicy:
         return int(action) if self._discrete else np.asarray(action, np.float32).ravel()
 
 
-Policy = TD3Policy | IQNPolicy | OwnPolicy  # deterministic controllers
+Policy = TD3Policy | IQNPolicy | CustomPolicy  # deterministic controllers
 
 
 def policy_digest(arrays: Arrays) -> str:
@@ -99,11 +99,9 @@ def policy_digest(arrays: Arrays) -> str:
 def load_policy(environment: str, path: str | Path | None = None) -> Policy:
     """Load the frozen policy of an environment, or another file; `PolicyError` if it is none."""
     spec, info = environment_spec(environment), info_of(environment)
-    if spec and path is None:
-        if callable(spec.policy):
-            return OwnPolicy(environment, spec.policy())
-        path = spec.policy
-    file = Path(path) if path is not None else FROZEN / f"{environment}.npz"
+    if path is None and callable(spec.policy):
+        return CustomPolicy(environment, spec.policy())
+    file = Path(path or str(spec.policy))
     if not file.exists():
         raise PolicyError(
             f"{file.name} does not exist: train it, `oodd-eval policies train {environment}`"
@@ -117,10 +115,10 @@ def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
     if missing := ", ".join(name for name in LAYERS[info.policy] if name not in arrays):
         raise PolicyError(f"{file} lacks the arrays {missing} of a {info.policy} policy")
     last = arrays["b3"] if info.policy == "TD3" else arrays["b4"]
-    found = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
-    if found != (info.observation_dim, info.action_dim):
+    widths = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
+    if widths != (info.observation_dim, info.action_dim):
         raise PolicyError(
-            f"{file} maps {found[0]} sensors to {found[1]} actions, expected "
+            f"{file} maps {widths[0]} sensors to {widths[1]} actions, expected "
             f"{info.observation_dim} and {info.action_dim} for {info.id}"
         )
     if bad := [name for name, a in arrays.items() if not np.isfinite(a).all()]:

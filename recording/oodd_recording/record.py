@@ -14,14 +14,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import FIRST_ONSET, split_condition
-from oodd_eval.data.own import MEASURED, Measured, environment_spec, info_of, kinds_of
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import FIRST_ONSET
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
 from oodd_recording.anomalies import draw
 from oodd_recording.environments import Simulator, make
 from oodd_recording.faults import Fault, make_fault
+from oodd_recording.info import MEASURED, Measured, info_of, kinds_of
 from oodd_recording.policies import Policy
 from oodd_recording.values import spread_of
 
@@ -87,12 +88,12 @@ class Episode:
 def record_seed(
     environment: str,
     seed: int,
-    conditions: Iterable[str] | Mapping[str, float | None] = (),
+    conditions: Iterable[Condition] | Mapping[Condition, float | None] = (),
     *,
     policy: Policy,
     episode_cap: int | None = None,
     noise: float = 0.0,
-) -> dict[str | None, Episode]:
+) -> dict[Condition | None, Episode]:
     """Record the nominal twin of a seed (key None) and one episode per condition.
 
     Parameters
@@ -100,8 +101,8 @@ def record_seed(
     environment, seed
         Name, and the seed of its reset.
     conditions
-        Anomalies such as ``"iid"`` with the values of Table 1; or strengths by condition, such as
-        ``{"iid@kept99": 0.1}``, where None stands for Table 1's values.
+        Anomalies with the values of Table 1; or strengths by condition, such as
+        ``{Condition("iid", "kept99"): 0.1}``, where None stands for Table 1's values.
     policy
         It acts on the observations as stored.
     episode_cap
@@ -116,18 +117,18 @@ def record_seed(
     SimulationError
         When an anomaly changes nothing in 100 redraws.
     """
-    given = conditions if isinstance(conditions, Mapping) else dict.fromkeys(conditions)
-    kinds = [split_condition(name)[0] for name in given]
+    strengths = conditions if isinstance(conditions, Mapping) else dict.fromkeys(conditions)
+    kinds = [condition.anomaly for condition in strengths]
     check_known(f"anomaly that {environment} can have", kinds_of(environment), *kinds)
     setup = Setup(environment, policy, episode_cap, noise)
     twin = setup.record(seed)
-    if given and twin.trajectory.transitions < SHORTEST_TWIN:
+    if strengths and twin.trajectory.transitions < SHORTEST_TWIN:
         raise TwinTooShortError(
             f"the nominal episode of {environment} with seed {seed} has "
             f"{twin.trajectory.transitions} transitions, expected at least {SHORTEST_TWIN}"
         )
-    episodes: dict[str | None, Episode] = {None: twin}
-    episodes |= {c: record_anomalous(setup, c, given[c], twin) for c in given}
+    episodes: dict[Condition | None, Episode] = {None: twin}
+    episodes |= {c: record_anomalous(setup, c.anomaly, strengths[c], twin) for c in strengths}
     return episodes
 
 
@@ -159,12 +160,12 @@ def evaluate_policy(
 
 
 def measure(environment: str, policy: Policy) -> None:
-    """Measure the sensors of an environment of one's own, once, in ten nominal episodes.
+    """Measure the sensors of a custom environment, once, in ten nominal episodes.
 
     Sensors that may break vary as the benchmark's do: they differ from their median in at least 1 %
     of the rows, and have more than 8 distinct values.
     """
-    if environment_spec(environment) is None or environment in MEASURED:
+    if environment in MEASURED:
         return
     setup = Setup(environment, policy)
     episodes = [setup.record(EVALUATION_SEED + i).trajectory for i in range(MEASURED_EPISODES)]
@@ -191,21 +192,16 @@ def generator(environment: str, anomaly: str, seed: int, attempt: int) -> np.ran
 
 
 def record_anomalous(
-    setup: Setup,
-    condition: str,
-    strength: float | None,
-    twin: Episode,
-    *,
-    redraws: int = MAX_REDRAWS,
+    setup: Setup, kind: str, strength: float | None, twin: Episode, *, redraws: int = MAX_REDRAWS
 ) -> Episode:
-    """Record the episode of a twin's seed under one condition; see `record_seed`.
+    """Record the episode of a twin's seed under one kind of anomaly; see `record_seed`.
 
     After so many `redraws` the longest episode is taken.
     """
-    environment, kind = setup.environment, split_condition(condition)[0]
+    environment = setup.environment
     maker: _Maker = functools.partial(draw, environment, kind)
     if strength is not None:
-        maker = functools.partial(make_fault, environment, kind, strength)
+        maker = functools.partial(make_fault, kind, strength)
     commands = list(twin.trajectory.actions)
     if info_of(environment).discrete:
         commands = [int(row.argmax()) for row in commands]
@@ -231,7 +227,7 @@ def record_anomalous(
         return Episode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
     if longest is None:
         raise SimulationError(
-            f"no {condition} episode of {environment} with seed {twin.seed} differs from its twin "
+            f"no {kind} episode of {environment} with seed {twin.seed} differs from its twin "
             f"in {redraws} redraws, expected one: the policy or the simulator ignores the anomaly"
         )
     return replace(longest, redraws=redraws)
@@ -271,8 +267,8 @@ def _run(
             if anomaly is not None and step == len(replayed):
                 fault = anomaly[0](simulator, anomaly[1])
                 fault.begin(simulator, rows)
-            given = actions[-1] if fault is None else fault.command(actions[-1], simulator)
-            row, reward, over = simulator.step(given)
+            command = actions[-1] if fault is None else fault.command(actions[-1], simulator)
+            row, reward, over = simulator.step(command)
             row = noisy(row)
             rows.append(row if fault is None else fault.observe(row, len(rows)))
             rewards.append(reward)

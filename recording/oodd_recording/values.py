@@ -7,7 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.own import MEASURED, anomaly_spec, info_of
+from oodd_eval.data.registry import anomaly_spec
+from oodd_recording.info import MEASURED, Measured, info_of
 
 SENSOR_SHARE: Final = 0.2  # of the sensors that an anomaly corrupts, rounded down, at least one
 
@@ -24,39 +25,34 @@ simulator divides by length and mass.
 ``sensors`` are those that sensor anomalies corrupt. In the mini split's training rows they differ
 from their median in at least 1 % of the rows (to switch off a constant zero changes nothing), and
 have more than 8 distinct values (a contact of 0.87 gives itself away). ``spread`` is the standard
-deviation of each sensor in these rows. ``strength`` has unit and largest sensible value of the
-strength of kinds; discrete actions, or one environment, may have their own.
+deviation of each sensor in these rows.
 """
+
+MEASURED.update(
+    {
+        name: Measured(tuple(spread), tuple(VALUES["sensors"][name]))
+        for name, spread in VALUES["spread"].items()
+    }
+)
 
 
 def choose_sensors(environment: str, rng: np.random.Generator) -> NDArray[np.intp]:
     """Draw the sensors that an anomaly corrupts, sorted."""
-    own = MEASURED.get(environment)
-    known = own.sensors if own else VALUES["sensors"][environment]
-    count = min(len(known), max(1, int(SENSOR_SHARE * info_of(environment).observation_dim)))
-    return np.sort(rng.choice(known, size=count, replace=False))
+    breakable = MEASURED[environment].sensors
+    count = min(len(breakable), max(1, int(SENSOR_SHARE * info_of(environment).observation_dim)))
+    return np.sort(rng.choice(breakable, size=count, replace=False))
 
 
 def spread_of(environment: str) -> NDArray[np.float64]:
     """Return the nominal standard deviation of each sensor, of shape (D,)."""
-    own = MEASURED.get(environment)
-    return np.array(own.spread if own else VALUES["spread"][environment], dtype=np.float64)
+    return np.array(MEASURED[environment].spread, dtype=np.float64)
 
 
 def unit_of(environment: str, kind: str) -> str:
     """Return what a kind's strength of 1 means in an environment."""
-    return str(_strength(environment, kind)[0])
+    return anomaly_spec(kind).scale(info_of(environment))[0]
 
 
 def bound_of(environment: str, kind: str) -> float:
     """Return the largest sensible strength of a kind in an environment."""
-    return float(_strength(environment, kind)[1])
-
-
-def _strength(environment: str, kind: str) -> tuple[str, float]:
-    if spec := anomaly_spec(kind):
-        return spec.unit, spec.bound
-    own = VALUES["strength"]["wind-l2r" if kind.startswith("wind") else kind]
-    family = "discrete" if info_of(environment).discrete else "continuous"
-    found: tuple[str, float] = own.get(environment) or own.get(family) or own["all"]
-    return found
+    return float(anomaly_spec(kind).scale(info_of(environment))[1])

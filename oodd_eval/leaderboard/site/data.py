@@ -26,9 +26,9 @@ from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metri
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
-from oodd_eval.results.ladder import FOUND, curve
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.standings import Standing
+from oodd_eval.results.strengths import DETECTION, curve
 
 _COMPARED: Final = (
     "false_episodes",
@@ -125,7 +125,7 @@ def _power(section: SuiteSection) -> Json:
     by_name = {str(row): row for row in board.entries}
     rows = [by_name[line[0]] for line in tables[0].rows] if tables else []
     records = grouped(board.records, lambda r: r.setting)
-    metrics = [metric_info(name) for name in (FOUND, RANKING)]
+    metrics = [metric_info(name) for name in (DETECTION, RANKING)]
     return {
         **_fields(board, "split", "digest"),
         "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],

@@ -182,6 +182,7 @@ _RECORD: Final = strict_model(
     inputs=Literal["observations", "observations+actions", ""], alarm=Literal["cusum", "score"],
     deterministic=bool, environment=Annotated[str, _one_of(ENVIRONMENTS)],
     anomaly=Annotated[str, _one_of(ANOMALIES)], strength=Strength,
+    magnitude=(Annotated[float, Field(ge=0)] | None, None),
     group=Annotated[str, _one_of(GROUPS)], horizon=Annotated[int, Field(ge=1, le=100_000)],
     seed=Whole, split=SplitName, split_digest=Digest, limit=None,
     status=Status, reason=Annotated[str, _text(1000)],

@@ -197,11 +197,12 @@ def check_against_split(records: Records, split: Split, findings: Findings) -> N
         with closing(split.environment(environment)) as data:
             parts = {"train": data.train, "calibration": data.calibration, "test": data.twins}
             counts = {name: len(part) for name, part in parts.items()}
-            conditions = ", ".join(data.anomalies)
+            conditions = data.anomalies
         for where, record in of_environment.items():
             findings.expect(where, "counts", counts, record.counts, "as the split has")
-            if record.condition not in conditions.split(", "):
-                message = f"is {record.condition!r}, the split has {conditions}"
+            if str(record.condition) not in conditions:
+                names = ", ".join(conditions)
+                message = f"is '{record.condition}', the split has {names}"
                 findings.refuse(where, "anomaly", message)
 
 

@@ -21,7 +21,7 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import ENVIRONMENTS, OWN_SEED_BASES, SPLITS, TABLE1, SplitDefinition
+from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, TABLE1, SplitDefinition
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError, UsageError
@@ -116,7 +116,7 @@ def draw(
     order = read_order(directory)
     if order is None:
         taken = {definition.seed_base for definition in SPLITS.values()}
-        base = secrets.choice([n for n in OWN_SEED_BASES if n not in taken])
+        base = secrets.choice([n for n in CUSTOM_SEED_BASES if n not in taken])
         day = datetime.now(UTC).date().isoformat()
         order = RerunOrder(digest, base, day, list(environments), sandbox)
     if order.entry != digest:
@@ -205,7 +205,7 @@ def compare_rerun(
 
 
 def _cell_of(record: Record) -> _CellKey:
-    return record.setting, record.environment, record.condition
+    return record.setting, *record.position
 
 
 def _usable(

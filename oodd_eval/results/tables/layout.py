@@ -255,6 +255,12 @@ def notes(board: Board) -> list[str]:
     lines = [f"Split {board.split}, {facts}, test seeds per environment: {seeds}."]
     if board.limit is not None:
         lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
+    cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
+    if len(cells) > len({cell[:2] for cell in cells}):
+        lines.append(
+            "Anomalies have several strengths: means are over all of them, but for columns that "
+            "are named by strengths."
+        )
     benchmark = {*board.environments} <= {*ENVIRONMENTS}
     for group in filter(board.in_group, GROUPS) if benchmark else ():
         of_group = [a for a in TABLE1 if ANOMALIES[a].group == group]

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.own import info_of
-from oodd_recording.policies import FROZEN, LAYERS, Arrays, load_policy, make_policy, policy_digest
+from oodd_recording.benchmark import FROZEN
+from oodd_recording.info import info_of
+from oodd_recording.policies import LAYERS, Arrays, load_policy, make_policy, policy_digest
 from oodd_recording.record import EVALUATION_SEED, evaluate_policy
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oodd_eval.data.own import info_of
 from oodd_recording.environments import make
+from oodd_recording.info import info_of
 from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {
@@ -76,11 +76,11 @@ class Network(nn.Module):
             "W4": self.head[2],
         }
         biases = {"W1": "b1", "W2": "b2", "C": "c", "W3": "b3", "W4": "b4"}
-        found: dict[str, np.ndarray[Any, Any]] = {"quantiles": np.array(quantiles)}
+        arrays: dict[str, np.ndarray[Any, Any]] = {"quantiles": np.array(quantiles)}
         for name, layer in layers.items():
-            found[name] = layer.weight.detach().numpy().T.copy()
-            found[biases[name]] = layer.bias.detach().numpy().copy()
-        return found
+            arrays[name] = layer.weight.detach().numpy().T.copy()
+            arrays[biases[name]] = layer.bias.detach().numpy().copy()
+        return arrays
 
 
 def quantile_huber(predicted: Tensor, target: Tensor, tau: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ class Replay:
 
     def sample(self, batch: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Return random transitions, of shape (batch, width)."""
-        found: NDArray[np.float32] = self.rows[
+        rows: NDArray[np.float32] = self.rows[
             rng.integers(0, min(self.count, len(self.rows)), batch)
         ]
-        return found
+        return rows

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from oodd_eval.data.own import info_of
 from oodd_recording.environments import make
+from oodd_recording.info import info_of
 from oodd_recording.policies import LAYERS
 from oodd_recording.train.replay import Replay
 
@@ -54,15 +54,15 @@ def initial(inputs: int, outputs: int, networks: int | None, layers: list[int]) 
     """Return weights and biases, uniform in ±1/sqrt(inputs); `networks` of them side by side."""
     sizes = [inputs, *layers, outputs]
     lead = (networks,) if networks else ()
-    found: Layers = []
+    weights: Layers = []
     for rows, columns in itertools.pairwise(sizes):
         bound = rows**-0.5
         bias = (*lead, 1, columns) if networks else (columns,)
-        found += [
+        weights += [
             torch.empty(*shape).uniform_(-bound, bound).requires_grad_()
             for shape in ((*lead, rows, columns), bias)
         ]
-    return found
+    return weights
 
 
 def actor(p: Layers, rows: Tensor) -> Tensor:
@@ -103,10 +103,10 @@ class TD3:
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint holds."""
-        found: dict[str, Any] = {
+        checkpoint: dict[str, Any] = {
             name: [x.detach() for x in layers] for name, layers in self.networks.items()
         }
-        return found | {f"opt_{n}": o.state_dict() for n, o in self.optimisers.items()}
+        return checkpoint | {f"opt_{n}": o.state_dict() for n, o in self.optimisers.items()}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over the state of a checkpoint."""

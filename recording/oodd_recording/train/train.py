@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.files import replacing, write_text
-from oodd_eval.data.own import info_of
 from oodd_eval.errors import MissingExtraError, PolicyError
+from oodd_recording.info import info_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import evaluate_policy
 from oodd_recording.train.freeze import freeze_policy

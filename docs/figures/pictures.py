@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-
-from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_recording.calibrate import setup_of
 from oodd_recording.environments import Bullet, Simulator, make, quiet_streams
 from oodd_recording.record import SHORTEST_TWIN, Episode, record_anomalous
 from oodd_recording.values import VALUES, spread_of
+
+from oodd_eval.data.facts import ENVIRONMENTS
 
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
 BEFORE, AFTER = 30, 90  # rows of a plot before the onset and after the effect
@@ -40,7 +40,7 @@ def draw_pictures(
     twin = next(t for t in twins if t.trajectory.transitions >= SHORTEST_TWIN)
     yield f"{environment}.png", png(frame(environment, twin))
     for kind, (rung, strength) in rungs.items():
-        episode = record_anomalous(setup, f"{kind}@{rung}", strength, twin)
+        episode = record_anomalous(setup, kind, strength, twin)
         title = f"{kind} at {rung} ({strength:g})"
         yield f"{environment}/{kind}.svg", plot(environment, title, episode, twin).encode()
 
@@ -98,8 +98,8 @@ def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
     """
     rows, others = episode.trajectory.observations, twin.trajectory.observations
     effect = episode.effect or 0
-    shown = slice(effect, min(len(rows), len(others), effect + AFTER))
-    gap = np.abs(rows[shown] - others[shown]).mean(axis=0)
+    plotted = slice(effect, min(len(rows), len(others), effect + AFTER))
+    gap = np.abs(rows[plotted] - others[plotted]).mean(axis=0)
     among: list[int] = episode.parameters.get("sensors", VALUES["sensors"][environment])
     return max(among, key=lambda i: float(gap[i] / spread_of(environment)[i]))
 
@@ -152,5 +152,5 @@ def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
 
 
 def _text(x: float, y: float, text: str, anchor: str = "middle", weight: str = "normal") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-weight="{weight}"'
-    return f'<text {place} fill="{INK}">{escape(text)}</text>'
+    anchoring = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-weight="{weight}"'
+    return f'<text {anchoring} fill="{INK}">{escape(text)}</text>'

@@ -1,32 +1,27 @@
 """Write the pages "Environments and anomalies": an overview, and a page for each environment.
 
-Numbers are those of the facts, of the frozen policies and of ``ladder.json``; the words that only a
-person can write are in ``page.toml``. Texts need no simulation, so that a test can compare them.
+``python docs/figures/environments.py [DIRECTORY]`` writes them, here unless told otherwise. Numbers
+are those of the facts, of the frozen policies and of ``ladder.json``; the words that only a person
+can write are in ``environments.toml``. Texts need no simulation, so that a test can compare them.
 """
 
+import argparse
 import json
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
-from oodd_eval.data.files import write_bytes, write_text
-from oodd_eval.data.ladder import (
-    FRACTIONS,
-    PAPER,
-    ROBOTS_CAP,
-    WHOLE,
-    Rung,
-    all_rungs_of,
-    read_ladder,
-    rungs_of,
-)
-from oodd_recording.policies import FROZEN
+from oodd_recording.benchmark import FROZEN
 from oodd_recording.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
 
+from oodd_eval.data.condition import FRACTIONS, PAPER
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
+from oodd_eval.data.files import write_bytes, write_text
+from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE, Rung, all_rungs_of, read_ladder, rungs_of
+
 NAME: Final = "environments"
-COMMAND: Final = "oodd-eval data page docs"
+COMMAND: Final = "python docs/figures/environments.py"
 OVERVIEW_RUNG: Final = "kept90"
 PICTURED: Final = "kept75"
 """The rung of the plotted episodes, or the strongest where the bound costs less."""
@@ -57,7 +52,7 @@ def write_pages(
     called with the name of each when its files are written.
     """
     # Texts alone need no simulators.
-    from oodd_recording.pictures import draw_pictures  # noqa: PLC0415
+    from pictures import draw_pictures  # noqa: PLC0415
 
     write_text(directory / f"{NAME}.md", overview())
     for environment in environments:
@@ -282,8 +277,8 @@ def _range(name: str, bounds: Sequence[float], nominal: float) -> str:
 
 def _returns(environment: str) -> tuple[str, str]:
     """Return the returns of our policy and the paper's, as text."""
-    told: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
-    ours = f"{told['mean_return']:.1f} ± {told['std_return']:.1f}"
+    provenance: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
+    ours = f"{provenance['mean_return']:.1f} ± {provenance['std_return']:.1f}"
     return ours, f"{ENVIRONMENTS[environment].paper_return:.1f}"
 
 
@@ -294,3 +289,9 @@ def _unit(unit: str) -> str:
 def _table(rows: Iterable[Sequence[Any]], header: Sequence[str]) -> str:
     lines = (header, ["---"] * len(header), *rows)
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("directory", type=Path, nargs="?", default=Path(__file__).parents[1])
+    write_pages(parser.parse_args().directory, progress=print)
