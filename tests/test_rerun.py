@@ -5,7 +5,7 @@ import json
 
 import pytest
 from helpers_submission import assert_refused
-from oodd_recording.rerun import check_installed, plan_of
+from oodd_recording.rerun import check_installed, definition_of, draw, environments_of, plan_of
 from test_submission_trust import entry, fresh, of_three  # noqa: F401  fixtures
 
 from oodd_eval.cli import main as cli
@@ -14,13 +14,7 @@ from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import read_entry
 from oodd_eval.leaderboard.verify import verify_entry
-from oodd_eval.leaderboard.verify.rerun import (
-    ORDER,
-    definition_of,
-    draw,
-    environments_of,
-    read_order,
-)
+from oodd_eval.leaderboard.verify.rerun import ORDER, read_order
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.directory import ResultsDirectory
 

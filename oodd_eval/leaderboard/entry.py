@@ -23,7 +23,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, TypeVar, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -33,6 +33,8 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
+
+_T = TypeVar("_T")
 
 SCHEMA: Final = 3  # version of the layout of an entry; a reader refuses others
 
@@ -174,23 +176,16 @@ def _in_order(item: tuple[Setting, object]) -> tuple[bool, int, str]:
 def read_entry(path: Path | str) -> SubmittedEntry:
     """Read the entry in a directory; ResultsError when it cannot be read."""
     file = Path(path) / ENTRY
-    try:
-        content = file.read_bytes()
-        meta = TypeAdapter(EntryInfo).validate_json(content)
-    except OSError as error:
-        raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        path_in_file = ".".join(map(str, first["loc"]))
-        message = f"{path_in_file}: {first['msg']}"
-        raise ResultsError(f"{str(file)!r} is no entry: {message}") from None
+    meta = read_json(EntryInfo, file, "is no entry")
     if meta.schema != SCHEMA:
         raise ResultsError(
             f"{str(file)!r}: schema is {meta.schema}, expected {SCHEMA}: it was written by another "
             "version of oodd-eval"
         )
     grant = read_grants(file.absolute().parents[1]).get(meta.id)
-    granted = grant and grant.entry == digest_of(content) and _has_its_files(file.parent, meta)
+    granted = (
+        grant and grant.entry == digest_of(file.read_bytes()) and _has_its_files(file.parent, meta)
+    )
     records = ResultsDirectory(path).records()
     return SubmittedEntry(file.parent, meta, records, grant if granted else None)
 
@@ -199,6 +194,18 @@ def _has_its_files(directory: Path, meta: EntryInfo) -> bool:
     """Tell whether the files that an entry names are as it says: a grant is of these."""
     named = {directory / name: known.get("sha256") for name, known in meta.files.items()}
     return all(p.is_file() and digest_of(p.read_bytes()) == digest for p, digest in named.items())
+
+
+def read_json(kind: type[_T], file: Path, problem: str) -> _T:
+    """Read a dataclass from a JSON file; `ResultsError` says a `problem` and why."""
+    try:
+        return TypeAdapter(kind).validate_json(file.read_bytes())
+    except OSError as error:
+        why = f"cannot be read: {error.strerror}"
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        why = f"{problem}: {'.'.join(map(str, first['loc']))}: {first['msg']}"
+    raise ResultsError(f"{str(file)!r} {why}")
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
@@ -244,14 +251,7 @@ def read_grants(results: Path) -> dict[str, Grant]:
     file = results.absolute().parent / GRANTS
     if not file.exists():
         return {}
-    try:
-        return TypeAdapter(_GrantsLayout).validate_json(file.read_bytes()).grants
-    except (OSError, ValidationError) as error:
-        first = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
-        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
-        raise ResultsError(
-            f"{str(file)!r} holds no grants: {why}; restore it from the history"
-        ) from None
+    return read_json(_GrantsLayout, file, "holds no grants, restore it from the history").grants
 
 
 def write_grants(results: Path, grants: Mapping[str, Grant]) -> Path:

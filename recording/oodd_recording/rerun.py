@@ -3,7 +3,12 @@
 Entries are data; this is the only action that runs a detector for one.
 """
 
+import json
+import secrets
 from collections.abc import Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
 
 import click
 
@@ -20,17 +25,13 @@ from oodd_eval.cli import (
     say,
 )
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
+from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import SubmittedEntry, read_entry
+from oodd_eval.leaderboard.entry import ENTRY, SubmittedEntry, digest_of, read_entry
 from oodd_eval.leaderboard.verify import verify
-from oodd_eval.leaderboard.verify.rerun import (
-    LEAST,
-    SPLIT_DIRECTORY,
-    definition_of,
-    draw,
-    environments_of,
-)
+from oodd_eval.leaderboard.verify.rerun import LEAST, ORDER, SPLIT_DIRECTORY, RerunOrder, read_order
 from oodd_eval.names import expression, select
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.isolation.child import Limits
@@ -150,3 +151,51 @@ def plan_of(
     if not units:
         raise UsageError(f"{entry.meta.id} has none of seeds {', '.join(map(str, seeds or ()))}")
     return Plan(split.name, split.digest, units, split.groups)
+
+
+def draw(
+    entry: SubmittedEntry, directory: Path, environments: Sequence[str], *, sandbox: bool
+) -> RerunOrder:
+    """Draw seeds for an entry and write the order, or go on with the one that is there.
+
+    `UsageError`: the order there is for another entry, another version of it, or environments.
+    """
+    digest = digest_of((entry.path / ENTRY).read_bytes())
+    order = read_order(directory)
+    if order is None:
+        taken = {definition.seed_base for definition in SPLITS.values()}
+        base = secrets.choice([n for n in CUSTOM_SEED_BASES if n not in taken])
+        day = datetime.now(UTC).date().isoformat()
+        order = RerunOrder(digest, base, day, list(environments), sandbox)
+    if order.entry != digest:
+        raise UsageError(
+            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {entry.meta.id} "
+            f"has {digest[:12]}: seeds are drawn for one version of an entry; name another --output"
+        )
+    if order.environments != list(environments):
+        raise UsageError(
+            f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
+            f"{', '.join(environments)}: name another --output"
+        )
+    order = replace(order, sandbox=order.sandbox and sandbox)
+    directory.mkdir(parents=True, exist_ok=True)
+    write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
+    return order
+
+
+def definition_of(entry: SubmittedEntry, order: RerunOrder) -> SplitDefinition:
+    """Return the entry's split, recorded anew from the order's seeds; `UsageError` for others."""
+    definition = SPLITS.get(entry.meta.split)
+    if definition is None or definition.base:
+        known = ", ".join(name for name, one in SPLITS.items() if not one.base)
+        raise UsageError(
+            f"{entry.meta.id} is on split {entry.meta.split!r}: expected one that can be recorded "
+            f"with other seeds ({known})"
+        )
+    return replace(definition, name=f"rerun-{order.seed_base}", seed_base=order.seed_base)
+
+
+def environments_of(entry: SubmittedEntry) -> list[str]:
+    """Return the environments that an entry has, in the order of the paper."""
+    present = {record.environment for record in entry.records}
+    return [name for name in ENVIRONMENTS if name in present]

@@ -16,14 +16,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data import files as stored_files
-from oodd_eval.data.files import PACKED, forms
+from oodd_eval.data.bounded import read_bytes
+from oodd_eval.data.files import MAX_BYTES, PACKED, decompress, forms
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES
 from oodd_eval.results.directory import RECORDS
 
 MB: Final = 10**6
-MOST_PLAIN: Final = {RECORDS: stored_files.MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
+MOST_PLAIN: Final = {RECORDS: MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
 
 MOST_BYTES: Final = (
     {ENTRY: MB // 4} | MOST_PLAIN | {name + end: 8 * MB for end in PACKED for name in MOST_PLAIN}
@@ -97,7 +97,10 @@ class Findings:
         try:
             yield
         except ResultsError as error:
-            self.refuse(where, "", str(error))
+            message = str(error).removeprefix(f"{where}: ")[:500]
+            self.refuse(where, "", re.sub("[^ -~]", lambda c: ascii(c[0])[1:-1], message))
+        except OSError as error:
+            self.refuse(where, "", f"cannot be read: {error.strerror}")
         except UnicodeDecodeError as error:
             line = error.object[: error.start].count(b"\n") + 1
             self.refuse(where, "", f"is not UTF-8: {error.reason} in line {line}")
@@ -129,20 +132,17 @@ def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
     contents = {}
     for name in sizes:
         with findings.reading(name):
-            contents[name] = _read(entry / name, MOST_BYTES.get(name, MOST_SCORE_BYTES))
+            most = MOST_BYTES.get(name, MOST_SCORE_BYTES)
+            contents[name] = read_bytes(entry / name, most, ResultsError)
     return contents
 
 
 def _scan(directory: Path, prefix: str, findings: Findings) -> dict[str, os.stat_result]:
-    try:
-        with os.scandir(directory) as items:
-            first = list(islice(items, MOST_FILES + 1))
-        if len(first) <= MOST_FILES:
-            return {prefix + item.name: item.stat(follow_symlinks=False) for item in first}
-        message = f"holds more than {MOST_FILES} files"
-    except OSError as error:
-        message = f"cannot be listed: {error.strerror}"
-    findings.refuse(prefix or "entry", "", message)
+    with findings.reading(prefix or "entry"), os.scandir(directory) as items:
+        first = list(islice(items, MOST_FILES + 1))
+        if len(first) > MOST_FILES:
+            raise ResultsError(f"holds more than {MOST_FILES} files")
+        return {prefix + item.name: item.stat(follow_symlinks=False) for item in first}
     return {}
 
 
@@ -159,21 +159,6 @@ def _complaint(name: str, status: os.stat_result) -> str:
     return ""
 
 
-def _read(path: Path, most: int) -> bytes:
-    """Read a plain file of at most `most` bytes, following no link and waiting for no pipe."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0))
-        with os.fdopen(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise ResultsError("is no plain file")
-            content = file.read(most + 1)
-    except OSError as error:
-        raise ResultsError(f"cannot be read: {error.strerror}") from None
-    if len(content) > most:
-        raise ResultsError(f"has more than {most} bytes")
-    return content
-
-
 def find_text(contents: Mapping[str, bytes], name: str, findings: Findings) -> tuple[str, str]:
     """Return a text file's name, compressed or not, and its text; both empty without it."""
     for stored in forms(name):
@@ -181,7 +166,7 @@ def find_text(contents: Mapping[str, bytes], name: str, findings: Findings) -> t
             content = contents[stored]
             with findings.reading(stored):
                 if stored != name:
-                    content = stored_files.decompress(content, MOST_PLAIN[name])
+                    content = decompress(content, MOST_PLAIN[name])
                 return stored, content.decode()
     return "", ""
 

@@ -4,31 +4,28 @@ Every metric with an interval is a ratio of sums over test trajectories, and a r
 terms of both sums. So value, interval and number of trajectories are computed again from them. An
 entry with score files has all scores; where the split is at hand, the terms follow from these.
 
-HDF5 can hold more than numbers. A score file may hold the parts of one unit, each with two plain
-datasets, and nothing else: no links to other places, no objects, no data kept outside the file, no
-filter but those of this format.
+Score files are read within the bounds of `oodd_eval.data.stored`. They may hold the parts of one
+unit, each with scores, offsets and, where the detector explains them, explanations.
 """
 
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-import h5py
 import numpy as np
 
+from oodd_eval.data.bounded import Bounds
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
-from oodd_eval.data.stored import check_plain
-from oodd_eval.errors import OoddError, ResultsError, SplitError
+from oodd_eval.data.stored import StoredFile
+from oodd_eval.errors import OoddError, ResultsError
 from oodd_eval.leaderboard.entry import CURVES, SCORES, EntryInfo
 from oodd_eval.leaderboard.verify.files import Findings, find_text, parse_json, plain, short
-from oodd_eval.leaderboard.verify.formats import MOST_COST, ParameterName, complaint
 from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.catalogue import (
     ALARM_RANKING,
@@ -41,7 +38,7 @@ from oodd_eval.metrics.catalogue import (
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
 from oodd_eval.results.board import contribution
-from oodd_eval.results.directory import EXPLAINED, ORDER_BITS, RECORDS, ResultsDirectory
+from oodd_eval.results.directory import EXPLAINED, RECORDS, ResultsDirectory
 from oodd_eval.results.evaluate import metric_of, rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
@@ -49,7 +46,7 @@ from oodd_eval.results.record import Metric, Record
 Records = Mapping[str, Record]  # records by their line: ``records.jsonl:3 (<cell>)``
 TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders
 MOST_ROWS: Final = 64  # rows of one entry; the paper's comparisons are some twenty
-MOST_VALUES: Final = 20_000_000  # of a file: its size says little of its decompressed one
+BOUNDS: Final = Bounds(2**28, ResultsError, kinds="fi")  # of the arrays of a score file
 
 PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in TABLE1))
 """Groups of a score file."""
@@ -206,27 +203,6 @@ def check_against_split(records: Records, split: Split, findings: Findings) -> N
                 findings.refuse(where, "anomaly", message)
 
 
-_DATASET: Final[tuple[tuple[Callable[[Any, Any], object], str], ...]] = (
-    (lambda d, _: isinstance(d, h5py.Dataset), "a dataset"),
-    (lambda d, dtype: d.dtype == dtype, "float64 scores, int64 offsets and int32 explanations"),
-    (lambda d, _: d.shape is not None and d.ndim == 1 and d.size, "one dimension and not empty"),
-    (lambda d, _: d.size <= MOST_VALUES, f"at most {MOST_VALUES} values"),
-    (lambda d, _: not (d.is_virtual or d.external), "data within this file"),
-    (lambda d, _: not len(d.attrs), "no attributes"),
-    (lambda d, _: not d.fletcher32, "no filter but gzip and shuffle"),
-    (lambda d, _: _is_plain(d), "content that the file holds, as gzip in chunks of at most 64 MB"),
-)
-"""Predicates of an item and its expected type, each safe where those before hold."""
-
-
-def _is_plain(item: h5py.Dataset) -> bool:
-    try:
-        check_plain(item)
-    except SplitError:
-        return False
-    return True
-
-
 def check_scores(
     directory: Path, files: Collection[str], records: Records, findings: Findings
 ) -> Records:
@@ -246,80 +222,47 @@ def check_scores(
             message = f"names {name}, which is absent: an entry has all scores or none"
             findings.refuse(where, "scores", message)
             continue
-        try:
-            with h5py.File(directory / name, "r") as file:
-                for field, message in _file(file, record.horizon):
-                    findings.refuse(name, field, message)
-        # A damaged file makes the library raise whatever it stumbles over.
-        except (OSError, KeyError, ValueError, RuntimeError, TypeError, MemoryError) as error:
-            findings.refuse(name, "", f"is damaged or no HDF5 file: {plain(str(error))}")
+        with findings.reading(name):
+            for field, message in _complaints(directory / name, record.horizon):
+                findings.refuse(name, field, message)
         if findings.count == before:
             sound |= unit
     return sound
 
 
-def _file(file: h5py.File, horizon: int) -> Complaints:
-    if file.userblock_size:
-        yield "userblock", f"has {file.userblock_size} bytes, expected none"
-    yield from _attributes(file)
-    groups: dict[str, Any] = {}
-    yield from _children(file, "", groups)
-    if isinstance(groups.get("test"), h5py.Group):
-        yield from _children(groups.pop("test"), "test/", groups)
-    for part in sorted(groups.keys() - set(PARTS)):
-        yield plain(part), "is no part of a score file"
-    for part in PARTS:
-        if not isinstance(groups.get(part), h5py.Group):
-            yield part, "is no group" if part in groups else "is missing"
-        else:
-            yield from _part(groups[part], part, horizon)
+def _complaints(path: Path, horizon: int) -> Complaints:
+    """Yield what is wrong with a score file; `ResultsError` where it cannot be read safely."""
+    with closing(StoredFile(path, BOUNDS)) as file:
+        parts = {*file.groups()} - {"test"} | {f"test/{name}" for name in file.groups("test")}
+        for part in sorted(parts ^ {*PARTS}):
+            yield plain(part), "is no part of a score file" if part in parts else "is missing"
+        for part in sorted(parts & {*PARTS}):
+            yield from _part(file.part(part), part, horizon)
 
 
-def _children(group: h5py.Group, prefix: str, children: dict[str, Any]) -> Complaints:
-    """Add what lies directly in a group; links that lead elsewhere are refused unfollowed."""
-    for key in group:
-        link = group.get(key, getlink=True)
-        if isinstance(link, h5py.HardLink):
-            children[prefix + key] = group[key]
-        else:
-            yield prefix + plain(key), f"is a link ({type(link).__name__}), expected data"
-    if prefix.rstrip("/") in PARTS:
-        yield from _attributes(group, {"order"})
-    elif prefix and len(group.attrs):
-        yield prefix.rstrip("/"), "has attributes, expected none"
-
-
-def _attributes(group: h5py.Group, names: Collection[str] = ()) -> Complaints:
-    """Yield attributes that are no costs, nor the order of groups, or not among some names."""
-    for key, value in group.attrs.items():
-        most = 2**ORDER_BITS if key == "order" else MOST_COST
-        number = isinstance(value, float | np.integer) and 0 <= value <= most
-        if complaint(ParameterName, key) or not number or (names and key not in names):
-            yield f"attribute {plain(key)}", f"is {short(value)}, expected a cost, or the order"
-
-
-def _part(group: h5py.Group, part: str, horizon: int) -> Complaints:
-    items: dict[str, Any] = {}
-    complaints = list(_children(group, f"{part}/", items))
-    explains = part not in (CALIBRATION, TWINS) and not group.keys().isdisjoint(_EXPLAINED)
+def _part(datasets: Mapping[str, Any], part: str, horizon: int) -> Complaints:
+    explains = part not in (CALIBRATION, TWINS) and not datasets.keys().isdisjoint(_EXPLAINED)
     dtypes = _DTYPES | _EXPLAINED if explains else _DTYPES
-    expected = {f"{part}/{key}": dtype for key, dtype in dtypes.items()}
-    unknown = sorted(items.keys() - expected)
-    complaints += [(plain(name), "is no dataset of this format") for name in unknown]
-    for name, dtype in expected.items():
-        item = items.get(name)
-        broken = (text for holds, text in _DATASET if not holds(item, dtype))
-        first = islice(broken, 1)
-        complaints += [(name, f"is {plain(str(item))}, expected {text}") for text in first]
+    complaints = [
+        (f"{part}/{plain(name)}", "is no dataset of this format")
+        for name in sorted(datasets.keys() - dtypes)
+    ]
+    for name, dtype in dtypes.items():
+        data = datasets.get(name)
+        if data is None:
+            complaints.append((f"{part}/{name}", "is missing"))
+        elif data.dtype != dtype or len(data.shape) != 1 or not len(data):
+            message = f"is {data.dtype} of shape {data.shape}, expected some {dtype} in a column"
+            complaints.append((f"{part}/{name}", message))
     yield from complaints
     if complaints:
         return
-    scores, offsets = items[f"{part}/scores"][:], items[f"{part}/offsets"][:]
+    scores, offsets = datasets["scores"], datasets["offsets"]
     if offsets[0] != 0 or (np.diff(offsets) < 1).any() or offsets[-1] != len(scores):
         yield f"{part}/offsets", f"do not rise from 0 to {len(scores)}, the number of scores"
         return
     for name in (name for name in EXPLAINED if explains):
-        values = items[f"{part}/{name}"][:]
+        values = datasets[name]
         if len(values) != len(scores) or ((values < 0) != np.isnan(scores)).any():
             yield f"{part}/{name}", "is not of all rows with a score, and negative for the others"
     most = max(horizon, MAX_WARM_UP)
@@ -360,18 +303,9 @@ def check_curves(contents: Mapping[str, bytes], records: Records, findings: Find
     name, text = find_text(contents, CURVES, findings)
     if not name:
         return
-    before, content = findings.count, None
+    units: list[Any] = []
     with findings.reading(name):
-        content = parse_json(text)
-    if findings.count > before:
-        return
-    try:
-        units = curve_file.check_curves(content, CURVES)["units"]
-    except ResultsError as error:
-        # Its messages begin with the field: "curves.json: units[0].seed is False, ...".
-        field, _, message = str(error).removeprefix(f"{CURVES}: ").partition(" ")
-        findings.refuse(name, field.removeprefix(CURVES).rstrip(":"), message)
-        return
+        units = curve_file.check_curves(parse_json(text), name)["units"]
     cells = {str(record.cell): record for record in records.values() if record.ok}
     for i, unit in enumerate(units):
         record = cells.get(unit["cell"])

@@ -9,23 +9,17 @@ so its numbers differ by chance. How much chance explains is estimated from envi
 fit, a calibration and episodes of its own. An entry that is better by more than that is refused.
 """
 
-import json
 import math
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final, Literal
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
-from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, TABLE1, SplitDefinition
-from oodd_eval.data.files import write_text
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.split import published_digests
-from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.leaderboard.entry import ENTRY, Means, SubmittedEntry, digest_of
+from oodd_eval.leaderboard.entry import Means, read_json
 from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.leaderboard.verify.recompute import Records
 from oodd_eval.metrics.auc import Floats
@@ -97,60 +91,7 @@ def read_order(directory: Path) -> RerunOrder | None:
     file = directory / ORDER
     if not file.exists():
         return None
-    try:
-        return TypeAdapter(RerunOrder).validate_json(file.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise ResultsError(
-            f"{str(file)!r} is no order of a re-run: {error}; use another directory"
-        ) from None
-
-
-def draw(
-    entry: SubmittedEntry, directory: Path, environments: Sequence[str], *, sandbox: bool
-) -> RerunOrder:
-    """Draw seeds for an entry and write the order, or go on with the one that is there.
-
-    `UsageError`: the order there is for another entry, another version of it, or environments.
-    """
-    digest = digest_of((entry.path / ENTRY).read_bytes())
-    order = read_order(directory)
-    if order is None:
-        taken = {definition.seed_base for definition in SPLITS.values()}
-        base = secrets.choice([n for n in CUSTOM_SEED_BASES if n not in taken])
-        day = datetime.now(UTC).date().isoformat()
-        order = RerunOrder(digest, base, day, list(environments), sandbox)
-    if order.entry != digest:
-        raise UsageError(
-            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {entry.meta.id} "
-            f"has {digest[:12]}: seeds are drawn for one version of an entry; name another --output"
-        )
-    if order.environments != list(environments):
-        raise UsageError(
-            f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
-            f"{', '.join(environments)}: name another --output"
-        )
-    order = replace(order, sandbox=order.sandbox and sandbox)
-    directory.mkdir(parents=True, exist_ok=True)
-    write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
-    return order
-
-
-def definition_of(entry: SubmittedEntry, order: RerunOrder) -> SplitDefinition:
-    """Return the entry's split, recorded anew from the order's seeds; `UsageError` for others."""
-    definition = SPLITS.get(entry.meta.split)
-    if definition is None or definition.base:
-        known = ", ".join(name for name, one in SPLITS.items() if not one.base)
-        raise UsageError(
-            f"{entry.meta.id} is on split {entry.meta.split!r}: expected one that can be recorded "
-            f"with other seeds ({known})"
-        )
-    return replace(definition, name=f"rerun-{order.seed_base}", seed_base=order.seed_base)
-
-
-def environments_of(entry: SubmittedEntry) -> list[str]:
-    """Return the environments that an entry has, in the order of the paper."""
-    present = {record.environment for record in entry.records}
-    return [name for name in ENVIRONMENTS if name in present]
+    return read_json(RerunOrder, file, "is no order of a re-run, use another directory")
 
 
 @dataclass(frozen=True, slots=True)
