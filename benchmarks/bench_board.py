@@ -21,8 +21,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from oodd_eval.leaderboard.build import build, suite_parts
+from oodd_eval.leaderboard.build import build
 from oodd_eval.leaderboard.entry import ENTRY, read_entries
+from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.standings import SEEDS
 
@@ -74,7 +75,7 @@ def timed(leaderboard, queue):
         build(
             read_entries(leaderboard / "results"),
             Path(output),
-            lambda: suite_parts(leaderboard),
+            suite_sections(leaderboard),
             on_part=lambda name: marks.append((name, time.perf_counter())),
         )
     marks.append(("", time.perf_counter()))

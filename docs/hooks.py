@@ -18,10 +18,9 @@ from mkdocs.structure.pages import Page
 from oodd_eval._version import repository
 from oodd_eval.cli.main import PROGRAM
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import CELLS, cells, suite_cells
+from oodd_eval.leaderboard.build import CELLS, cells
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections, suite_sections
-from oodd_eval.leaderboard.site.data import power_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"
@@ -94,10 +93,10 @@ def board() -> dict[str, str | bytes]:
         return {}
     found = sections(read_entries(ROOT / "leaderboard" / "results"))
     suites = suite_sections(ROOT / "leaderboard")
-    shown = site.files(found, power_of(suites), project=repository())
+    shown = site.files(found, suites, project=repository())
     # The page of Markdown that it links to is a page of this site.
     page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
-    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suite_cells(suites))}
+    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suites)}
     return {f"{BOARD}/{name}": content for name, content in files.items()}
 
 

@@ -22,7 +22,7 @@ from oodd_eval.leaderboard.entry import (
     write_grants,
 )
 from oodd_eval.leaderboard.sections import sections, suite_sections
-from oodd_eval.leaderboard.site.data import power_of, site_data
+from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
@@ -69,7 +69,7 @@ GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
 
 
 def graded(root):
-    """What is drawn of a leaderboard in `root` with three rows on one ladder."""
+    """The suites of a leaderboard in `root` with three rows on one ladder."""
     names = list(rungs_of("cartpole", "iid"))
     lines = []
     for row, (first, last) in GRADED_ROWS.items():
@@ -80,7 +80,7 @@ def graded(root):
     own = root / "suites" / "small"
     own.mkdir(parents=True)
     (own / "records.jsonl").write_text("".join(lines), encoding="utf-8")
-    return power_of(suite_sections(root))
+    return suite_sections(root)
 
 
 def make_curves(record, seed, twins_seed=0):
@@ -219,10 +219,9 @@ def full(rows):
     ]
     part = parts[row["part"]]
     part |= {"comparisons": [[name, 0.0123456, -0.012345, 0.0234567, 0.0015] for name in names]}
-    content = part | {"curves": site.packed(part["curves"])}
     found = {
         site.PAGE: site.index(data),
-        f"{site.PARTS}/{names[1]}.js": site.data_file(names[1], content),
+        f"{site.PARTS}/{names[1]}.js": site.data_file(names[1], part),
     }
     for name in board["parts"].values():
         (values,) = parts[name]["values"].values()

@@ -16,7 +16,7 @@ from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.placing import placement
 from oodd_eval.leaderboard.published import PUBLISHED, board_of, read_published
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.leaderboard.verify import verify
 
 BOARD = Path(__file__).parents[1] / "leaderboard"
@@ -65,7 +65,7 @@ def check_board(board, scratch, entries=None):
     entries = entries_of(board) if entries is None else entries
     if not entries:
         return [f"{name} is committed, but there are no entries" for name in rendered(board)]
-    leaderboard_build.build(entries, scratch, lambda: leaderboard_build.suite_parts(board))
+    leaderboard_build.build(entries, scratch, suite_sections(board))
     new, old = rendered(scratch), rendered(board)
     lines = [f"{name} is missing" for name in sorted(new - old)]
     lines += [f"{name} is of no entry" for name in sorted(old - new)]

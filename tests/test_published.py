@@ -16,9 +16,9 @@ from oodd_eval.leaderboard import published
 from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry
 from oodd_eval.leaderboard.placing import neighbours, placement, rankings
 from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.sections import SuiteSection, sections
+from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.strengths import DETECTION
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
@@ -106,11 +106,14 @@ def run_of(records, directory):
 # The file
 
 
+def suite_of(records):
+    return SuiteSection("graded", Board(records), [], graded=True)
+
+
 def test_further_suites_are_read_apart_from_the_boards(board, tmp_path):
     (one, *_) = row("good", 0.9, strength="half")
-    line = published.slim(one, ["auc_matched"], suite="graded").to_json() + "\n"
     place = tmp_path / published.PUBLISHED
-    place.write_bytes(published_bytes([board], line))
+    place.write_bytes(published_bytes([board], [suite_of([one])]))
     found = read_published(place)
     (own,) = found.boards
     assert len(own.records) == sum(len(s.records) for s in board.ranks.standings)
@@ -122,9 +125,8 @@ def test_show_prints_further_suites_unless_one_board_is_asked_for(
     board, tmp_path, monkeypatch, capsys
 ):
     rung = row("graded-one", 0.9, strength="kept99")
-    lines = (published.slim(r, ["auc_matched", DETECTION], suite="graded").to_json() for r in rung)
     place = tmp_path / published.PUBLISHED
-    place.write_bytes(published_bytes([board], "".join(f"{line}\n" for line in lines)))
+    place.write_bytes(published_bytes([board], [suite_of(rung)]))
     monkeypatch.setattr(published, "published_file", lambda: place)
     assert main(["leaderboard", "show"]) == 0
     boards, suite = capsys.readouterr().out.split("Suite graded, digest")

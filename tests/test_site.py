@@ -18,9 +18,9 @@ from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.leaderboard.sections import sections
-from oodd_eval.leaderboard.site import gridded, packed
 from oodd_eval.leaderboard.site.data import (
     WITH_INTERVALS,
+    gridded,
     part_name,
     selections,
     shipped_split,
@@ -314,12 +314,12 @@ def test_selections_without_cells_are_left_out():
 def test_curves_are_those_of_the_row(files):
     one, ten = part(files, "riqn")["curves"], part(files, "riqn[h=10]")["curves"]
     assert part(files, "rf")["curves"] == {}
-    curves = one["cells"]
+    curves = one
     assert set(curves) == {
         f"{e}/{a}" for e in ("cartpole", "hopper")
         for a in ("iid", "drift", "gravity", "components")
     }  # fmt: skip
-    assert curves["hopper/iid"] != ten["cells"]["hopper/iid"]
+    assert curves["hopper/iid"] != ten["hopper/iid"]
 
 
 def test_damaged_curves_are_named(tmp_path):
@@ -407,53 +407,25 @@ def test_an_entry_says_who_granted_its_trust_and_its_source(tmp_path):
 # -- curves as the page keeps them ----------------------------------------------------------------
 
 
-def test_unpacked_curves_are_those_of_the_entry_to_a_pixel(entries, files):
+def test_curves_are_those_of_the_entry_to_a_pixel(entries, files):
     units = read_curves(entries[0].curves)["units"]
     kept = part(files, "riqn")["curves"]
     compared = 0
-    for unit in units:
-        if not unit["cell"].endswith("::riqn[h=1,seed=0]"):
-            continue
-        cell = kept["cells"][f"{unit['environment']}/{unit['anomaly']}"]
-        for curve in ("roc", "delay_far"):
-            shown = {name: kept["lists"][place] for name, place in cell[curve].items()}
-            assert shown == unit[curve]
-        example = unit["example"]
+    for unit in (unit for unit in units if unit["cell"].endswith("::riqn[h=1,seed=0]")):
+        cell, example = kept[f"{unit['environment']}/{unit['anomaly']}"], unit["example"]
+        assert (cell["roc"], cell["delay_far"]) == (unit["roc"], unit["delay_far"])
         for names, step in (
             (("scores", "twin"), cell["example"]["score_step"]),
             (("cusum", "twin_cusum"), cell["example"]["cusum_step"]),
         ):
             largest = max(abs(v) for name in names for v in example[name] if v is not None)
-            same = cell["example"][f"same_{names[0]}"]
-            assert same >= example["onset"] - example["start"]
             for name in names:
-                kept_here = cell["example"][name]
-                if name == names[1]:
-                    kept_here = [*cell["example"][names[0]][:same], *kept_here]
-                shown = [v if v is None else v * step for v in kept_here]
+                shown = [v if v is None else v * step for v in cell["example"][name]]
                 assert shown == pytest.approx(example[name], abs=largest / 250)
                 compared += len(shown)
         plain = ("index", "auc_matched", "onset", "length", "start", "alarms", "twin_alarms")
         assert {n: cell["example"][n] for n in plain} == {n: example[n] for n in plain}
     assert compared > 8 * 4 * 90
-
-
-def test_lists_that_cells_share_are_kept_once():
-    example = {"scores": [1.0], "twin": [1.0], "cusum": [0.0], "twin_cusum": [0.0]}
-    one = {"roc": {"fpr": [0, 1], "tpr": [0.5, 1]}, "delay_far": {"far": [0, 1]}, "seed": 0}
-    found = packed({"ant/iid": one | {"example": example}, "ant/drift": one | {"example": example}})
-    assert found["lists"] == [[0, 1], [0.5, 1]]
-    assert found["cells"]["ant/iid"]["roc"] == {"fpr": 0, "tpr": 1}
-    assert found["cells"]["ant/drift"]["delay_far"] == {"far": 0}
-
-
-def test_a_twin_keeps_only_what_differs():
-    example = {"scores": [None, 1, 2, 3], "twin": [None, 1, 2.5, 3, 1],
-               "cusum": [0, 0, 0], "twin_cusum": [0]}  # fmt: skip
-    one = {"roc": {}, "delay_far": {}, "example": example}
-    found = packed({"ant/iid": one})["cells"]["ant/iid"]["example"]
-    assert (found["same_scores"], found["same_cusum"], found["twin_cusum"]) == (2, 1, [])
-    assert [v * found["score_step"] for v in found["twin"]] == [2.5, 3, 1]
 
 
 @pytest.mark.parametrize(

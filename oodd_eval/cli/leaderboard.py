@@ -13,9 +13,10 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expre
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.build import STALE, differences, stale, suite_parts
+from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
 from oodd_eval.leaderboard.entry import GRANTS, read_entries
+from oodd_eval.leaderboard.sections import suite_sections
 from oodd_eval.leaderboard.verify import EntryVerdict, changes_against, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
@@ -50,7 +51,7 @@ def build(options: Options) -> int:
         if not entries:
             return say(f"no entries in {options.results}", 5)
         target = Path(fresh) if options.check else output
-        written = build_board(entries, target, lambda: suite_parts(output), on_part=show)
+        written = build_board(entries, target, suite_sections(output), on_part=show)
         lines = differences(target, output) if options.check else []
     if not options.check:
         if options.verbosity >= 0:
@@ -210,7 +211,7 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
     if refused:
         return say(f"{refused} of {len(entries)} entries are refused", 1)
     with tempfile.TemporaryDirectory() as fresh:
-        build_board(read_entries(results), Path(fresh), lambda: suite_parts(results.parent))
+        build_board(read_entries(results), Path(fresh), suite_sections(results.parent))
     console.print(f"{', '.join(entries)}: may be merged, the board builds with it")
     return 0
 

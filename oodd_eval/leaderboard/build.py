@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS
@@ -16,16 +16,14 @@ from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.published import PUBLISHED, published_bytes, suite_lines
+from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
 from oodd_eval.leaderboard.sections import (
     SUITES,
     TABLES,
     LeaderboardSection,
     SuiteSection,
     sections,
-    suite_sections,
 )
-from oodd_eval.leaderboard.site.data import Json, power_of
 from oodd_eval.results.board import Board
 from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record
@@ -45,39 +43,6 @@ TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(enc
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
-class SuiteParts(NamedTuple):
-    """Results on further test suites, ready to be shown.
-
-    `page` are sections of the page, `power` is drawn by the site; `cells` are lines of the table
-    of all cells, `published` those of the published file.
-    """
-
-    page: Sequence[str] = ()
-    power: Sequence[Json] = ()
-    cells: str = ""
-    published: str = ""
-
-
-@without_collector()
-def suite_parts(directory: Path) -> SuiteParts:
-    """Return what a leaderboard's directory has of further test suites, ready to be shown."""
-    suites = suite_sections(directory)
-    page = [*map(_suite, suites)]
-    return SuiteParts(page, power_of(suites), suite_cells(suites), suite_lines(suites))
-
-
-def suite_cells(suites: Sequence[SuiteSection]) -> str:
-    """Return the lines that further test suites have in the table of all cells."""
-    lines = []
-    for suite in suites:
-        first = primary_settings(suite.board.records)
-        for r in suite.board.records:
-            trivial = suite.board.is_trivial(r.setting)
-            about = _origin(suite.name, "", "", primary=r.setting in first, trivial=trivial)
-            lines.append((about, r))
-    return cells_csv(lines, header=False)
-
-
 def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool) -> dict[str, str]:
     """Return the columns that stand before a cell's own in the table of all cells."""
     flags = {"primary": primary, "trivial": trivial}
@@ -89,7 +54,7 @@ def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool)
 def build(
     entries: Sequence[SubmittedEntry],
     output: Path,
-    suites: Callable[[], SuiteParts] = SuiteParts,
+    suites: Sequence[SuiteSection] = (),
     *,
     on_part: Callable[[str], object] = str,
 ) -> list[str]:
@@ -101,20 +66,18 @@ def build(
     """
     on_part("ranking")
     by_board = sections(entries)
-    on_part("suites")
-    further = suites()
     on_part("page")
     address = f"{SITE}/{site.PAGE}"
-    files: dict[str, str | bytes] = {PAGE: page(by_board, further.page, site=address)}
+    files: dict[str, str | bytes] = {PAGE: page(by_board, suites, site=address)}
     on_part("tables")
     for section in by_board:
         files[section.file("ranking")] = ranking_csv(section.ranks, section.trust)
         files[section.file("comparisons")] = comparisons_csv(section.ranks)
     on_part("published board")
-    files[PUBLISHED] = published_bytes(by_board, further.published)
-    files[CELLS] = cells(by_board, further.cells)
+    files[PUBLISHED] = published_bytes(by_board, suites)
+    files[CELLS] = cells(by_board, suites)
     on_part("site")
-    parts = site.files(by_board, further.power, project=repository())
+    parts = site.files(by_board, suites, project=repository())
     files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
@@ -126,8 +89,8 @@ def build(
     return list(files)
 
 
-def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
-    """Return all cells of boards as one table (compressed CSV), the lines of `suites` last."""
+def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> bytes:
+    """Return all cells of boards, and then of suites, as one table (compressed CSV)."""
     lines: list[tuple[dict[str, str], Record]] = []
     for section in sections:
         for row in section.ranks.standings:
@@ -135,7 +98,12 @@ def cells(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
             flags = {"primary": row.primary, "trivial": row.trivial}
             about = _origin("leaderboard", entry.meta.id, entry.trust, **flags)
             lines += [(about, r) for r in row.records]
-    return compress((cells_csv(lines) + suites).encode())
+    for suite in suites:
+        first = primary_settings(suite.board.records)
+        for r in suite.board.records:
+            flags = {"primary": r.setting in first, "trivial": suite.board.is_trivial(r.setting)}
+            lines.append((_origin(suite.name, "", "", **flags), r))
+    return compress(cells_csv(lines).encode())
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -174,14 +142,14 @@ def _has_content(path: Path, content: bytes) -> bool:
 
 
 def page(
-    sections: Sequence[LeaderboardSection], suites: Sequence[str] = (), *, site: str = ""
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
 ) -> str:
     """Return the whole page with the sections of suites; it names the `site` if there is one."""
     entries = {e.meta.id: e for section in sections for e in section.entries}
     parts = [TEXTS["introduction"], *([TEXTS["site"].format(site=site)] if site else [])]
     parts += [_contents(sections)] if len(sections) > 1 else []
     parts += [_section(section) for section in sections]
-    parts += suites
+    parts += [_suite(suite) for suite in suites]
     parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
     return "\n".join(parts)
 

@@ -76,35 +76,29 @@ class Published(NamedTuple):
         return {name: Board(records) for name, records in by_suite.items()}
 
 
-def published_bytes(sections: Sequence[LeaderboardSection], suites: str = "") -> bytes:
-    """Return the bytes of the file: the same ones for the same entries and `suite_lines`."""
-    lines = [
+def published_bytes(
+    sections: Iterable[LeaderboardSection], suites: Iterable[SuiteSection] = ()
+) -> bytes:
+    """Return the bytes of the file: the same ones for the same boards and suites."""
+    records = [
         slim(
             record,
             RANKED_BY,
-            entry=section.sources[one.entry].meta.id,
-            trust=section.trust[one.entry],
-            primary=one.primary,
+            entry=section.sources[row.entry].meta.id,
+            trust=section.trust[row.entry],
+            primary=row.primary,
         )
         for section in sections
-        for one in section.ranks.standings
-        for record in one.records
+        for row in section.ranks.standings
+        for record in row.records
     ]
-    return compress((_text(lines) + suites).encode())
-
-
-def suite_lines(suites: Iterable[SuiteSection]) -> str:
-    """Return the lines of further test suites, of those that are graded."""
-    return _text(
+    records += [
         slim(record, (DETECTION,), suite=suite.name)
         for suite in suites
         if suite.graded
         for record in suite.board.records
-    )
-
-
-def _text(records: Iterable[Record]) -> str:
-    return "".join(record.to_json() + "\n" for record in records)
+    ]
+    return compress("".join(record.to_json() + "\n" for record in records).encode())
 
 
 def published_file() -> Path:

@@ -9,6 +9,7 @@ sorts and draws.
 import hashlib
 import math
 import re
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any, Final
@@ -66,6 +67,8 @@ _ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIE
 
 MOST_SENSORS: Final = 3  # sensors of an episode: those that leave their twin's course most
 STEPS: Final = 250  # steps between the least and the largest value: one a pixel
+LEVELS: Final = 250  # least steps from zero to the largest value of a drawing: one a pixel
+HEAVY: Final = 30  # A largest value this many times the typical one asks for a logarithmic scale
 
 Json = dict[str, Any]
 Units = Mapping[str, list[Json]]  # curves of single cells by the id of their entry
@@ -74,7 +77,7 @@ SelectedCell = tuple[str, str]  # environment and anomaly
 
 
 def site_data(
-    sections: Sequence[LeaderboardSection], power: Sequence[Json] = ()
+    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
 ) -> tuple[Json, dict[str, Json]]:
     """Return the index, and the parts by name.
 
@@ -95,7 +98,7 @@ def site_data(
         "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"],
         "boards": on_site,
-        "power": [*power],
+        "power": [_power(suite) for suite in suites if suite.graded],
     }
     return data, parts
 
@@ -109,11 +112,6 @@ def part_name(text: str) -> str:
 def metric_part(board: str, metric: str) -> str:
     """Return the name of the part with a metric of all cells of a board."""
     return part_name(f"{board}/{metric}")
-
-
-def power_of(suites: Sequence[SuiteSection]) -> list[Json]:
-    """Return what is drawn of further test suites, of those that are graded."""
-    return [_power(section) for section in suites if section.graded]
 
 
 def _power(section: SuiteSection) -> Json:
@@ -379,9 +377,42 @@ def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
     curves: Json = {}
     for unit in units:
         if unit["cell"] in cells:
-            parts = {name: unit[name] for name in ("seed", "roc", "delay_far", "example")}
+            parts = {name: unit[name] for name in ("seed", "roc", "delay_far")}
+            parts["example"] = gridded(unit["example"])
             curves.setdefault(f"{unit['environment']}/{unit['anomaly']}", parts)
     return curves
+
+
+def gridded(example: Json) -> Json:
+    """Return an example whose scores and statistics are whole numbers of steps.
+
+    A ``score_step`` or ``cusum_step`` of None says that the numbers are as they were, because a few
+    are so large that they need a logarithmic scale.
+    """
+    steps = dict(example)
+    for step_name, unit, names in (
+        ("score_step", 1.0, ("scores", "twin")),
+        ("cusum_step", THRESHOLD, ("cusum", "twin_cusum")),
+    ):
+        step = _step((v for name in names for v in example[name] if v is not None), unit)
+        steps[step_name] = step
+        if step is not None:
+            for name in names:
+                steps[name] = [None if v is None else round(v / step) for v in example[name]]
+    return steps
+
+
+def _step(numbers: Iterable[float], unit: float) -> float | None:
+    """Return a round step for numbers that are drawn together; None where they are too uneven."""
+    sizes = [abs(v) for v in numbers]
+    largest = max([unit, *sizes])
+    typical = max(unit, statistics.median(sizes) if sizes else unit)
+    if largest > HEAVY * typical:
+        return None
+    power = math.floor(math.log10(largest / LEVELS))
+    # Not 10**-4 but the float that is printed as 0.0001.
+    steps = [float(f"{digit}e{power}") for digit in (1, 2, 5)]
+    return max(s for s in steps if s <= largest / LEVELS * (1 + 1e-9))
 
 
 def _digits(value: float, metric: str) -> int | None:

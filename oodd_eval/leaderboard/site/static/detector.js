@@ -149,22 +149,20 @@ function sensorsOf(board, cell, example) {
   return name ? load(name).then((episodes) => episodes[`${cell.anomaly}/${example.index}`] ?? null) : null;
 }
 
-/** Curves of one cell of a row, unpacked; undefined where there are none. */
+/** Curves of one cell of a row, in their units; undefined where there are none. */
 function curvesOf(row, name) {
-  const { lists, cells } = PARTS.get(row.part).curves;
-  const cell = cells?.[name];
+  const cell = PARTS.get(row.part).curves[name];
   if (!cell) return undefined;
-  const looked = (places) => Object.fromEntries(Object.entries(places).map(([key, place]) => [key, lists[place]]));
+  const { scores, twin, score_step, cusum, twin_cusum, cusum_step } = cell.example;
   const scaled = (values, step) => step === null ? values : values.map((v) => v === null ? null : v * step);
-  const { scores, twin, score_step, same_scores, cusum, twin_cusum, cusum_step, same_cusum } = cell.example;
   const example = {
     ...cell.example,
     scores: scaled(scores, score_step),
-    twin: scaled([...scores.slice(0, same_scores), ...twin], score_step),
+    twin: scaled(twin, score_step),
     cusum: scaled(cusum, cusum_step),
-    twin_cusum: scaled([...cusum.slice(0, same_cusum), ...twin_cusum], cusum_step),
+    twin_cusum: scaled(twin_cusum, cusum_step),
   };
-  return { seed: cell.seed, roc: looked(cell.roc), delay_far: looked(cell.delay_far), example };
+  return { ...cell, example };
 }
 
 /** The row against every other ranked row. */
