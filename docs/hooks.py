@@ -19,8 +19,7 @@ from oodd_eval._version import repository
 from oodd_eval.cli.main import PROGRAM
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.build import CELLS, cells
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import sections, suite_sections
+from oodd_eval.leaderboard.entry import read_entries, sections, suite_sections
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"

@@ -19,9 +19,10 @@ from oodd_eval.leaderboard.entry import (
     digest_of,
     read_entries,
     read_grants,
+    sections,
+    suite_sections,
     write_grants,
 )
-from oodd_eval.leaderboard.sections import sections, suite_sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING

@@ -13,10 +13,8 @@ import pytest
 
 from oodd_eval.data.files import read_text
 from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.placing import placement
-from oodd_eval.leaderboard.published import PUBLISHED, board_of, read_published
-from oodd_eval.leaderboard.sections import sections, suite_sections
+from oodd_eval.leaderboard.entry import read_entries, sections, suite_sections
+from oodd_eval.leaderboard.published import PUBLISHED, board_of, placement, read_published
 from oodd_eval.leaderboard.verify import verify
 
 BOARD = Path(__file__).parents[1] / "leaderboard"

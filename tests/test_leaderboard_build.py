@@ -18,9 +18,8 @@ from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.build import cells, page
-from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, read_entries
+from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, read_entries, sections
 from oodd_eval.leaderboard.published import PUBLISHED
-from oodd_eval.leaderboard.sections import sections
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results import board as results_board

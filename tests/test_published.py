@@ -13,10 +13,15 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.files import compress, decompress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard import published
-from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry
-from oodd_eval.leaderboard.placing import neighbours, placement, rankings
-from oodd_eval.leaderboard.published import board_of, published_bytes, read_published
-from oodd_eval.leaderboard.sections import SuiteSection, sections
+from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, SuiteSection, sections
+from oodd_eval.leaderboard.published import (
+    board_of,
+    neighbours,
+    placement,
+    published_bytes,
+    rankings,
+    read_published,
+)
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
 

@@ -16,8 +16,7 @@ from oodd_eval.data.ladder import rungs_of
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.entry import read_entries, sections
 from oodd_eval.leaderboard.site.data import (
     WITH_INTERVALS,
     gridded,

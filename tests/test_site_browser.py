@@ -10,8 +10,7 @@ import pytest
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.sections import sections
+from oodd_eval.leaderboard.entry import read_entries, sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.tables import show_value

@@ -13,8 +13,15 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, say_n
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, read_entry
-from oodd_eval.leaderboard.placing import Placement, neighbours, placement, rankings
-from oodd_eval.leaderboard.published import PublishedBoard, board_of, read_published
+from oodd_eval.leaderboard.published import (
+    Placement,
+    PublishedBoard,
+    board_of,
+    neighbours,
+    placement,
+    rankings,
+    read_published,
+)
 from oodd_eval.names import check_known, select
 from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory

@@ -15,8 +15,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.entry import GRANTS, read_entries
-from oodd_eval.leaderboard.sections import suite_sections
+from oodd_eval.leaderboard.entry import GRANTS, read_entries, suite_sections
 from oodd_eval.leaderboard.verify import EntryVerdict, changes_against, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed

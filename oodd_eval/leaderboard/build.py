@@ -15,15 +15,15 @@ from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import SubmittedEntry
-from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
-from oodd_eval.leaderboard.sections import (
+from oodd_eval.leaderboard.entry import (
     SUITES,
     TABLES,
     LeaderboardSection,
+    SubmittedEntry,
     SuiteSection,
     sections,
 )
+from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
 from oodd_eval.results.board import Board
 from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record

@@ -16,9 +16,9 @@ from oodd_eval.leaderboard.entry import (
     read_entries,
     read_entry,
     read_grants,
+    sections,
     write_grants,
 )
-from oodd_eval.leaderboard.sections import sections
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import verify
 

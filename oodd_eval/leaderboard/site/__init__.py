@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
+from oodd_eval.leaderboard.entry import LeaderboardSection, SuiteSection
 from oodd_eval.leaderboard.site.data import Json, site_data
 
 PAGE: Final = "index.html"

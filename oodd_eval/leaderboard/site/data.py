@@ -20,8 +20,12 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Quantity, paper_tables
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import SHIPPED, Split
-from oodd_eval.leaderboard.entry import SubmittedEntry, commands_of
-from oodd_eval.leaderboard.sections import LeaderboardSection, SuiteSection
+from oodd_eval.leaderboard.entry import (
+    LeaderboardSection,
+    SubmittedEntry,
+    SuiteSection,
+    commands_of,
+)
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
