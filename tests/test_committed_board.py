@@ -1,11 +1,10 @@
 """The committed leaderboard: valid entries, and no number that the records do not give.
 
-Without entries there must be no tables either. Numbers are compared to their last printed digit:
+Numbers are compared to their last printed digit:
 sums may be rounded otherwise on another processor. `leaderboard build --check` compares bytes.
 """
 
 import re
-import shutil
 from itertools import zip_longest
 from pathlib import Path
 
@@ -53,29 +52,20 @@ def unlike(fresh, committed):
     return found
 
 
-def entries_of(board):
-    results = board / "results"
-    return read_entries(results) if results.is_dir() else []
-
-
-def check_board(board, scratch, entries=None):
+def check_board(board, scratch, entries):
     """Return what is wrong with a board: a line for every file or line of one."""
-    entries = entries_of(board) if entries is None else entries
-    if not entries:
-        return [f"{name} is committed, but there are no entries" for name in rendered(board)]
     leaderboard_build.build(entries, scratch, suite_sections(board))
     new, old = rendered(scratch), rendered(board)
-    lines = [f"{name} is missing" for name in sorted(new - old)]
-    lines += [f"{name} is of no entry" for name in sorted(old - new)]
+    lines = [f"{name} is missing or of no entry" for name in sorted(new ^ old)]
     for name in sorted(new & old):
-        texts = (read_text(place / name) for place in (scratch, board))
+        texts = (read_text(path / name) for path in (scratch, board))
         lines += [f"{name}: {line}" for line in unlike(*texts)]
     return lines
 
 
 @pytest.fixture(scope="module")
 def entries():
-    return entries_of(BOARD)
+    return read_entries(BOARD / "results")
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +98,7 @@ def test_nominal_twins_look_alike_to_every_row_in_every_environment(committed):
 
 @pytest.mark.artefacts
 def test_every_committed_entry_is_valid():
-    verdicts = verify(BOARD / "results") if (BOARD / "results").is_dir() else []
-    assert [p.text for v in verdicts for p in v.findings.problems] == []
+    assert [p.text for v in verify(BOARD / "results") for p in v.findings.problems] == []
 
 
 @pytest.mark.artefacts
@@ -129,61 +118,13 @@ def test_committed_entries_have_their_committed_places_on_the_published_board(co
 # The comparison itself
 
 
-@pytest.fixture(scope="module")
-def built(submissions, tmp_path_factory):
-    """A board with an entry, as it would be committed."""
-    board = tmp_path_factory.mktemp("board")
-    shutil.copytree(submissions.plain, board / "results" / submissions.plain.name)
-    leaderboard_build.build(read_entries(board / "results"), board)
-    return board
-
-
-@pytest.fixture
-def board(built, tmp_path):
-    return Path(shutil.copytree(built, tmp_path / "board"))
-
-
-def edited(path, pattern, change):
-    """Change the last place where a pattern stands."""
-    text = path.read_text()
-    place = list(re.finditer(pattern, text))[-1]
-    path.write_text(text[: place.start()] + change(place[0]) + text[place.end() :])
-
-
-def test_a_number_that_was_edited_in_a_file_is_found(board, tmp_path):
-    shutil.rmtree(board / "site")  # it is built where it is shown
-    assert check_board(board, tmp_path / "fresh") == []
-    (file,) = (board / "tables").glob("*-ranking.csv")
-    edited(file, r"0\.\d{4,}", lambda text: f"{float(text) + 0.001:.6g}")
-    (line,) = check_board(board, tmp_path / "fresh")
-    assert line.startswith(f"tables/{file.name}: line ")
-
-
-def test_a_record_that_was_changed_afterwards_is_found(board, tmp_path):
-    (entry,) = (board / "results").iterdir()
-    records = entry / "records.jsonl"
-    edited(records, r'"auc_matched": \[\[[^,]*', lambda _: '"auc_matched": [[0.123')
-    assert any("-ranking.csv" in line for line in check_board(board, tmp_path / "fresh"))
-
-
-def test_tables_of_entries_that_are_gone_are_found(board, tmp_path):
-    (board / "tables" / "old-cells.csv").write_text("x\n")
-    assert check_board(board, tmp_path / "fresh") == ["tables/old-cells.csv is of no entry"]
-    shutil.rmtree(board / "results")
-    lines = check_board(board, tmp_path / "fresh")
-    assert "README.md is committed, but there are no entries" in lines
-
-
 @pytest.mark.parametrize(
     ("fresh", "committed", "same"),
     [
         ("a,0.123456", "a,0.123457", True),
         ("a,0.123456", "a,0.123458", False),
-        ("a,0.123456,1", "a,0.123457,1", True),
         ("a,0.123456,1", "a,0.123456,2", False),
         ("| 85.3 \\[83.0, 87.0] |", "|  85.4 \\[83.0, 87.1] |", True),
-        ("| 85.3 |", "| 85.5 |", False),
-        ("a,1e-07", "a,1.1e-07", True),
         ("a,1e-07", "a,3e-07", False),
         ("riqn,1", "npn,1", False),
         ("a,,1", "a,1,1", False),

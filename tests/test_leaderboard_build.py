@@ -550,14 +550,6 @@ def test_nothing_depends_on_the_order_of_entries_or_records():
         assert ranking_csv(a.ranks, a.trust) == ranking_csv(b.ranks, b.trust)
 
 
-def test_cells_or_further_seeds_of_a_row_from_another_entry_are_refused():
-    first = entry("first", [record("riqn", [0.5] * SEEDS)], trust="re-run")
-    second = entry("second", [record("riqn", [0.7] * SEEDS, seed=1)])
-    for others in (second, entry("second", first.records)):
-        with pytest.raises(ResultsError, match="'first' and 'second' both hold row 'riqn'"):
-            sections([first, others])
-
-
 def test_two_rows_with_the_same_name_are_refused():
     records = [record("riqn", [0.5] * SEEDS, horizon=10), record("riqn[h=10]", [0.5] * SEEDS)]
     with pytest.raises(ResultsError, match=r"both called 'riqn\[h=10\]'"):

@@ -163,7 +163,7 @@ def test_a_claim_is_refuted_where_the_opposite_is_true(claim, denied):
     assert judge(claim, claim.metric, denied).verdict == "refuted"
 
 
-@pytest.mark.parametrize("claim", ABOUT_DETECTORS, ids=lambda c: c.id)
+@pytest.mark.parametrize("claim", [*ABOUT_DETECTORS, *SETTLED], ids=lambda c: c.id)
 def test_a_claim_is_not_run_without_records(claim):
     judged = judge(claim, claim.metric, Estimator([]))
     assert judged.verdict == "not run"
@@ -203,11 +203,6 @@ def test_what_is_settled_says_so_in_any_world_and_is_not_counted(world):
     assert shown[SETTLED[0]][1].startswith("by definition: ")
 
 
-def test_what_is_settled_and_was_not_run_says_that():
-    for claim in SETTLED:
-        assert judge(claim, claim.metric, Estimator([])).verdict == "not run"
-
-
 def largest_by_environment(differences):
     return max(map(abs, differences))
 
@@ -233,15 +228,6 @@ def test_upper_ends_are_the_papers_own_numbers():
         )
 
 
-@pytest.mark.parametrize("horizon", [1, 10, 20])
-def test_riqn_above_rf_is_judged(horizon, claimed, denied):
-    claim = BY_ID[f"riqn-above-rf-{horizon}"]
-    assert [s.settings[0].detector for s in claim.sides] == ["riqn", "rf"]
-    assert {s.settings[0].horizon for s in claim.sides} == {horizon}
-    assert judge(claim, "auc_matched", claimed).verdict == "confirmed"
-    assert judge(claim, "auc_matched", denied).verdict == "refuted"
-
-
 @pytest.mark.parametrize(
     ("auc", "verdict"),
     [(0.504, "negligible"), (0.5, "negligible"), (0.49, "refuted"), (0.8, "confirmed")],
@@ -252,7 +238,9 @@ def test_a_claim_about_every_environment_is_as_good_as_its_worst(auc, verdict):
         for e in ENVIRONMENTS
         for a in TABLE1
     ]
-    assert judge(BY_ID["non-trivial"], "auc", Estimator(records)).verdict == verdict
+    judged = judge(BY_ID["non-trivial"], "auc", Estimator(records))
+    assert judged.verdict == judged.by_environment["hopper"] == verdict
+    assert judged.estimate.value == pytest.approx(min(auc, 0.8) - 0.5)
 
 
 def test_every_claim_has_its_place_and_only_settings_that_are_run():
@@ -274,15 +262,6 @@ minus = { settings = ["rf"], anomalies = ["iid"] }
 above = 0.0
 environments = ["ant"]
 """
-
-
-def test_a_claim_is_added_by_a_table_of_the_file(tmp_path):
-    (tmp_path / "claims.toml").write_text(ADDED)
-    (claim,) = read_tables(tmp_path / "claims.toml", "claim", Claim.of)
-    records = [make_record(d, "ant", "iid", values={"auc": [auc] * 2})
-               for d, auc in (("npn", 0.9), ("rf", 0.6))]  # fmt: skip
-    judged = judge(claim, "auc", Estimator(records))
-    assert (judged.verdict, judged.estimate.value) == ("confirmed", pytest.approx(0.3))
 
 
 def test_the_claim_that_the_docs_show_can_be_added(tmp_path):
@@ -313,35 +292,6 @@ def test_a_wrong_claim_is_named_with_what_is_wrong(tmp_path, old, new, part):
     (tmp_path / "claims.toml").write_text(text)
     with pytest.raises(ResultsError, match=f"(?s)claims.toml.*{part}"):
         read_tables(tmp_path / "claims.toml", "claim", Claim.of)
-
-
-def test_difference_has_the_value_worked_by_hand():
-    # Two trajectories, RIQN .9 and .7 everywhere, NPN .6 and .6: the difference is .3 and .1.
-    records = [
-        make_record(detector, environment, anomaly, values={"auc": auc})
-        for detector, auc in (("riqn-ms", [0.9, 0.7]), ("npn", [0.6, 0.6]))
-        for environment in ENVIRONMENTS
-        for anomaly in TABLE1
-    ]
-    claim = BY_ID["riqn-ms-above-npn-1"]
-    judged = judge(claim, "auc", Estimator(records))
-    assert judged.estimate.value == pytest.approx(0.2)
-    assert 0.1 < judged.estimate.low < 0.2 < judged.estimate.high < 0.3
-    assert judged.verdict == "confirmed"
-
-
-def test_one_environment_refutes_a_claim_about_every_one():
-    claim = BY_ID["non-trivial"]
-    records = [
-        make_record("riqn", e, a, values={"auc": [0.4 if e == "hopper" else 0.8] * 2})
-        for e in ENVIRONMENTS
-        for a in TABLE1
-    ]
-    judged = judge(claim, "auc", Estimator(records))
-    assert judged.verdict == "refuted"
-    assert judged.estimate.value == pytest.approx(-0.1)
-    assert dict(judged.by_environment)["hopper"] == "refuted"
-    assert list(dict(judged.by_environment).values()).count("confirmed") == 6
 
 
 def test_a_claim_about_every_environment_waits_for_all_of_them():
@@ -419,9 +369,3 @@ def test_negative_returns_lose_when_they_fall():
     assert estimate.value == pytest.approx(0.25)
 
 
-def test_table_of_claims_has_a_row_per_claim_and_counts_verdicts(claimed):
-    made = rulings(claimed, None)
-    assert len(claims_table(made).rows) == len(CLAIMS)
-    own = f"of {len(CLAIMS) - 3} claims {len(ABOUT_DETECTORS)} confirmed, 2 not run"
-    assert own in summary(made)
-    assert all(r.fair is None for r in made if r.claim.metric in ("far", "return"))

@@ -86,11 +86,6 @@ def objects(file):
     file.create_dataset("calibration/scores", data=["x"] * 5, dtype=h5py.string_dtype())
 
 
-def opaque(file):
-    del file["calibration/scores"]
-    file["calibration/scores"] = np.array([b"\x80\x04."] * 5, dtype="V3")
-
-
 def shorter(file):
     """Take the last score of the last calibration trajectory away, consistently."""
     scores, offsets = file["calibration/scores"][:-1], file["calibration/offsets"][:]
@@ -114,8 +109,6 @@ SCORES = {
         replaced("calibration/scores", data=np.zeros(9, np.float32)), "calibration/scores",
     ),
     "objects": (inside(objects), "calibration/scores"),
-    "opaque-bytes": (inside(opaque), "calibration/scores"),
-    "two-dimensions": (replaced("calibration/scores", data=np.zeros((3, 3))), "calibration/scores"),
     "bomb": (
         replaced(
             "calibration/scores", shape=(10**9,), dtype="f8", chunks=(10**6,), compression="gzip"
@@ -140,7 +133,6 @@ SCORES = {
     "missing-part": (inside(lambda f: f.__delitem__("test/drift")), "test/drift"),
     "cut-off": (cut_off, KEY),
     "pickle-as-scores": (overwritten(b"\x80\x04K\x01."), KEY),
-    "empty-file": (overwritten(b""), KEY),
     "of-no-record": (unknown_file, "scores/other.h5"),
 }  # fmt: skip
 
@@ -184,9 +176,6 @@ CURVES = {
         curves(lambda c: c["units"][0]["roc"]["tpr"].__setitem__(3, 1.5)), "units[0].roc.tpr[3]",
     ),
     "other-cell": (unit(cell="small/cartpole/iid::x[h=1,seed=0]"), "units[0].cell"),
-    "other-detector": (unit(detector="riqn"), "units[0].detector"),
-    "html": (unit(detector="<script>"), "units[0].detector"),
-    "truth-as-seed": (unit(seed=False), "units[0].seed"),
     "unknown-field": (unit(code="x"), "units[0].code"),
     "unit-twice": (curves(lambda c: c["units"].append(c["units"][0])), "units[8].cell"),
     "index": (

@@ -194,12 +194,7 @@ def test_results_on_seeds_that_were_known_confirm_nothing(entry, tmp_path):
 
 OTHERWISE = {
     "version": ({"detector_version": "9.9"}, "detector_version", "expected '9.9'"),
-    "source": ({"plugin_source": "f" * 64}, "plugin_source", "in the re-run"),
-    "distribution": ({"plugin": "oodd-x:trivial"}, "plugin", "oodd-x:trivial"),
     "failure": ({"status": "timeout", "reason": "slow"}, "status", "timeout"),
-    "random": ({"deterministic": False}, "deterministic", "in the re-run"),
-    "alarm": ({"alarm": "score"}, "alarm", "in the re-run"),
-    "inputs": ({"inputs": ""}, "inputs", "in the re-run"),
     "limited": ({"limit": 3}, "split", "is none without --limit"),
     "protocol": ({"protocol": PROTOCOL + 1}, "split", "is none without --limit"),
     "another-row": ({"horizon": 5}, "persistence", "in 0 environments, expected 3"),
