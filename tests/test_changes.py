@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
+from oodd_eval.cli.leaderboard import changes_against
 from oodd_eval.cli.main import main
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import build as leaderboard_build
 from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import changes_against
 
 
 class Repository:

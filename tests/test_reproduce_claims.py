@@ -367,5 +367,3 @@ def test_negative_returns_lose_when_they_fall():
                          for k in KINDS}}  # fmt: skip
     estimate = lost_return(found, [Side.of(1.0, "dynamics")], ["acrobot"])
     assert estimate.value == pytest.approx(0.25)
-
-

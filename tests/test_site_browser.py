@@ -841,5 +841,3 @@ def test_the_first_view_of_500_rows_takes_less_than_a_second(window, large):
     assert min(walls) < 1.0 or 0.0 < min(processors) < 0.6, (walls, processors)
     window.click("#all")
     assert len(window.texts(LABELS)) == 500
-
-

@@ -242,6 +242,13 @@ def recorded_versions(records: Iterable[Record]) -> dict[str, str]:
     return {name: "+".join(sorted(versions)) for name, versions in sorted(by_package.items())}
 
 
+def recorded_plugins(records: Iterable[Record]) -> list[dict[str, str]]:
+    """Return the plug-ins that made records, as ``entry.json`` lists them."""
+    names = ("distribution", "plugin", "version", "source_digest")
+    used = sorted({(r.plugin, r.detector_version, r.plugin_source) for r in records})
+    return [dict(zip(names, (*p.split(":", 1), *source), strict=True)) for p, *source in used]
+
+
 def digest_of(content: bytes) -> str:
     """Return the SHA-256 digest of the bytes of a file, as grants and entries name it."""
     return hashlib.sha256(content).hexdigest()

@@ -15,15 +15,7 @@ from oodd_eval.data.files import compress_large, digests
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
-from oodd_eval.leaderboard.verify import (
-    EntryVerdict,
-    Seen,
-    check_clashes,
-    find_split,
-    formats,
-    verify_entry,
-)
-from oodd_eval.leaderboard.verify.files import Findings
+from oodd_eval.leaderboard.verify import EntryVerdict, Neighbours, find_split, formats, verify_entry
 from oodd_eval.names import expression, select
 from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
@@ -106,11 +98,8 @@ def submit(
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
-            seen = Seen()
-            for other in stored.read_entries(root):
-                numbered = {str(i): record for i, record in enumerate(other.records)}
-                check_clashes(other.meta.id, numbered, seen, Findings())
-            check_clashes(verdict.name, verdict.records, seen, verdict.findings)
+            others = Neighbours(stored.read_entries(root))
+            others.check_rows(verdict.name, verdict.records, verdict.findings)
         if verdict.ok:
             directory.rename(path)
     return Submission(path, verdict, left_out)
@@ -168,24 +157,17 @@ def _publishable(record: Record) -> Record:
     return replace(record, reason=reason, provenance=origin)
 
 
-def first_seeds(records: Iterable[Record]) -> dict[Setting, int]:
-    """Return the lowest seed of each row that has an evaluated cell."""
-    seeds: dict[Setting, int] = {}
-    for record in records:
-        if record.ok:
-            seeds[record.setting] = min(seeds.get(record.setting, record.seed), record.seed)
-    return seeds
-
-
 def with_curves(records: Sequence[Record], extent: Extent) -> list[Record]:
-    """Return the records that curves are made of; ``"detectors"`` means rows primary by default."""
-    seeds = first_seeds(records)
-    if extent == "none":
-        return []
-    if extent == "detectors":
-        rows = primary_settings(r for r in records if r.ok)
-        seeds = {row: seeds[row] for row in rows}
-    return [r for r in records if r.ok and seeds.get(r.setting) == r.seed]
+    """Return the records that curves are made of: those of the lowest evaluated seed of each row.
+
+    With ``"detectors"`` they are of rows that are primary by default.
+    """
+    evaluated = [r for r in records if r.ok and extent != "none"]
+    seeds: dict[Setting, int] = {}
+    for r in evaluated:
+        seeds[r.setting] = min(seeds.get(r.setting, r.seed), r.seed)
+    rows = primary_settings(evaluated) if extent == "detectors" else seeds
+    return [r for r in evaluated if r.setting in rows and r.seed == seeds[r.setting]]
 
 
 def _check_publishable(records: Sequence[Record]) -> None:
@@ -220,12 +202,6 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     if complaint:
         raise UsageError(f"--id {complaint}")
     title = ", ".join(detectors[:3]) + (f" and {len(detectors) - 3} more" * (len(detectors) > 3))
-    plugins = []
-    for plugin, *source in sorted(
-        {(r.plugin, r.detector_version, r.plugin_source) for r in records}
-    ):
-        names = ("distribution", "plugin", "version", "source_digest")
-        plugins.append(dict(zip(names, (*plugin.split(":", 1), *source), strict=True)))
     packages = {r.plugin.partition(":")[0]: r.detector_version for r in records}
     packages |= stored.recorded_versions(records)
     platforms = sorted({r.provenance.get("platform", "") for r in records})
@@ -245,7 +221,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
         split=first.split,
         split_digest=first.split_digest,
         protocol=first.protocol,
-        plugins=plugins,
+        plugins=stored.recorded_plugins(records),
         environment=environment,
         created=datetime.now(UTC).date().isoformat(),
     )

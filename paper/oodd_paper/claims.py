@@ -205,32 +205,26 @@ def changed(claims_judged: Sequence[Ruling], other: Other) -> str:
 
 def claims_table(claims_judged: Sequence[Ruling], other: Other | None = None) -> Table:
     """Return one row per claim, with the verdicts of another reproduction if there is one."""
-    header = [
-        "Claim",
-        "By the paper's measure",
-        "By matched AUC or censored delay",
-        "Number",
-        "True if",
-        "Seeds",
-        "Place in the paper",
-    ]
-    header[3:3] = [f"On {other.name}"] if other else []
     rows = []
     for r in claims_judged:
         c = r.claim
-        text = f"{c.text} ({c.note})" if c.note else c.text
-        true_if = c.region.describe(c.metric) + (f" ({c.source})" if c.source else "")
-        judged: tuple[str, ...] = (
-            _judgement_text(r.paper),
-            _judgement_text(r.fair) if r.fair else "",
-        )
+        row = {
+            "Claim": f"{c.text} ({c.note})" if c.note else c.text,
+            "By the paper's measure": _judgement_text(r.paper),
+            "By matched AUC or censored delay": _judgement_text(r.fair) if r.fair else "",
+        }
         if other:
             verdicts = [other.claims.get((c.id, kind), {}) for kind in ("paper", "fair")]
-            judged = *judged, "; ".join(line["verdict"] for line in verdicts if line)
-        rows.append(
-            [text, *judged, c.number, true_if, str(r.paper.estimate.seeds or ""), c.section]
-        )
-    return Table("Claims", header, rows, labels=len(header))
+            row[f"On {other.name}"] = "; ".join(line["verdict"] for line in verdicts if line)
+        row |= {
+            "Number": c.number,
+            "True if": c.region.describe(c.metric) + (f" ({c.source})" if c.source else ""),
+            "Seeds": str(r.paper.estimate.seeds or ""),
+            "Place in the paper": c.section,
+        }
+        rows.append(row)
+    header = list(rows[0]) if rows else []
+    return Table("Claims", header, [[*row.values()] for row in rows], labels=len(header))
 
 
 def claims_csv(claims_judged: Sequence[Ruling]) -> str:

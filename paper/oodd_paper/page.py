@@ -23,7 +23,7 @@ from typing import Any, Final
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.data import csv_text, number
+from oodd_eval.results.render.data import csv_rows, number
 from oodd_eval.results.render.text import markdown_table as padded_table
 from oodd_eval.results.tables import Table
 from oodd_paper.claims import NOT_RUN, Ruling, changed, claims_csv, claims_table, rulings, summary
@@ -69,12 +69,12 @@ def publish(
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """A table or figure: its numbers as lines of CSV (none: not run), and what the page shows."""
+    """A table or figure: its numbers as rows of CSV (none: not run), and what the page shows."""
 
     id: str
     title: str
     caption: str = ""
-    csv: Sequence[Sequence[str]] = ()
+    csv: Sequence[Mapping[str, str]] = ()
     tables: Sequence[str] = ()
     pictures: Mapping[str, Picture] = field(default_factory=dict)
     page_lines: Sequence[str] = ()
@@ -84,7 +84,7 @@ def _write(directory: Path, one: _Section, *, figures: bool) -> list[str]:
     """Write a section's files, no picture twice, and return its part of the page."""
     if not one.csv:
         return [f"## {one.title}", "", "Not run.", ""]
-    write_changed(directory / "tables" / f"{one.id}.csv", csv_text(one.csv))
+    write_changed(directory / "tables" / f"{one.id}.csv", csv_rows(one.csv))
     whole = "\n".join([f"# {one.title}", "", one.caption, "", *one.tables])
     write_changed(directory / "tables" / f"{one.id}.md", whole)
     links = []
@@ -194,67 +194,54 @@ def show(estimate: Estimate, metric: str, *, intervals: bool = True) -> str:
     return text + (f" ({estimate.environments} of {estimate.expected})" if estimate.partial else "")
 
 
-def numbers_csv(numbers: Numbers) -> list[list[str]]:
-    """Return the numbers as lines of a CSV file, the header first; what was not run is empty."""
-    lines = [
-        [
-            "environment",
-            "series",
-            "detectors",
-            "horizon",
-            "parameters",
-            "anomalies",
-            "metric",
-            "value",
-            "low",
-            "high",
-            "environments",
-            "seeds",
-            "state",
-            "paper",
-        ]
-    ]
+def numbers_csv(numbers: Numbers) -> list[dict[str, str]]:
+    """Return the numbers as rows of a CSV file; what was not run is empty."""
+    rows = []
     for n in numbers.values():
         first, e = n.series.settings[0], n.estimate
-        detectors = "+".join(setting.detector for setting in n.series.settings)
-        parameters = json.dumps(first.overrides) if first.overrides else ""
-        labels = [n.environment, n.series.label, detectors, str(first.horizon), parameters]
-        state = e.state or ("" if e.environments else NOT_RUN)
-        lines.append(
-            [
-                *labels,
-                n.scope.id,
-                n.metric,
-                *map(number, e.ends),
-                str(e.environments),
-                str(e.seeds),
-                state,
-                number(n.paper),
-            ]
-        )
-    return lines
+        row = {
+            "environment": n.environment,
+            "series": n.series.label,
+            "detectors": "+".join(setting.detector for setting in n.series.settings),
+            "horizon": str(first.horizon),
+            "parameters": json.dumps(first.overrides) if first.overrides else "",
+            "anomalies": n.scope.id,
+            "metric": n.metric,
+            **e.columns,
+            "state": e.state or ("" if e.environments else NOT_RUN),
+            "paper": number(n.paper),
+        }
+        rows.append(row)
+    return rows
 
 
-def returns_tables(returns: Returns, other: Other | None = None) -> tuple[Table, list[list[str]]]:
-    """Return Table 2, ours with intervals and the paper's below it, and its lines of CSV."""
+def returns_tables(
+    returns: Returns, other: Other | None = None
+) -> tuple[Table, list[dict[str, str]]]:
+    """Return Table 2, ours with intervals and the paper's below it, and its rows of CSV."""
     header = ["Environment", "Policy", "", "Nominal", *(ANOMALIES[a].title for a in TABLE1)]
-    rows = []
-    lines = [["environment", "kind", "group", "value", "low", "high", "n", "paper"]]
+    rows, csv = [], []
     for environment in (e for e in ENVIRONMENTS if e in returns):
         info, paper = ENVIRONMENTS[environment], paper_tables()["table2_policy_return"][environment]
-        ours, theirs = [info.title, info.policy, "ours"], ["", "", "paper"]
-        for kind in KINDS:
-            e, n = mean_return(returns, environment, kind), len(returns[environment].get(kind, ()))
-            group, digits = ANOMALIES[kind].group if kind in ANOMALIES else "", float(paper[kind])
-            numbers = *map(number, e.ends), str(n), number(digits)
-            lines.append([environment, kind, group, *numbers])
-            ours.append(_printed(e))
-            theirs.append(f"{digits:.1f}")
-        rows += [ours, theirs]
+        digits = {kind: float(paper[kind]) for kind in KINDS}
+        estimates = {kind: mean_return(returns, environment, kind) for kind in KINDS}
+        rows.append([info.title, info.policy, "ours", *map(_printed, estimates.values())])
+        rows.append(["", "", "paper", *(f"{value:.1f}" for value in digits.values())])
         if other and other.returns:
             its = (_printed(mean_return(other.returns, environment, k)) for k in KINDS)
             rows.append(["", "", other.name, *its])
-    return Table("Mean return", header, rows, labels=3), lines
+        csv += [
+            {
+                "environment": environment,
+                "kind": kind,
+                "group": ANOMALIES[kind].group if kind in ANOMALIES else "",
+                **dict(zip(("value", "low", "high"), map(number, e.ends), strict=True)),
+                "n": str(len(returns[environment].get(kind, ()))),
+                "paper": number(digits[kind]),
+            }
+            for kind, e in estimates.items()
+        ]
+    return Table("Mean return", header, rows, labels=3), csv
 
 
 def _printed(e: Estimate) -> str:

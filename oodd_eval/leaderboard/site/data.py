@@ -85,7 +85,7 @@ def site_data(
 ) -> tuple[Json, dict[str, Json]]:
     """Return the index, and the parts by name.
 
-    A row of the index names its part. The part of a board's metric has the name of `metric_part`.
+    A row of the index names its part. A board names those of its metrics.
     """
     entries = {entry.meta.id: entry for section in sections for entry in section.entries}
     units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
@@ -113,11 +113,6 @@ def part_name(text: str) -> str:
     return f"{slug}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def metric_part(board: str, metric: str) -> str:
-    """Return the name of the part with a metric of all cells of a board."""
-    return part_name(f"{board}/{metric}")
-
-
 def _power(section: SuiteSection) -> Json:
     """Return tables of a board of graded strengths, and each row's means along the ladder.
 
@@ -136,15 +131,14 @@ def _power(section: SuiteSection) -> Json:
             {
                 "label": str(row),
                 "trivial": board.is_trivial(row),
-                "points": [_points(records[row], info.name) for info in metrics],
+                "points": [
+                    [[*map(_short, point)] for point in curve(records[row], info.name)]
+                    for info in metrics
+                ],
             }
             for row in rows
         ],
     }
-
-
-def _points(records: Sequence[Record], metric: str) -> list[list[float | None]]:
-    return [[_short(value) for value in point] for point in curve(records, metric)]
 
 
 def _fields(thing: object, *names: str) -> Json:
@@ -173,19 +167,17 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         parts[row["part"]] = part
         ends[row["part"]] = _ranking_intervals(part)
         by_cell[row["part"]] = _by_cell(standing, cells)
-    for metric in names:
+    metric_parts = {name: part_name(f"{section.name}/{name}") for name in names}
+    for metric, name in metric_parts.items():
         values = {
             part: [_mean(records, metric) for records in of_row] for part, of_row in by_cell.items()
         }
-        parts[metric_part(section.name, metric)] = {
-            "values": values,
-            "intervals": ends if metric == RANKING else {},
-        }
+        parts[name] = {"values": values, "intervals": ends if metric == RANKING else {}}
     return {
         "id": section.name,
         "episodes": _episodes(section, parts, rows),
         "cells": cells,
-        "parts": {name: metric_part(section.name, name) for name in names},
+        "parts": metric_parts,
         **_fields(board, "split", "digest", "protocol", "limit"),
         "tests": board.test_seeds(),
         **_fields(board, "environments", "anomalies"),

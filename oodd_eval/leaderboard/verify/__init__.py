@@ -8,13 +8,12 @@ hand. That the scores are those of the detector is not checked here: re-runs do 
 
 import os
 import stat
-import subprocess
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path, PurePosixPath
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -29,10 +28,12 @@ from oodd_eval.leaderboard.entry import (
     EntryInfo,
     Grant,
     Means,
+    SubmittedEntry,
     Trust,
     digest_of,
     read_entry,
     read_grants,
+    recorded_plugins,
     recorded_versions,
     row_of,
     write_grants,
@@ -54,8 +55,6 @@ from oodd_eval.results.directory import RECORDS, without_collector
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
-Seen = dict[object, tuple[str, str]]  # by row or detector: its entry, a detector's distribution
-_Numbers = dict[object, tuple[str, str]]  # by position and numbers of a cell: its entry and row
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,12 +189,8 @@ def _check_statements(entry: EntryInfo, records: Records, findings: Findings) ->
     why = "as the records have it"
     detectors = sorted({record.detector for record in records.values()})
     findings.expect(ENTRY, "detectors", detectors, entry.detectors, why)
-    listed = sorted(
-        (f"{p['distribution']}:{p['plugin']}", p["version"], p["source_digest"])
-        for p in entry.plugins
-    )
-    used = {(r.plugin, r.detector_version, r.plugin_source) for r in records.values()}
-    findings.expect(ENTRY, "plugins", sorted(used), listed, why)
+    used = recorded_plugins(records.values())
+    findings.expect(ENTRY, "plugins", used, entry.plugins, why)
     rows = {str(record.setting): record.detector for record in records.values()}
     named = [rows.get(row, "") for row in entry.primary]
     for row, detector in zip(entry.primary, named, strict=True):
@@ -250,12 +245,11 @@ def verify(
         return
     if rerun:
         raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")
-    stray, seen, numbers, digests = Findings(), Seen(), _Numbers(), {}
+    stray, neighbours, digests = Findings(), Neighbours(), {}
     for child in sorted(path.iterdir()):
         if child.is_symlink() or child.is_dir():
             verdict = _guarded(child, split)
-            check_clashes(verdict.name, verdict.records, seen, verdict.findings)
-            check_copies(verdict.name, verdict.records, numbers, verdict.findings)
+            neighbours.check(verdict)
             digests[child.name] = verdict.digest
             yield verdict
         elif child.name not in ROOT_FILES:
@@ -273,52 +267,67 @@ def verify_changed(root: Path, names: Collection[str]) -> Iterator[EntryVerdict]
 
     The others are taken as they are. Names without a directory are entries that were removed.
     """
-    seen, numbers = Seen(), _Numbers()
     directories = sorted(path.parent for path in root.glob(f"*/{ENTRY}"))
-    for entry in (read_entry(path) for path in directories if path.name not in names):
-        records = {str(i): record for i, record in enumerate(entry.records)}
-        check_clashes(entry.meta.id, records, seen, Findings())
-        check_copies(entry.meta.id, records, numbers, Findings())
+    neighbours = Neighbours(read_entry(path) for path in directories if path.name not in names)
     for name in sorted(names):
         if os.path.lexists(root / name):
             verdict = _guarded(root / name, None)
-            check_clashes(name, verdict.records, seen, verdict.findings)
-            check_copies(name, verdict.records, numbers, verdict.findings)
+            neighbours.check(verdict)
             yield verdict
 
 
-def check_clashes(name: str, records: Records, seen: Seen, findings: Findings) -> None:
-    """Refuse what an entry in `seen` has too: a row, or a detector's name from another place."""
-    for where, record in records.items():
-        other, _ = seen.setdefault(row_of(record), (name, ""))
-        if other != name:
-            message = f"is of a row of entry {other} too: replace that one, or leave it out"
-            findings.refuse(where, "cell", message)
-        distribution = record.plugin.partition(":")[0]
-        owner, known = seen.setdefault(record.detector, (name, distribution))
-        why = f"as in entry {owner}: a name stands for one detector"
-        findings.expect(where, "detector", f"from {known}", f"from {distribution}", why)
+class Neighbours:
+    """The rows, detectors and numbers of entries, which no further entry may have too.
 
-
-def check_copies(name: str, records: Records, seen: _Numbers, findings: Findings) -> None:
-    """Refuse rows that have the numbers of another entry's row in more than half of their cells.
-
-    Cells in which all trajectories have one number say nothing, as whatever finds all has them.
-    Numbers are compared by three digits, so that changing all of them a little does not help.
+    Parameters
+    ----------
+    entries
+        Those that are taken as they are.
     """
-    cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
-    for record in records.values():
-        terms, row = record.per_trajectory.get(RANKING, np.zeros((2, 0))), str(record.setting)
-        numbers = tuple(round(term, 3) for term in terms[0].tolist())
-        if len(set(numbers)) > 1:
-            cells[row] += 1
-            key = record.split_digest, record.environment, record.condition, numbers
-            entry, other = seen.setdefault(key, (name, row))
-            copied[row, entry, other] += entry != name
-    for (row, entry, other), count in copied.items():
-        if 2 * count > cells[row]:
-            message = f"has in {count} of {cells[row]} cells the numbers of {other} in {entry}"
-            findings.refuse(RECORDS, row, f"{message}: expected a detector's own")
+
+    def __init__(self, entries: Iterable[SubmittedEntry] = ()) -> None:
+        self._rows: dict[object, str] = {}  # the entry of a row
+        self._origins: dict[str, tuple[str, str]] = {}  # a detector's entry and distribution
+        self._numbers: dict[object, tuple[str, str]] = {}  # entry and row of a cell's numbers
+        for entry in entries:
+            records = {str(i): record for i, record in enumerate(entry.records)}
+            self.check(EntryVerdict(entry.meta.id, Findings(), records))
+
+    def check(self, verdict: EntryVerdict) -> None:
+        """Refuse what an earlier entry has, and keep what this one has."""
+        self.check_rows(verdict.name, verdict.records, verdict.findings)
+        self._check_copies(verdict.name, verdict.records, verdict.findings)
+
+    def check_rows(self, name: str, records: Records, findings: Findings) -> None:
+        """Refuse rows of other entries, and detectors' names from other distributions."""
+        for where, record in records.items():
+            if (other := self._rows.setdefault(row_of(record), name)) != name:
+                message = f"is of a row of entry {other} too: replace that one, or leave it out"
+                findings.refuse(where, "cell", message)
+            origin = record.plugin.partition(":")[0]
+            owner, first = self._origins.setdefault(record.detector, (name, origin))
+            why = f"as in entry {owner}: a name stands for one detector"
+            findings.expect(where, "detector", f"from {first}", f"from {origin}", why)
+
+    def _check_copies(self, name: str, records: Records, findings: Findings) -> None:
+        """Refuse rows that have another entry's numbers in more than half of their cells.
+
+        Cells in which all trajectories have one number say nothing, as whatever finds all has them.
+        Numbers are compared by three digits, so that changing all of them a little does not help.
+        """
+        cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
+        for record in records.values():
+            terms, row = record.per_trajectory.get(RANKING, np.zeros((2, 0))), str(record.setting)
+            numbers = tuple(round(term, 3) for term in terms[0].tolist())
+            if len(set(numbers)) > 1:
+                cells[row] += 1
+                key = record.split_digest, record.environment, record.condition, numbers
+                entry, other = self._numbers.setdefault(key, (name, row))
+                copied[row, entry, other] += entry != name
+        for (row, entry, other), count in copied.items():
+            if 2 * count > cells[row]:
+                message = f"has in {count} of {cells[row]} cells the numbers of {other} in {entry}"
+                findings.refuse(RECORDS, row, f"{message}: expected a detector's own")
 
 
 def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
@@ -341,56 +350,3 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
     results = directory.absolute().parent
     write_grants(results, read_grants(results) | {verdict.name: new})
     return new
-
-
-class Changes(NamedTuple):
-    """Names of the entries that were added, changed or removed, and the paths of other files."""
-
-    entries: list[str]
-    others: list[str]
-
-
-def changes_against(base: str, results: Path) -> Changes:
-    """Return what differs from the commit where the current branch left a base, by name.
-
-    The base is a branch, tag or commit. `results` is the directory of the entries, in a checkout,
-    where files that git does not know yet count, too. `UsageError`: this is no checkout, or `base`
-    is no commit of it that the branch comes from.
-    """
-    inside = results if results.is_dir() else Path()
-    top = Path(_git(inside, "rev-parse", "--show-toplevel").rstrip("\n"))
-    commit = _git(top, "rev-parse", "--verify", "--end-of-options", f"{base}^{{commit}}").strip()
-    fork = _git(top, "merge-base", commit, "HEAD").strip()
-    changed = _git(top, "diff", "--name-only", "--no-renames", "--no-ext-diff", "-z", fork)
-    root = PurePosixPath(Path(os.path.relpath(results.resolve(), top.resolve())).as_posix())
-    added = _git(top, "ls-files", "--others", "--exclude-standard", "-z", "--", str(root))
-    entries, others = set[str](), set[str]()
-    for text in filter(None, f"{changed}{added}".split("\0")):
-        path = PurePosixPath(text)
-        below = path.relative_to(root).parts if path.is_relative_to(root) else ()
-        if len(below) > 1:
-            entries.add(below[0])
-        else:
-            others.add(text)  # a file beside the entries is none of them
-    return Changes(sorted(entries), sorted(others))
-
-
-def _git(directory: Path, *arguments: str) -> str:
-    """Return what git prints; its message is the error's."""
-    try:
-        done = subprocess.run(  # noqa: S603
-            ["git", "-C", str(directory), *arguments],  # noqa: S607
-            capture_output=True,
-            check=False,
-            text=True,
-            errors="surrogateescape",
-        )
-    except OSError as error:
-        raise UsageError(f"--changed-against needs git: {error.strerror}") from None
-    if done.returncode:
-        said = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
-        raise UsageError(
-            f"--changed-against: git {arguments[0]} says {said!r}; expected a checkout and a "
-            "commit that it has (in CI, fetch the whole history)"
-        )
-    return done.stdout

@@ -7,7 +7,7 @@ line that can be printed, without ``<`` and ``>``: whatever shows it, it cannot 
 import functools
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from datetime import date
 from typing import Annotated, Any, Final, Literal
 
@@ -51,10 +51,6 @@ def _rule(holds: Callable[[Any], object], expected: str) -> AfterValidator:
 
 def _matching(pattern: str, expected: str) -> AfterValidator:
     return _rule(re.compile(pattern, re.ASCII).fullmatch, expected)
-
-
-def _one_of(known: Collection[Any]) -> AfterValidator:
-    return _rule(lambda value: value in known, " or ".join(map(str, known)))
 
 
 def _is_text(value: str, longest: int, least: int = 0) -> bool:
@@ -152,11 +148,11 @@ class _Provenance(BaseModel):
 
 
 def _schema(version: int) -> Any:
-    return Annotated[int, _one_of([version]), Field(alias="schema")]
+    return Annotated[Literal[version], Field(alias="schema")]
 
 
 _COUNT: Final = Annotated[int, Field(ge=1, le=LARGEST)]
-_PROTOCOL: Final = Annotated[int, _one_of([PROTOCOL])]
+_PROTOCOL: Final = Literal[PROTOCOL]
 
 # fmt: off
 _ENTRY: Final = strict_model(
@@ -180,10 +176,10 @@ _RECORD: Final = strict_model(
     detector=DetectorName, detector_version=Version, plugin=PluginName, plugin_source=Digest,
     parameters=Parameters, overrides=Parameters,
     inputs=Literal["observations", "observations+actions", ""], alarm=Literal["cusum", "score"],
-    deterministic=bool, environment=Annotated[str, _one_of(ENVIRONMENTS)],
-    anomaly=Annotated[str, _one_of(ANOMALIES)], strength=Strength,
+    deterministic=bool, environment=Literal[*ENVIRONMENTS],
+    anomaly=Literal[*ANOMALIES], strength=Strength,
     magnitude=(Annotated[float, Field(ge=0)] | None, None),
-    group=Annotated[str, _one_of(GROUPS)], horizon=Annotated[int, Field(ge=1, le=100_000)],
+    group=Literal[*GROUPS], horizon=Annotated[int, Field(ge=1, le=100_000)],
     seed=Whole, split=SplitName, split_digest=Digest, limit=None,
     status=Status, reason=Annotated[str, _text(1000)],
     metrics=dict[str, strict_model(  # type: ignore[misc]
