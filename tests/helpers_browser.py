@@ -1,6 +1,5 @@
 """Headless Chromium through its own driver: the W3C WebDriver protocol over HTTP, nothing else."""
 
-import base64
 import contextlib
 import json
 import os
@@ -144,9 +143,6 @@ class Browser:
     def _command(self, name, parameters=None):
         body = {"cmd": name, "params": parameters or {}}
         return self._call("POST", f"{self._session}/goog/cdp/execute", body)
-
-    def screenshot(self, path):
-        path.write_bytes(base64.b64decode(self._call("GET", f"{self._session}/screenshot")))
 
     def _log(self, kind):
         return self._call("POST", f"{self._session}/se/log", {"type": kind})

@@ -1,21 +1,19 @@
 """Entries of a leaderboard made by hand, and the data of a site as large as it gets."""
 
-import functools
 import json
 import re
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from helpers_records import make_record
 
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import (
     EntryInfo,
     Grant,
+    SubmittedEntry,
     digest_of,
     read_entries,
     read_grants,
@@ -25,18 +23,34 @@ from oodd_eval.leaderboard.entry import (
 )
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
-from oodd_eval.metrics.catalogue import GUARANTEED, LEVELS, METRICS, RANKING
+from oodd_eval.metrics.catalogue import GUARANTEED, METRICS, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
-from oodd_eval.results.record import Metric
 from oodd_eval.results.strengths import DETECTION
 
 DIGEST = "ab" * 32
 
 SIMILAR = {"delay_censored_null": "delay_null", "missed_null": "missed"}
 """Metrics without a level whose numbers stand in for guaranteed alarms; otherwise ``far_twin``."""
+
+
+def submitted(name, records, trust="reported", **meta):
+    """An entry in memory."""
+    first = records[0]
+    texts = {"title": "An entry", "citation": "", "url": "", "caption": "",
+             "submitter": "Somebody", "created": "2026-11-21"}  # fmt: skip
+    plugin = {"distribution": "oodd-eval", "plugin": "riqn", "version": "0.1.0",
+              "source_digest": "0" * 64}  # fmt: skip
+    made_with = {"python": "3.11.7", "platform": "Linux", "packages": {"numpy": "2.4.6"}}
+    info = EntryInfo(
+        id=name, detectors=sorted({r.detector for r in records}), split=first.split,
+        split_digest=first.split_digest, protocol=first.protocol,
+        **texts | {"plugins": [plugin], "environment": made_with} | meta,
+    )  # fmt: skip
+    grant = None if trust == "reported" else Grant("", trust, "us", "2026-11-22", "fresh seeds")
+    return SubmittedEntry(Path(name), info, records, grant)
 
 
 def write_entry(root, identity, records, *, curves=(), trust="reported", **fields):
@@ -48,21 +62,13 @@ def write_entry(root, identity, records, *, curves=(), trust="reported", **field
     units = [make_curves(r, i) for i, r in enumerate(records) if r.ok and r.detector in curves]
     if units:
         write_curves({"units": units}, directory / "curves.json")
-    first = records[0]
-    given = {
-        "title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
-        "url": "https://example.org/page", "created": "2026-11-21",
-        "caption": "", "plugins": [],
-    } | fields  # fmt: skip
-    entry = EntryInfo(
-        id=identity, detectors=sorted({r.detector for r in records}), split=first.split,
-        split_digest=first.split_digest, protocol=first.protocol, environment={}, **given,
-    )  # fmt: skip
-    text = entry.to_json()
+    texts = {"title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
+             "url": "https://example.org/page", "plugins": [], "environment": {}}  # fmt: skip
+    text = submitted(identity, records, **texts | fields).meta.to_json()
     (directory / "entry.json").write_text(text, encoding="utf-8")
     if trust != "reported":
-        given = Grant(digest_of(text.encode()), trust, "C. Hecker", "2026-11-22", "fresh seeds")
-        write_grants(root, read_grants(root) | {identity: given})
+        grant = Grant(digest_of(text.encode()), trust, "C. Hecker", "2026-11-22", "fresh seeds")
+        write_grants(root, read_grants(root) | {identity: grant})
 
 
 GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
@@ -171,69 +177,17 @@ def example(root):
     return read_entries(root)
 
 
-def other_levels(columns):
-    """Columns by metric, and those at 5 % again at the other levels."""
-    return columns | {
-        name.replace("_at_5pct", f"_{level}"): column
-        for level in LEVELS
-        for name, column in columns.items()
-        if name.endswith("_at_5pct")
-    }
-
-
-def one_row(root):
-    """Index and parts of a site of one detector on all cells."""
-    rng = np.random.default_rng(0)
-    records, units = [], []
-    for e in ENVIRONMENTS:
-        for a in TABLE1:
-            given = {
-                name: list(rng.uniform(0, 40 if "delay" in name else 1, 10)) for name in METRICS
-            }
-            record = describe(make_record("detector-0", e, a, values=given))
-            others = [f"threshold_{level}" for level in LEVELS]
-            metrics = other_levels(record.metrics)
-            metrics |= {name: Metric(rng.uniform()) for name in others}
-            columns = other_levels(record.per_trajectory)
-            records.append(replace(record, metrics=metrics, per_trajectory=columns))
-            units.append(make_curves(record, len(units), twins_seed=list(ENVIRONMENTS).index(e)))
-    write_entry(root, "one", records)
-    write_curves({"units": units}, root / "one" / "curves.json")
-    return site_data(sections(read_entries(root)))
-
-
-@functools.cache
-def full(rows):
-    """Files of a site with so many detectors on all cells and with all metrics.
-
-    One row is computed, of numbers as long as real ones; the others are copies of other names. Of
-    their data files only that of the second is there.
-    """
-    with tempfile.TemporaryDirectory() as directory:
-        data, parts = one_row(Path(directory))
-    (board,) = data["boards"]
-    (row,) = board["rows"]
+def full(root, rows):
+    """Files of a site with so many detectors: the first row of the example, under other names."""
+    data, _ = site_data(sections(example(root)))
+    board = data["boards"][0]
     names = [f"detector-{i}" for i in range(rows)]
     board["rows"] = [
-        row | {"id": f"board/{name}", "part": name, "label": name, "detector": name, "rank": i + 1}
+        board["rows"][0]
+        | {"id": f"board/{name}", "part": name, "label": name, "detector": name, "rank": i + 1}
         for i, name in enumerate(names)
     ]
-    part = parts[row["part"]]
-    part |= {"comparisons": [[name, 0.0123456, -0.012345, 0.0234567, 0.0015] for name in names]}
-    found = {
-        site.PAGE: site.index(data),
-        f"{site.PARTS}/{names[1]}.js": site.data_file(names[1], part),
-    }
-    for name in board["parts"].values():
-        (values,) = parts[name]["values"].values()
-        ends = {
-            key: pair
-            for (own,) in [parts[name]["intervals"].values() or [{}]]
-            for key, pair in own.items()
-        }
-        shared = {"values": dict.fromkeys(names, values), "intervals": dict.fromkeys(names, ends)}
-        found[f"{site.PARTS}/{name}.js"] = site.data_file(name, shared)
-    return found
+    return {site.PAGE: site.index(data)}
 
 
 def write_site(directory, files):

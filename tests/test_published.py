@@ -3,17 +3,17 @@
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_records import make_record
+from helpers_site import submitted
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.files import compress, decompress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard import published
-from oodd_eval.leaderboard.entry import EntryInfo, Grant, SubmittedEntry, SuiteSection, sections
+from oodd_eval.leaderboard.entry import SuiteSection, sections
 from oodd_eval.leaderboard.published import (
     board_of,
     neighbours,
@@ -54,16 +54,8 @@ def row(detector, mean, *, seeds=(0, 1, 2), places=PLACES, **more):
     return made
 
 
-def entry(name, records, *, trust="re-run", primary=()):
-    first = records[0]
-    info = EntryInfo(
-        id=name, title=name, detectors=sorted({r.detector for r in records}), submitter="",
-        citation="", url="", split=first.split, split_digest=first.split_digest, plugins=[],
-        protocol=first.protocol, environment={}, created="2026-11-21", caption="",
-        primary=list(primary),
-    )  # fmt: skip
-    grant = None if trust == "reported" else Grant("", trust, "us", "2026-11-22", "fresh seeds")
-    return SubmittedEntry(Path(name), info, records, grant)
+def entry(name, records, *, trust="re-run", **meta):
+    return submitted(name, records, trust=trust, **meta)
 
 
 def entries():

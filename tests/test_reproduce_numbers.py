@@ -340,8 +340,6 @@ def test_measured_costs_cover_every_setting_in_every_environment():
         ('scopes = ["all"]', 'scopes = ["al"]', "'table-3'.*unknown scope 'al'"),
         ('["riqn"]', '["riqn[h"]', r"'table-3'.*riqn\[h"),
         ('across = "scopes"', 'across = "scoops"', "'figure-horizon'.*scoops"),
-        ('rows = "mean"', 'rows = "means"', "'figure-models'.*means"),
-        ('axis = "scopes"', 'axis = "scoops"', "'figure-horizon'.*scoops"),
         ("columns = 3", "column = 3", "'table-3'.*column"),
         ("[[experiment]]", "[[experiment]", "cannot be read"),
         ('"table-4"', '"table-3"', "'table-3'.*same id"),

@@ -461,10 +461,3 @@ def test_sensors_of_shown_episodes_are_the_splits():
 def test_no_sensors_of_a_split_that_is_not_in_the_package(page):
     assert shipped_split("ab" * 32) is None
     assert embedded(page)["boards"][0]["episodes"] == {}
-
-
-# -- size -----------------------------------------------------------------------------------------
-
-
-def test_the_index_of_500_rows_is_below_a_megabyte():
-    assert len(helpers_site.full(500)[site.PAGE].encode()) < 1e6

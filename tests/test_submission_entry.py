@@ -316,7 +316,3 @@ def test_random_damage_is_a_problem_and_never_a_crash(submissions, tmp_path, see
     draft.file(name).write_bytes(bytes(content))
     draft.written = True
     assert not draft.verdict().ok
-
-
-def test_an_undamaged_copy_passes(submissions, tmp_path):
-    assert Draft(submissions.plain, tmp_path).verdict().ok
