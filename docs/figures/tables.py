@@ -126,7 +126,7 @@ def of_protocols(name: str) -> str:
 
 
 def of_reproductions(table1: str, losses: str) -> Row:
-    """Return AUC by group of a model: the paper's, at Table 1's strengths, at the paper's losses."""
+    """Return AUC by group of a model: of the paper, at Table 1's strengths, at equal losses."""
 
     def means(split: str) -> dict[tuple[str, str], dict[str, str]]:
         rows = lines(f"reproduction/{split}/tables/table-5.csv")
