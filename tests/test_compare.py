@@ -18,7 +18,7 @@ from oodd_eval import load_split
 from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.metrics.catalogue import NAMES
+from oodd_eval.metrics.catalogue import METRICS, NAMES
 from oodd_eval.names import expression
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import (
@@ -116,14 +116,12 @@ def test_other_forms_unknown_metrics_and_signs_on_the_better_side_are_refused(te
 
 
 def test_every_metric_has_its_worse_side():
-    falls = {m for m in NAMES if worse_side(m) == "-"}
-    neither = {m for m in NAMES if worse_side(m) == "±"}
-    own = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired", "sensor_named_at_5pct"}
-    assert {m for m in falls if not m.startswith("found")} == own
-    assert {m.partition("_at_")[0] for m in falls - own} == {"found_within_20", "found_within_100"}
-    beside = ("null", "placebo", "threshold")
-    assert neither == {m for m in NAMES if any(word in m for word in beside)}
-    assert worse_side("of_another_version") == "±"
+    falling = {"auc", "auc_matched", "auc_smoothed", "auc_unpaired", "sensor_named_at_5pct",
+               "found_within_20_at_5pct", "found_within_100_at_1pct"}  # fmt: skip
+    assert {worse_side(m) for m in falling} == {"-"}
+    assert {worse_side(m) for m in ("delay", "missed", "far", "false_episodes_at_5pct")} == {"+"}
+    beside = [m for m in NAMES if any(word in m for word in ("null", "placebo", "threshold"))]
+    assert {worse_side(m) for m in [*beside, "of_another_version"]} == {"±"}
 
 
 # Verdicts
@@ -198,10 +196,8 @@ def test_what_failed_in_the_reference_already_does_not_fail():
 def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
     changed = record(auc=0.4, auc_null=0.9, delay=0.4, far=0.6)
     found = against([changed], [record()])
-    assert {d.tolerance.metric for d in found.differences} == {
-        "auc", "auc_matched", "auc_smoothed", "auc_unpaired", "delay", "delay_censored", "missed",
-        "far", "far_twin",
-    }  # fmt: skip
+    judged = {m for m in METRICS if worse_side(m) != "±"}
+    assert {d.tolerance.metric for d in found.differences} == judged
     assert {d.tolerance.metric for d in found.failures} == {"auc", "far"}
 
 
@@ -360,7 +356,8 @@ def run(tmp_path, capsys, monkeypatch):
 def test_identical_results_are_exit_code_0_and_one_line(run, results, reference):
     code, out, err = run(results, "--against", reference)
     assert (code, err) == (0, "")
-    assert out == "3 cells compared in 9 metrics: 27 same.\n"
+    judged = sum(worse_side(m) != "±" for m in METRICS)
+    assert out == f"3 cells compared in {judged} metrics: {3 * judged} same.\n"
 
 
 def test_a_regression_is_exit_code_1_and_a_table(run):
