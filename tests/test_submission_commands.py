@@ -161,21 +161,6 @@ def test_every_entry_of_a_directory_is_checked_and_nothing_else_may_lie_there(
     assert "1 valid, 2 refused" in out
 
 
-def test_a_detectors_name_belongs_to_one_distribution(submissions, tmp_path, capsys):
-    first = Draft(submissions.plain, tmp_path)
-    first.write()
-    second = Draft(submissions.full, tmp_path)
-    second.entry["plugins"][0]["distribution"] = "oodd-other"
-    for record in second.records:
-        record.update(plugin="oodd-other:trivial", seed=1)
-    for path in (second.path / "scores", second.file("curves.json")):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    second.entry["files"] = {"records.jsonl": {}}
-    second.write()
-    assert verify(submissions, tmp_path) == 1
-    assert "a name stands for one detector" in capsys.readouterr().out
-
-
 def test_verifying_imports_no_plugin(submissions, tmp_path, monkeypatch):
     """An entry that names a plug-in which is installed here, and would be noticed if imported."""
     site, marker = tmp_path / "site", tmp_path / "imported"
