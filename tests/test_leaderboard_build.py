@@ -629,6 +629,18 @@ def test_check_compares_what_compressed_files_say(tmp_path):
     assert main(check) == 1
 
 
+def test_a_board_that_no_reader_would_unpack_is_written(tmp_path, monkeypatch):
+    """A board of 300 rows has more cells than a compressed file of a stranger may hold."""
+
+    def refused(_content):
+        raise ResultsError("decompresses to more than 64000000 bytes")
+
+    monkeypatch.setattr(leaderboard_build, "decompress", refused)
+    for _ in range(2):
+        leaderboard_build.build(entries(), tmp_path)
+    assert (tmp_path / PUBLISHED).is_file()
+
+
 def test_check_names_every_file_that_differs(tmp_path, capsys):
     _, results, output = built(tmp_path, entries())
     name = f"tables/mini-{'ab' * 6}-protocol1"

@@ -82,7 +82,7 @@ def build(
     for name, content in files.items():
         if isinstance(content, str):
             write_text(output / name, content)
-        elif not _has_content(output / name, decompress(content)):
+        elif not _has_content(output / name, content):
             write_bytes(output / name, content)
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
@@ -134,10 +134,10 @@ def _content(path: Path) -> bytes:
     return decompress(content) if path.suffix == GZIP else content
 
 
-def _has_content(path: Path, content: bytes) -> bool:
-    """Tell whether a file is there and says this."""
+def _has_content(path: Path, compressed: bytes) -> bool:
+    """Tell whether a file is there and says this; one that is too large to be unpacked does not."""
     with contextlib.suppress(OSError, ResultsError):
-        return _content(path) == content
+        return path.read_bytes() == compressed or _content(path) == decompress(compressed)
     return False
 
 
