@@ -48,6 +48,17 @@ class Trial:
     The factory is called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec`
     tells what the detector declares too. Episodes have actions where the spec declares them, and
     for a factory, which declares nothing.
+
+    Parameters
+    ----------
+    factory
+        Factory or `DetectorSpec` of the detector.
+    horizon
+        Prediction horizon in steps, at least 1.
+    seed
+        Seed of the detector.
+    parameters
+        Further arguments of the factory.
     """
 
     def __init__(
