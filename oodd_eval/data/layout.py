@@ -154,13 +154,8 @@ def check_names(file: str, parts: Mapping[str, Mapping[str, Any]]) -> None:
                 )
 
 
-def content_digest(
-    group: Mapping[str, Any], seen: Callable[[str, int, NDArray[Any]], None] | None = None
-) -> str:
-    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size.
-
-    `seen`, if given, is called with each block: name, number of its first row, rows.
-    """
+def content_digest(group: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size."""
     sha = hashlib.sha256()
     for name in sorted(group):
         data = group[name]
@@ -173,8 +168,6 @@ def content_digest(
         for start in range(0, len(data), step):
             block = np.asarray(data[start : start + step]).astype(little, copy=False)
             sha.update(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
-            if seen:
-                seen(name, start, block)
     return sha.hexdigest()
 
 
