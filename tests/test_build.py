@@ -20,7 +20,7 @@ from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 
@@ -219,9 +219,3 @@ def test_wrong_requests_fail_before_any_work(tmp_path):
         with pytest.raises(UsageError, match=message):
             build_split(dataclasses.replace(SMALL, **change), target, **FEW)
     assert not target.exists()
-
-
-def test_reduced_differs_from_standard_in_sizes_alone():
-    sizes = {"train": 500, "calibration": 200, "test": 50}
-    reduced = dataclasses.replace(SPLITS["reduced"], name="standard", **sizes)
-    assert reduced == SPLITS["standard"]

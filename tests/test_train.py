@@ -174,7 +174,3 @@ def test_frozen_policies_carry_their_provenance(file):
     assert facts["flagged"] == (facts["share_of_paper"] < 0.8)
     assert facts["steps"] in [c[0] for c in facts["curve"]]
     assert {"seed", "hyper_parameters", "selection", "std_return"} <= facts.keys()
-
-
-def test_every_environment_has_a_frozen_policy():
-    assert {f.stem for f in FROZEN.glob("*.npz")} == set(ENVIRONMENTS)
