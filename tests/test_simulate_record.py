@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers_simulate import SEEDS, Reflex, record
 from oodd_recording import record as recording
-from oodd_recording.anomalies import Draw
+from oodd_recording.faults import Fault
 from oodd_recording.record import TwinTooShortError, record_nominal
 
 from oodd_eval.data.trajectory import Trajectory
@@ -99,7 +99,7 @@ def test_draws_that_change_nothing_are_redrawn_and_counted(monkeypatch):
     def idle_twice(environment, anomaly, simulator, rng):
         calls.append(anomaly)
         drawn = true_draw(environment, anomaly, simulator, rng)
-        return drawn if len(calls) > 2 else Draw("drift", drawn.parameters, rng)
+        return drawn if len(calls) > 2 else Fault(drawn.parameters)
 
     monkeypatch.setattr(recording, "draw", idle_twice)
     episode = record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
@@ -111,7 +111,7 @@ def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeyp
 
     def idle(environment, anomaly, simulator, rng):
         calls.append(anomaly)
-        return Draw("drift", {}, rng)
+        return Fault({})
 
     monkeypatch.setattr(recording, "draw", idle)
     with pytest.raises(SimulationError, match="no drift episode of cartpole with seed 1 differs"):
