@@ -78,15 +78,6 @@ def test_acrobot_swings_with_the_gravity_it_was_given():
     np.testing.assert_allclose(env._dsdt(state)[2:4], 2 * usual[2:4], rtol=1e-12)
 
 
-# CartPole
-
-
-# LunarLander
-
-
-# PyBullet
-
-
 # Sensors that anomalies may corrupt
 
 
