@@ -191,11 +191,3 @@ def test_a_dataset_in_blocks_is_the_same_file(tmp_path):
         found = write_environment(tmp_path / "blocks.h5", [("train", blocks)], "", **names)
         assert found == whole | {"file": "blocks.h5"}
         assert (tmp_path / "blocks.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
-
-
-def test_blocks_of_any_length_come_in_one_length():
-    array = np.arange(20).reshape(10, 2)
-    blocks = Blocks(array.shape, lambda: [array[:1], array[1:1], array[1:9], array[9:]])
-    assert [len(block) for block in blocks.of_length(4)] == [4, 4, 2]
-    assert np.concatenate(list(blocks.of_length(3))).tolist() == array.tolist()
-    assert list(Blocks((0,), list).of_length(2)) == []
