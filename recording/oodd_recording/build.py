@@ -298,8 +298,9 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
             for future in as_completed(running):
                 future.result()
                 yield running[future]
-        finally:
+        except BaseException:  # an interrupt, too, does not wait for what is recorded now
             pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 @contextlib.contextmanager
