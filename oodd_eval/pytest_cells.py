@@ -18,10 +18,16 @@ from oodd_eval.names import select
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
-from oodd_eval.results.compare import Difference, compare, message, parse_tolerances
+from oodd_eval.results.compare import (
+    Difference,
+    RecordSet,
+    compare,
+    parse_tolerances,
+    read_record_set,
+)
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.reference import RecordSet, read_record_set
+from oodd_eval.results.report import message
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run

@@ -19,10 +19,10 @@ from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
 from oodd_eval.metrics.catalogue import ATTRIBUTION
 from oodd_eval.plugins.contract import PROBES
 from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
+from oodd_eval.results import tables
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.standings import ranked
-from oodd_eval.results.tables import layout
 
 NAN = float("nan")
 SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION
@@ -374,13 +374,13 @@ def test_tables_have_a_section_for_detectors_that_explain(world, capsys):
 def test_a_board_has_the_section_in_the_order_of_its_rows(world):
     _, found = world
     ranks = ranked([*found["silent"], *found["tells"]])
-    table = layout.attribution(ranks.board, intervals=True, standings=ranks.standings)
+    table = tables.attribution(ranks.board, intervals=True, standings=ranks.standings)
     assert table.header[:5] == ["rank", "detector", "settings", "sensor named", "onset error"]
     (row,) = table.rows
     assert row[1] == "tells"
     assert "[" in row[3]
     assert "[" in row[4]
-    assert layout.attribution(ranked(found["silent"]).board) is None
+    assert tables.attribution(ranked(found["silent"]).board) is None
 
 
 # Verification

@@ -24,17 +24,18 @@ from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import (
     MEANINGS,
     NothingInCommonError,
+    RecordSet,
     Tolerance,
-    change,
     compare,
     parse_tolerance,
-    section,
+    read_record_set,
     worse_side,
+    write_reference,
 )
 from oodd_eval.results.record import Metric, same_terms
-from oodd_eval.results.reference import RecordSet, read_record_set, write_reference
-from oodd_eval.results.render.junit import junit
+from oodd_eval.results.render.data import junit
 from oodd_eval.results.render.text import markdown_section
+from oodd_eval.results.report import change, comparison_section
 
 NAN = math.nan
 ROOT = Path(__file__).parents[1]
@@ -68,7 +69,7 @@ def only(*arguments, **settings):
 
 
 def markdown(comparison):
-    return markdown_section(section(comparison))
+    return markdown_section(comparison_section(comparison))
 
 
 def flat(text):
@@ -314,7 +315,7 @@ def test_detectors_and_environments_that_were_not_run_are_summed_up_in_one_line(
     lost = [d for d in found.differences if d.verdict == "missing"]
     # They fail as before, but only what is missing from within is listed.
     assert len(lost) == len(found.failures) == len(reference) - len(now) + 1
-    ((row,),) = (table.rows for table in section(found).tables)
+    ((row,),) = (table.rows for table in comparison_section(found).tables)
     assert row[0] == f"{now[0].environment}/{now[0].anomaly}"
     (note,) = found.notes
     assert f"{len(reference) - len(now)} cells" in note
@@ -492,7 +493,7 @@ def test_a_failing_cell_takes_one_row_of_the_table():
     assert "<b>" not in text
     assert r"\<b\>" in text
     assert change(only([record(delay=12.5)], [record(delay=10.0)], DELAY)) == "↑ 2.5 (+25.0%)"
-    (found,) = section(odd_comparison()).tables
+    (found,) = comparison_section(odd_comparison()).tables
     assert found.colours == ["red"] * 3
     assert [(row[0], row[1], row[-1]) for row in found.rows] == [
         ("hopper/iid", "auc", "worse"),

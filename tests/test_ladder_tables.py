@@ -13,6 +13,7 @@ from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.ladder import Rung
 from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.results import strengths
 from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
@@ -20,7 +21,6 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import DETECTION, Strengths, at_strength, curve, thresholds
-from oodd_eval.results.tables import ladder
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -74,7 +74,7 @@ def rows_of(table):
 
 
 def table_of(records, start, **settings):
-    made = ladder.tables(Board(records), **settings)
+    made = strengths.strength_tables(Board(records), **settings)
     return next(t for t in made if t.title.startswith(start))
 
 
@@ -186,13 +186,13 @@ def test_strengths_that_no_ladder_has_are_left_out():
     cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
     other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
     assert Strengths.of(other).rungs == {}
-    assert not ladder.tables(Board(other))
+    assert not strengths.strength_tables(Board(other))
     assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
 
 
 def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
     bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
-    assert [t.title for t in ladder.tables(Board(bare), places=True)] == [
+    assert [t.title for t in strengths.strength_tables(Board(bare), places=True)] == [
         "Matched AUC (%) by strength"
     ]
 

@@ -9,8 +9,8 @@ from helpers_plugins import install
 
 from oodd_eval import evaluate
 from oodd_eval.pytest_cells import Cells, Regression
+from oodd_eval.results.compare import read_record_set, write_reference
 from oodd_eval.results.record import Metric
-from oodd_eval.results.reference import read_record_set, write_reference
 
 pytest_plugins = ["pytester"]
 

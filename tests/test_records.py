@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import OutputError, ResultsError, UsageError
-from oodd_eval.results import provenance
+from oodd_eval.results import record as record_module
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell, Setting
 from oodd_eval.results.record import SCHEMA, STATUSES, Metric, Record, same_terms
@@ -304,11 +304,11 @@ def test_the_commit_is_read_without_writing_to_the_checkout(tmp_path, monkeypatc
     git("init", "-q")
     git("add", "-A")
     git("commit", "-qm", "one")
-    monkeypatch.setattr(provenance, "_HOME", tmp_path)
+    monkeypatch.setattr(record_module, "_HOME", tmp_path)
     os.utime(file, (1, 1))  # git has to look whether it is the same
     index = (tmp_path / ".git" / "index").read_bytes()
-    found = provenance.gather()
+    found = record_module.gather()
     assert (found["git_commit"], found["git_dirty"]) == (git("rev-parse", "HEAD"), False)
     assert (tmp_path / ".git" / "index").read_bytes() == index
     file.write_text("2\n")
-    assert provenance.gather()["git_dirty"] is True
+    assert record_module.gather()["git_dirty"] is True

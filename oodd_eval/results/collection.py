@@ -15,16 +15,15 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
 from oodd_eval.names import check_known, select
-from oodd_eval.results import paired, plots
+from oodd_eval.results import plots
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.episode import ScoredEpisode
-from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
+from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
+from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
 from oodd_eval.results.strengths import DETECTION, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
@@ -139,9 +138,9 @@ class Results(Sequence[Record]):
         Raises
         ------
         UsageError, ResultsError
-            As `oodd_eval.results.paired.compare`.
+            As `oodd_eval.results.standings.compare_rows`.
         """
-        return paired.compare(self.records, first, second, metric)
+        return compare_rows(self.records, first, second, metric)
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Return a flat mapping for each cell: its identity, its metrics, and its cost.

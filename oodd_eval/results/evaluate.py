@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
 from oodd_eval.data.split import Split
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
@@ -19,6 +20,7 @@ from oodd_eval.metrics.catalogue import HEADLINE, IntervalKind, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, Metric, Record
 
 
@@ -159,3 +161,71 @@ def stored_scores(
             "--stored"
         )
     return scores
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredEpisode:
+    """An anomalous episode beside its nominal twin, with the scores of both.
+
+    Attributes
+    ----------
+    cell, index
+        The cell, and the index of the episode among the cell's.
+    scores, twin_scores
+        One for each observation, NaN where undefined.
+    trajectory, twin
+        The episodes, of T + 1 observations each.
+    sensors
+        Names of the sensors, in the order of columns.
+    onset, effect
+        The row from which the anomaly is in force, and the first that differs from the twin's.
+    rule
+        The guaranteed alarm at 5 %; None where there are too few calibration episodes for it.
+    """
+
+    cell: Cell
+    index: int
+    scores: Floats
+    twin_scores: Floats
+    trajectory: Trajectory
+    twin: Trajectory
+    sensors: tuple[str, ...]
+    onset: int
+    effect: int
+    rule: GuaranteedAlarm | None
+
+    @property
+    def alarm(self) -> int | None:
+        """The row of the first alarm; None without one."""
+        return self.rule.first(self.scores) if self.rule else None
+
+    def delay(self, *, of_twin: bool = False) -> float:
+        """Return the number of rows from the effect to the first alarm.
+
+        Parameters
+        ----------
+        of_twin
+            Whether the alarm is one of the twin, which is a false one.
+
+        Returns
+        -------
+        float
+            Infinite without an alarm; NaN where that precedes the effect, or no row follows it.
+        """
+        scores = self.twin_scores if of_twin else self.scores
+        first = self.rule.first(scores) if self.rule else None
+        if self.rule is None or len(scores) <= self.effect:
+            return math.nan
+        if first is None:
+            return math.inf
+        return first - self.effect if first >= self.effect else math.nan
+
+    def __repr__(self) -> str:
+        """Return what happened when: the arrays would fill screens."""
+        return (
+            f"ScoredEpisode({self.cell}, index={self.index}, rows={len(self.scores)}, "
+            f"onset={self.onset}, effect={self.effect}, alarm={self.alarm})"
+        )

@@ -9,7 +9,7 @@ import numpy as np
 
 from oodd_eval.errors import MissingExtraError, ResultsError
 from oodd_eval.metrics.catalogue import MetricInfo
-from oodd_eval.results.episode import ScoredEpisode
+from oodd_eval.results.evaluate import ScoredEpisode
 from oodd_eval.results.strengths import Point
 
 if TYPE_CHECKING:
