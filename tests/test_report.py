@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.cli.main import main
-from oodd_eval.cli.terminal import TerminalReporter, summary
+from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
-from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.render import FORMATS
@@ -193,19 +192,6 @@ def test_table_five_has_the_papers_layout_and_averages_without_trivial_rows():
         assert not tables.anomaly_groups(board)[0].note
 
 
-def test_undefined_is_a_dash_and_not_run_is_empty():
-    values = {"delay": [None, None]}
-    board = Board([make_record(values=values), make_record("rf", anomaly="gravity")])
-    row = cells(tables.anomaly_groups(board)[0], 1)
-    assert (row["riqn"], row["rf"]) == (UNDEFINED, "")
-
-
-def test_a_metric_that_only_some_rows_have_is_empty_in_the_others():
-    board = Board([make_record(values={"missed_at_1pct": [0, 1]}), make_record("rf")])
-    table = tables.guaranteed(board, "at_1pct")
-    assert [cells(table, i)["missed"] for i in (0, 1)] == ["50.0", ""]
-
-
 def test_settings_and_horizons_are_rows_of_their_own():
     board = Board([
         make_record(), make_record(horizon=10), make_record(overrides={"members": 1}),
@@ -277,15 +263,6 @@ def test_every_simple_row_is_named_and_the_auc_of_what_knows_the_time_is_no_find
         assert not tables.findings(
             Board([make_record(), make_record(simple, values={"auc": [1.0, 1.0]})])
         )
-
-
-def test_comparison_is_over_common_cells_only():
-    board = Board([
-        make_record("riqn", values={"auc_matched": [0.6, 0.6]}),
-        make_record("riqn", anomaly="drift", values={"auc_matched": [0.1, 0.1]}),
-        make_record("persistence", values={"auc_matched": [0.5, 0.5]}),
-    ])  # fmt: skip
-    assert tables.findings(board) == []
 
 
 def test_notes_name_the_split_and_what_is_missing():
@@ -396,20 +373,8 @@ def test_a_table_that_is_too_wide_both_ways_comes_in_parts_with_its_labels():
     assert [w.strip() for h in headers for w in h[1:] if w] == WIDE.header[1:]
 
 
-def test_rows_have_their_colours_where_they_stand_as_rows():
-    table = Table("t", ["a", "b"], [["1", "2"], ["3", "4"]], colours=["red", ""])
-    *_, first, second, _ = printed_table(table, 40, terminal=True)
-    assert ["\x1b[31m" in line for line in (first, second)] == [True, False]
-    assert table.transposed().transposed().rows == table.rows
-
-
 def test_names_of_others_are_not_taken_for_markup():
     one = reporter()
     one.failures([make_record("[red]x", status="error", reason="[/b] oops")])
     assert "[red]x" in printed(one)
     assert "[/b] oops" in printed(one)
-
-
-def test_summary_counts_states():
-    assert summary(example()) == "14 ok, 2 timeout"
-    assert summary([]) == "no cells"

@@ -28,7 +28,6 @@ from oodd_eval.leaderboard.sections import (
 from oodd_eval.leaderboard.site.data import Json, power_of
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
-from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
@@ -59,7 +58,6 @@ class SuiteParts(NamedTuple):
     published: str = ""
 
 
-@without_collector()
 def suite_parts(directory: Path) -> SuiteParts:
     """Return what a leaderboard's directory has of further test suites, ready to be shown."""
     suites = suite_sections(directory)
@@ -86,7 +84,6 @@ def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool)
     return {"board": board, "entry": entry, "trust": trust, **texts}
 
 
-@without_collector()
 def build(
     entries: Sequence[SubmittedEntry],
     output: Path,

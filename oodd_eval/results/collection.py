@@ -69,10 +69,6 @@ class Results(Sequence[Record]):
             return Results(self.records[index], self._directory, self._split)
         return self.records[index]
 
-    def __iter__(self) -> Iterator[Record]:
-        """Iterate over the records."""
-        return iter(self.records)
-
     def __repr__(self) -> str:
         """Return one line: how many cells of what, and how many failed."""
         states = ", ".join(f"{n} {status}" for status, n in Counter(r.status for r in self).items())
@@ -268,9 +264,8 @@ class Results(Sequence[Record]):
         ResultsError
             When no row has an alarm at 5 %; others as those of `plot_trajectory`.
         """
-        chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})
         curves = {}
-        for setting in chosen:
+        for setting in map(self._row, rows or self.rows):
             records = [r for r in self.records if r.setting == setting and r.ok]
             curves[str(setting)] = [e for episodes in self._episodes(records) for e in episodes]
         return plots.power(curves)
@@ -305,7 +300,9 @@ class Results(Sequence[Record]):
         over = select("environment", environments, dict.fromkeys(r.environment for r in self))
         kinds = select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self))
         chosen = [r for r in self if r.environment in over and r.anomaly in kinds]
-        settings = [self._row(name) for name in rows] or list({r.setting: 0 for r in chosen})
+        settings = [
+            self._row(name) for name in rows or dict.fromkeys(str(r.setting) for r in chosen)
+        ]
         curves: list[dict[str, list[Point]]] = [
             {str(s): curve([r for r in chosen if r.setting == s], name) for s in settings}
             for name in filter(None, (metric, info.null))

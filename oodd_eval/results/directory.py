@@ -14,7 +14,6 @@ written is not read; one of an earlier version, without a digest beside it, is.
 """
 
 import contextlib
-import gc
 import hashlib
 import io
 import json
@@ -24,7 +23,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -87,7 +85,6 @@ class ResultsDirectory:
         self.path = Path(path)
         self.fits = FitStore(self.path / "fitted")
         self.notes: list[str] = []
-        self._has_records = False
 
     def prepare(self) -> None:
         """Make the directory, and find out before any work is done whether it can be used.
@@ -105,8 +102,7 @@ class ResultsDirectory:
                 f"results directory {str(self.path)!r} cannot be written to: {error.strerror}; "
                 "name another with --output"
             ) from None
-        self._has_records = (self.path / RECORDS).exists()
-        if self._has_records:
+        if (self.path / RECORDS).exists():
             self.records()
         for name in (RECORDS, REPORT):  # users may choose a directory that holds files of theirs
             files.remove_abandoned(self.path, name)
@@ -132,25 +128,17 @@ class ResultsDirectory:
         Newer records replace those of the same cell. A failed one is also replaced by one of the
         same cell with other parameters. Earlier records keep their places and new cells follow.
         Places of replaced cells are filled in the order of `records`, so that the end is the same
-        whether records come at once or one by one. `OutputError`: they cannot be written, or those
-        that were there were removed meanwhile; then the given ones are in a new file.
+        whether records come at once or one by one. `OutputError`: they cannot be written.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
         with files.lock(self.path):
-            existed = (self.path / RECORDS).exists()
-            earlier = self.records() if existed else []
+            earlier = self.records() if (self.path / RECORDS).exists() else []
             merged = _merged(earlier, records)
             text = "".join(record.to_json() + "\n" for record in merged)
             files.write_text(self.path / RECORDS, text)
-        removed, self._has_records = self._has_records and not existed, True
-        if removed:
-            raise OutputError(
-                f"{RECORDS} of results directory {str(self.path)!r} was removed while the run went "
-                "on: a new one holds what was scored since; run again for the rest"
-            )
         return merged
 
     def forget(self, records: Iterable[Record]) -> None:
@@ -224,12 +212,12 @@ class ResultsDirectory:
                 for part, expected in lengths.items():
                     if file[part]["offsets"].shape != (len(expected) + 1,):
                         return None
-                    flat, offsets = _rows(file[part]), file[part]["offsets"][:]
-                    if np.diff(offsets).tolist() != list(expected) or len(flat) != offsets[-1]:
+                    stored = _stored_part(file[part])
+                    if list(map(len, stored.sequences)) != list(expected):
                         return None
-                    parts[part] = np.split(flat.astype(np.float64, copy=False), offsets[1:-1])
-                    if columns := _explained(file[part]):
-                        explained[part] = columns
+                    parts[part] = stored.sequences
+                    if stored.explained:
+                        explained[part] = stored.explained
                 cost = {name: float(value) for name, value in file.attrs.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
@@ -242,10 +230,7 @@ class ResultsDirectory:
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
-                sequences = np.split(_rows(item), item["offsets"][1:-1])
-                # Files of earlier versions have one order for all parts.
-                order = item.attrs.get("order", item.file.attrs.get("order"))
-                parts[name] = _StoredPart(sequences, order, _explained(item))
+                parts[name] = _stored_part(item)
 
         try:
             with self._opened(key) as file:
@@ -255,13 +240,16 @@ class ResultsDirectory:
         return parts
 
 
-def _rows(part: h5py.Group) -> NDArray[np.float64]:
-    """Return all scores of a part; `ResultsError` when there can be no such number of them."""
+def _stored_part(part: h5py.Group) -> _StoredPart:
+    """Read a part of a score file; `ResultsError` when there can be no such number of scores."""
     stored = child(part, "scores", SCORES.error)
     SCORES.check("scores", stored.dtype, stored.nbytes)
     if stored.ndim != 1:
         raise SCORES.error(f"scores have shape {stored.shape}, expected one column")
-    return np.asarray(stored[:], np.float64)
+    sequences = np.split(np.asarray(stored[:], np.float64), part["offsets"][1:-1])
+    # Files of earlier versions have one order for all parts.
+    order = part.attrs.get("order", part.file.attrs.get("order"))
+    return _StoredPart(sequences, order, _explained(part))
 
 
 def _lines(digests: Path) -> list[str]:
@@ -319,19 +307,6 @@ class RecordWriter:
         return [record for index in sorted(self._finished) for record in self._finished[index]]
 
 
-@contextmanager
-def without_collector() -> Iterator[None]:
-    """Switch Python's garbage collector off: records have no cycles, and it visits all of them."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-@without_collector()
 def read_records(
     file: Path, notes: list[str] | None = None, *, matches: Callable[[str], bool] = bool
 ) -> list[Record]:
@@ -369,10 +344,7 @@ def read_records(
     records: list[Record] = []
     for number, line in enumerate(lines, start=1):
         if line.strip() and matches(line):
-            record = Record.from_json(line, f"{file}:{number}")
-            if records:
-                record.share(records[-1])
-            records.append(record)
+            records.append(Record.from_json(line, f"{file}:{number}"))
     return records
 
 
@@ -440,21 +412,16 @@ class FitStore:
 
         `OutputError`: it cannot be made.
         """
+        suffix = f".{os.getpid()}"
         try:
-            try:
-                temporary = self._temporary()
-            except FileNotFoundError:  # Somebody has just removed the directory.
-                temporary = self._temporary()
+            self.path.mkdir(parents=True, exist_ok=True)
+            path = Path(tempfile.mkdtemp(prefix=".", suffix=suffix, dir=self.path))
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
-        with temporary as path:
-            yield Path(path)
-
-    def _temporary(self) -> "tempfile.TemporaryDirectory[str]":
-        self.path.mkdir(parents=True, exist_ok=True)
-        return tempfile.TemporaryDirectory(
-            prefix=".", suffix=f".{os.getpid()}", dir=self.path, ignore_cleanup_errors=True
-        )
+        try:
+            yield path
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
 
     def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
         """Move a filled directory to its key; do nothing when it is empty or too large.

@@ -104,6 +104,11 @@ class Strengths:
                 chosen[pair] = counted
         return chosen
 
+    def at(self, records: Iterable[Record], name: str) -> list[Record]:
+        """Return the records in the column of a strength, see `chosen`."""
+        chosen = self.chosen(name)
+        return [r for r in records if r.strength and r.strength == chosen.get(_pair(r))]
+
 
 def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
     """Return the rungs of the benchmark's ladder; none for what is not calibrated."""
@@ -127,12 +132,6 @@ def _rung_of(record: Record) -> Rung | None:
 
 def _position(name: str) -> int:
     return RUNGS.index(name) if name in RUNGS else len(RUNGS)
-
-
-def at_strength(records: Sequence[Record], name: str) -> list[Record]:
-    """Return the records in the column of a strength, see `Strengths.chosen`."""
-    chosen = Strengths.of(records).chosen(name)
-    return [r for r in records if r.strength and r.strength == chosen.get(_pair(r))]
 
 
 def thresholds(records: Sequence[Record]) -> Thresholds:
@@ -225,9 +224,8 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
     """
     strengths, points = Strengths.of(records), []
     for name in strengths.names:
-        chosen = strengths.chosen(name)
-        cells = [r for r in records if r.ok and r.strength and r.strength == chosen.get(_pair(r))]
-        rungs = {pair: strengths.rungs[pair][chosen[pair]] for pair in map(_pair, cells)}
+        cells = [r for r in strengths.at(records, name) if r.ok]
+        rungs = {_pair(r): strengths.rungs[_pair(r)][r.strength] for r in cells}
         logs = [
             math.log(rung.strength / strengths.unit(pair))
             for pair, rung in rungs.items()
@@ -303,19 +301,18 @@ def overview(board: Board, by_row: Thresholds) -> Table:
     values = {entry: mean.value if mean else math.inf for entry, mean in means.items()}
     order = sorted(values, key=values.__getitem__)
     most = max((mean.pairs for mean in means.values() if mean), default=0)
-    shares = _by_strength(board, order, strengths.names, DETECTION)
+    shares = _by_strength(board, order, strengths, DETECTION)
     rows = []
     for entry in order:
         mean = means[entry]
-        figures = [UNDEFINED, "0", "", ""]
+        figures = [UNDEFINED, 0, "", ""]
         if mean:
-            counts = mean.pairs, mean.below, mean.above
-            figures = [mean.text() + "*" * (mean.pairs < most), *map(str, counts)]
-        rows.append([str(entry), *figures, *shares[entry]])
-    multiple = f"{REFERENCE}'s" if reference else _COSTS
-    over = f"as a multiple of {multiple}"
-    if not reference and not strengths.calibrated:
-        over = "in the units of the anomalies"
+            text = mean.text() + "*" * (mean.pairs < most)
+            figures = [text, mean.pairs, mean.below, mean.above]
+        rows.append([str(entry), *map(str, figures), *shares[entry]])
+    over = f"as a multiple of {_COSTS}" if strengths.calibrated else "in the units of the anomalies"
+    if reference:
+        over = f"as a multiple of {REFERENCE}'s"
     header = ["detector", "threshold", "pairs", "below", "above", *strengths.names]
     note = (
         f"{_RULE} Shown is its geometric mean {over}, over pairs of environment and "
@@ -329,7 +326,7 @@ def overview(board: Board, by_row: Thresholds) -> Table:
 def _separability(board: Board, by_row: Thresholds, strengths: Strengths) -> Table:
     """Return matched AUC by strength."""
     order = [e for e in board.entries if e in by_row]
-    texts = _by_strength(board, order, strengths.names, RANKING)
+    texts = _by_strength(board, order, strengths, RANKING)
     rows = [[str(e), *texts[e]] for e in order]
     header, note = ["detector", *strengths.names], _COLUMNS[strengths.calibrated]
     return Table("Matched AUC (%) by strength", header, rows, note=note)
@@ -354,10 +351,10 @@ def _by_kind(board: Board, by_row: Thresholds, strengths: Strengths, *, interval
 
 
 def _by_strength(
-    board: Board, entries: list[Setting], names: Sequence[str], metric: str
+    board: Board, entries: list[Setting], strengths: Strengths, metric: str
 ) -> dict[Setting, list[str]]:
     """Return a metric's means at each strength as texts."""
-    steps = [Board(at_strength(board.records, name)) for name in names]
+    steps = [Board(strengths.at(board.records, name)) for name in strengths.names]
     return {
         e: [show_value(b.mean(e, b.environments, b.anomalies, metric), metric) for b in steps]
         for e in entries

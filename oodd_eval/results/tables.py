@@ -192,7 +192,7 @@ def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
 
     There is a table for each horizon and group of anomalies.
     """
-    groups = [group for group in GROUPS if board.in_group(group)]
+    groups = filter(board.in_group, GROUPS)
     everything = itertools.product(board.horizons, groups)
     return [_anomaly_group(board, h, group, intervals=intervals) for h, group in everything]
 

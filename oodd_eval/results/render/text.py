@@ -1,6 +1,6 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from html import escape as escape_html
 from typing import Final
 
@@ -87,30 +87,37 @@ def escape(text: str) -> str:
 @renders("html", "HTML")
 def html(report: Report) -> str:
     """Return a report as HTML, without a page around it."""
-    parts = []
-    for section in report.sections:
-        parts += [f"<h3>{escape_html(section.title)}</h3>"]
-        parts += [f"<p>{escape_html(line)}</p>" for line in (*section.facts, *section.findings)]
-        for table in section.tables:
-            # tabulate's layout escapes the cells.
-            parts += [f"<h4>{escape_html(table.title)}</h4>", grid(table, "html")]
-            parts += [f"<p>{escape_html(table.note)}</p>"] if table.note else []
-        parts += [f"<p>{escape_html(line)}</p>" for line in section.notes]
+    marks = {"title": "<h3>{}</h3>", "sentence": "<p>{}</p>", "table": "<h4>{}</h4>"}
+    # tabulate's layout escapes the cells.
+    parts = (
+        grid(part, "html") if isinstance(part, Table) else marks[kind].format(escape_html(part))
+        for kind, part in _parts(report)
+    )
     return "\n".join(parts) + "\n"
 
 
 @renders("latex", "LaTeX, a tabular for each table")
 def latex(report: Report) -> str:
     """Return a report as LaTeX, to be copied or included; it needs no package."""
-    parts = []
-    for section in report.sections:
-        parts.append(f"\\section*{{{_latex(section.title)}}}")
-        parts += [_latex(line) for line in (*section.facts, *section.findings)]
-        for table in section.tables:
-            parts.append(f"\\subsection*{{{_latex(table.title)}}}")
-            parts += [grid(table, "latex_raw", _latex), *([_latex(table.note)] * bool(table.note))]
-        parts += [_latex(line) for line in section.notes]
+    marks = {"title": r"\section*{{{}}}", "sentence": "{}", "table": r"\subsection*{{{}}}"}
+    parts = (
+        grid(part, "latex_raw", _latex)
+        if isinstance(part, Table)
+        else marks[kind].format(_latex(part))
+        for kind, part in _parts(report)
+    )
     return "\n\n".join(parts) + "\n"
+
+
+def _parts(report: Report) -> Iterator[tuple[str, str | Table]]:
+    """Yield titles, sentences, and tables after their titles, in the order of a report."""
+    for section in report.sections:
+        yield "title", section.title
+        yield from (("sentence", line) for line in (*section.facts, *section.findings))
+        for table in section.tables:
+            yield from (("table", table.title), ("", table))
+            yield from [("sentence", table.note)] * bool(table.note)
+        yield from (("sentence", line) for line in section.notes)
 
 
 def _latex(text: str) -> str:
