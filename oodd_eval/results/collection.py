@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -332,19 +333,17 @@ class Results(Sequence[Record]):
                 anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
-                pairs = zip(file.parts[record.condition.part], file.parts[TWINS], strict=True)
-                yield [
-                    ScoredEpisode(
-                        record.cell,
-                        i,
-                        scores,
-                        twin,
-                        anomalous[i],
-                        data.twins[i],
-                        sensors,
-                        int(anomalous.onsets[i]),
-                        int(anomalous.effects[i]),
-                        rule,
-                    )
-                    for i, (scores, twin) in enumerate(pairs)
-                ]
+                episodes = zip(
+                    itertools.repeat(record.cell),
+                    itertools.count(),
+                    file.parts[record.condition.part],
+                    file.parts[TWINS],
+                    anomalous,
+                    data.twins,
+                    anomalous.onsets.tolist(),
+                    anomalous.effects.tolist(),
+                    itertools.repeat(sensors),
+                    itertools.repeat(rule),
+                    strict=False,  # under a limit there are scores of the first episodes only
+                )
+                yield list(itertools.starmap(ScoredEpisode, episodes))

@@ -137,8 +137,7 @@ class ResultsDirectory:
         with files.lock(self.path):
             earlier = self.records() if (self.path / RECORDS).exists() else []
             merged = _merged(earlier, records)
-            text = "".join(record.to_json() + "\n" for record in merged)
-            files.write_text(self.path / RECORDS, text)
+            self._write(merged)
         return merged
 
     def forget(self, records: Iterable[Record]) -> None:
@@ -146,11 +145,14 @@ class ResultsDirectory:
         gone = {record.identity: record for record in records}
         with files.lock(self.path):
             kept = [r for r in self.records() if r.identity not in gone]
-            text = "".join(record.to_json() + "\n" for record in kept)
-            files.write_text(self.path / RECORDS, text)
+            self._write(kept)
             for key in {r.scores for r in gone.values()} - {r.scores for r in kept} - {""}:
                 for file in (*self._score_paths(key), self.log_path(key)):
                     file.unlink(missing_ok=True)
+
+    def _write(self, records: Iterable[Record]) -> None:
+        text = "".join(record.to_json() + "\n" for record in records)
+        files.write_text(self.path / RECORDS, text)
 
     def log_path(self, key: str) -> Path:
         """Return the place of the log of a failed unit."""

@@ -178,10 +178,10 @@ class ScoredEpisode:
         One for each observation, NaN where undefined.
     trajectory, twin
         The episodes, of T + 1 observations each.
-    sensors
-        Names of the sensors, in the order of columns.
     onset, effect
         The row from which the anomaly is in force, and the first that differs from the twin's.
+    sensors
+        Names of the sensors, in the order of columns.
     rule
         The guaranteed alarm at 5 %; None where there are too few calibration episodes for it.
     """
@@ -192,9 +192,9 @@ class ScoredEpisode:
     twin_scores: Floats
     trajectory: Trajectory
     twin: Trajectory
-    sensors: tuple[str, ...]
     onset: int
     effect: int
+    sensors: tuple[str, ...]
     rule: GuaranteedAlarm | None
 
     @property

@@ -156,12 +156,11 @@ def ranked(
 
     ranking, rows, states = ranking_by(RANKING)
     alarms, _, alarm_states = ranking_by(ALARM_RANKING)
+    seeds = {label: rows[label].values() for label in ranking.ranks}
     rates = win_rates(
         {
-            label: {
-                c: nan_mean(seed[c].value for seed in rows[label].values()) for c in sorted(cells)
-            }
-            for label in ranking.ranks
+            label: {c: nan_mean(seed[c].value for seed in of_row) for c in sorted(cells)}
+            for label, of_row in seeds.items()
         }
     )
     unranked = set(map(str, below))
@@ -349,25 +348,22 @@ def compare_rows(
     settings = [row_named(records, name) for name in (first, second)]
     if settings[0] == settings[1]:
         raise UsageError(f"{first!r} and {second!r} are the same row")
-    rows = {s: terms_of((r for r in records if r.setting == s), metric) for s in settings}
-    defined = (
-        {cell for cell, terms in cells.items() if not math.isnan(terms.value)}
-        for row in rows.values()
-        for cells in row.values()
-    )
+    rows = {str(s): terms_of((r for r in records if r.setting == s), metric) for s in settings}
+    seeds = [cells for row in rows.values() for cells in row.values()]
+    defined = ({c for c, terms in s.items() if not math.isnan(terms.value)} for s in seeds)
     common = sorted(set.intersection(*defined))
     if not common:
         raise ResultsError(f"{first} and {second} have no cell in common with a value of {metric}")
     shared = {
-        str(setting): {seed: {cell: cells[cell] for cell in common} for seed, cells in row.items()}
-        for setting, row in rows.items()
+        name: {seed: {cell: cells[cell] for cell in common} for seed, cells in row.items()}
+        for name, row in rows.items()
     }
+    tests = {test.first: test for test in rank(shared).comparisons}
     one, other = shared
-    tests = {(test.first, test.second): test for test in rank(shared).comparisons}
-    test = tests[one, other]
+    test = tests[one]
     means = (
-        nan_mean(nan_mean(c.value for c in row.values()) for row in shared[name].values())
-        for name in shared
+        nan_mean(nan_mean(c.value for c in cells.values()) for cells in row.values())
+        for row in shared.values()
     )
     # Where lower is better, the terms have their sign turned.
     sign = -1.0 if info.better == "lower" else 1.0

@@ -66,21 +66,16 @@ class Strengths:
         -------
         Strengths
         """
-        rungs: dict[Pair, dict[str, Rung]] = {}
-        for r in records:
-            known = rungs.get(_pair(r), {})
-            if r.strength and r.strength not in known and (rung := _rung_of(r)):
-                rungs[_pair(r)] = known | {r.strength: rung}
-        ordered = {
-            pair: dict(sorted(by_name.items(), key=lambda item: item[1].strength))
-            for pair, by_name in rungs.items()
+        known = {
+            (_pair(r), r.strength): rung for r in records if r.strength and (rung := _rung_of(r))
         }
+        rungs: dict[Pair, dict[str, Rung]] = {}
         numbers: dict[str, list[float]] = {}
-        for name, rung in (item for by_name in ordered.values() for item in by_name.items()):
+        for (pair, name), rung in sorted(known.items(), key=lambda item: item[1].strength):
+            rungs.setdefault(pair, {})[name] = rung
             numbers.setdefault(name, []).append(rung.strength)
-        means = {name: float(np.mean(values)) for name, values in numbers.items()}
-        names = sorted(means, key=lambda name: (_position(name), means[name]))
-        return cls(ordered, tuple(names), calibrated=all(name in RUNGS for name in names))
+        names = sorted(numbers, key=lambda name: (_position(name), float(np.mean(numbers[name]))))
+        return cls(rungs, tuple(names), calibrated=all(name in RUNGS for name in names))
 
     def unit(self, pair: Pair) -> float:
         """Return the strength of a pair that is 1 where several pairs are put together."""

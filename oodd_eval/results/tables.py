@@ -163,7 +163,7 @@ def guaranteed(
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
         "is the share of this split's nominal twins that raised one."
     )
-    return replace(_by_metric(board, title, columns, standings), note=note)
+    return _by_metric(board, title, columns, standings, note)
 
 
 def attribution(
@@ -184,7 +184,7 @@ def attribution(
         "onset that they name is from the effect, the median of a cell."
     )
     ranks = [standing for standing in standings if standing.entry in explaining]
-    return replace(_by_metric(board, title, columns, ranks), note=note)
+    return _by_metric(board, title, columns, ranks, note)
 
 
 def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -375,13 +375,17 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
 
 
 def _by_metric(
-    board: Board, title: str, columns: Sequence[Mean], standings: Sequence[Standing] = ()
+    board: Board,
+    title: str,
+    columns: Sequence[Mean],
+    standings: Sequence[Standing] = (),
+    note: str = "",
 ) -> Table:
     """Return columns with a row per detector, or per standing with its place."""
     labels = {row.entry: _labels(row) for row in standings} or {e: [str(e)] for e in board.entries}
     rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
     first = _LABELS if standings else ("detector",)
-    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first))
+    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first), note=note)
 
 
 def _labels(row: Standing) -> list[str]:
