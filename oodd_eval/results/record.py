@@ -12,7 +12,7 @@ import platform
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -220,9 +220,13 @@ class Record:
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         if self.magnitude is None:
             del plain["magnitude"]
-        plain["metrics"] = {name: asdict(metric) for name, metric in self.metrics.items()}
+        plain["metrics"] = {
+            name: {"value": m.value, "low": m.low, "high": m.high, "n": m.n}
+            for name, m in self.metrics.items()
+        }
+        plain = _without_nan(plain | {"per_trajectory": {}})  # terms are finite, and many
         plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
-        return json.dumps(_without_nan(plain), allow_nan=False)
+        return json.dumps(plain, allow_nan=False)
 
     @classmethod
     def from_json(cls, line: str, where: str = "record") -> "Record":
