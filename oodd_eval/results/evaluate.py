@@ -1,6 +1,5 @@
 """From the scores of a cell to its metrics with intervals, and to its record."""
 
-import functools
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import HEADLINE, IntervalKind, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -74,18 +73,9 @@ def cell_metrics(
 
 def metric_of(name: str, contribution: Contribution, environment: str) -> Metric:
     """Return a metric of a cell with its interval, from its terms."""
-    terms = contribution.numerator.tobytes(), contribution.denominator.tobytes()
-    ends = _interval(metric_info(name).interval, environment, contribution.median, *terms)
+    cell = drawn_cell(environment, 0, contribution)
+    ends = mean_interval([cell], kind=metric_info(name).interval)
     return Metric(contribution.value, *ends, n=contribution.n)
-
-
-@functools.lru_cache(maxsize=4096)
-def _interval(
-    kind: IntervalKind, environment: str, median: bool, numerator: bytes, denominator: bytes
-) -> tuple[float, float]:
-    """Return the interval of a metric. Many metrics of a detector have the same terms."""
-    terms = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
-    return mean_interval([drawn_cell(environment, 0, terms)], kind=kind)
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
