@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.errors import OutputError, ResultsError, UsageError
 from oodd_eval.results import record as record_module
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Setting
@@ -55,6 +55,14 @@ def test_json_round_trip_of_anything(value, number, reason, parameters, status):
     line = one.to_json()
     assert "\n" not in line
     assert same(Record.from_json(line), one)
+
+
+def test_metrics_may_have_different_numbers_of_trajectories():
+    one = record(per_trajectory={"auc": np.ones((2, 3)), "far": np.zeros((2, 1))})
+    read = Record.from_json(one.to_json())
+    assert {name: terms.shape for name, terms in read.per_trajectory.items()} == {
+        "auc": (2, 3), "far": (2, 1),
+    }  # fmt: skip
 
 
 def test_undefined_is_null():
@@ -182,6 +190,31 @@ def test_a_record_knows_its_cell_and_its_row():
     assert str(one.cell) == "mini/hopper/iid::rf[h=5,seed=2,trees=60]"
     assert str(one.setting) == "rf[h=5,trees=60]"
     assert one.setting == Setting.of("rf", 5, {"trees": 60})
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3)
+    | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=5,
+)  # fmt: skip
+
+
+@given(
+    overrides=st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), VALUES, max_size=3),
+    horizon=st.integers(1, 99),
+)
+def test_a_setting_is_read_back_from_its_text(overrides, horizon):
+    overrides = {k: v for k, v in overrides.items() if k != "h"}
+    setting = Setting.of("pyod:IForest", horizon, overrides)
+    assert Setting.parse(str(setting)) == setting
+
+
+@pytest.mark.parametrize("text", ["", "rf[h=1", "rf[x]", 'rf[h=1,x="]'])
+def test_what_is_no_setting_is_refused(text):
+    with pytest.raises(UsageError):
+        Setting.parse(text)
 
 
 def test_the_order_of_parameters_is_not_in_a_setting():
