@@ -7,9 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import warnings
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -153,20 +151,11 @@ class Exits(Good):
         sys.exit(3)
 
 
-@breaks("inputs", "without actions, fit raised IndexError: index 0 is out of")
+@breaks("fits", "its spec declares no actions, so their width was 0")
 class LearnsActions(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ = self.std_ + np.concatenate([x.actions[:, 0] for x in nominal]).std()
-
-
-@breaks("inputs", "without actions, score raised IndexError: index 0 is out")
-class ScoresActions(Good):
-    def score(self, x):
-        scores = super().score(x)
-        if self.std_ is not None:
-            scores[1:] += np.abs(x.actions[:, 0])
-        return scores
 
 
 @breaks(
@@ -216,25 +205,25 @@ class Taciturn(Good):
 # Scores
 
 
-@breaks("shape", "score returned shape (80,) for 81 observations: expected")
+@breaks("scores", "80 scores for an episode, fitted with horizon 1, expected 81", also={"horizon"})
 class OneShort(Good):
     def score(self, x):
         return super().score(x)[1:]
 
 
-@breaks("dtype", "score returned float32 scores, expected float64")
+@breaks("scores", "float32 scores for")
 class Single(Good):
     def score(self, x):
         return super().score(x).astype(np.float32)
 
 
-@breaks("dtype", "score returned list, expected a numpy array")
+@breaks("scores", "list for")
 class PlainList(Good):
     def score(self, x):
         return super().score(x).tolist()
 
 
-@breaks("finite", "the score at t = 30 of 81 is nan: expected finite scores")
+@breaks("scores", "nan at t = 30")
 class LateNan(Good):
     def score(self, x):
         scores = super().score(x)
@@ -242,14 +231,14 @@ class LateNan(Good):
         return scores
 
 
-@breaks("finite", "the score at t = 40 of 81 is inf: expected finite scores")
+@breaks("scores", "inf at t = 40")
 class Overflows(Good):
     def score(self, x):
         scores = super().score(x)
         return np.where(scores > 25, np.inf, scores)
 
 
-@breaks("warm-up", "the first 3 scores are NaN, but with horizon 1 and")
+@breaks("scores", "nan at t = 1")
 class SecretWarmUp(Good):
     def score(self, x):
         scores = super().score(x)
@@ -257,17 +246,12 @@ class SecretWarmUp(Good):
         return scores
 
 
-@breaks("warm-up", "warm_up is 9, but only the first 1 scores are NaN:")
+@breaks("warm-up", "warm_up is 9, but only 1 scores are NaN:")
 class BraggingWarmUp(Good):
     warm_up = 9
 
 
-@breaks("warm-up", "warm_up is 50, expected an int between 0 and 20")
-class LongWarmUp(Good):
-    warm_up = 50
-
-
-@breaks("horizon", "with horizon 4 the first 8 scores are NaN: expected at")
+@breaks("horizon", "nan at t = 4 of an episode, fitted with horizon 4")
 class TwiceTheHorizon(Good):
     def score(self, x):
         scores = super().score(x)
@@ -310,9 +294,7 @@ class Remembers(Good):
 
 
 @breaks(
-    "order",
-    "scores of a trajectory change with what was scored",
-    also={"score-many", "causality", "prefix"},
+    "order", "scores of a trajectory change with what was scored", also={"score-many", "prefix"}
 )
 class Shocked(Good):
     """Scores one more after it has seen something wild."""
@@ -337,41 +319,7 @@ class LosesOne(Good):
         return super().score_many(trajectories[1:])
 
 
-@breaks("inputs-unchanged", "fit changed the list of trajectories that it was given")
-class Shuffles(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        if isinstance(nominal, list):
-            nominal.reverse()
-
-
-@breaks("inputs-unchanged", "fit changed the arrays of a trajectory", also={"read-only"})
-class Rescales(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        for x in nominal:
-            x.observations.flags.writeable = True
-            x.observations[:] = np.abs(x.observations)
-
-
-@breaks("read-only", "fit raised ValueError: cannot set WRITEABLE flag to True")
-class Unlocks(Good):
-    def fit(self, nominal):
-        for x in nominal:
-            x.observations.flags.writeable = True
-        super().fit(nominal)
-
-
 # Time
-
-
-@breaks(
-    "causality", "scores before t = 2 change when the episode goes on", also={"prefix", "streaming"}
-)
-class LooksAhead(Good):
-    def score(self, x):
-        scores = super().score(x)
-        return np.append(scores[:1], np.append(scores[2:], scores[-1:]))[: len(x)]
 
 
 @breaks("prefix", "the first 1 of 81 observations alone have other scores:", also={"streaming"})
@@ -536,7 +484,7 @@ class SavesNothing(Good):
     def save(self, directory): ...
 
 
-@breaks("save-and-load", "load raised FileNotFoundError", also={"shared-fit"})
+@breaks("save-and-load", "load raised FileNotFoundError", also={"shared-fit", "saved-files"})
 class LoadsElsewhere(Good):
     def load(self, directory):
         (directory / "elsewhere").read_bytes()
@@ -549,39 +497,15 @@ class FitsItsHorizon(Good):
         self.std_ = self.std_ / self.horizon
 
 
-class Pickles(Good):
-    """Saves one file more than the good one."""
-
-    extra, content = "", b""
-
-    def save(self, directory):
-        super().save(directory)
-        (directory / self.extra).write_bytes(self.content)
-
-
-@breaks("saved-files", "save wrote model.pkl, a pickle by its name: expected")
-class PicklesOpenly(Pickles):
-    extra, content = "model.pkl", b"anything"
-
-
-@breaks("saved-files", "save wrote model.bin, a pickle by its first bytes:")
-class PicklesSecretly(Pickles):
-    extra, content = "model.bin", b"\x80\x04N."
-
-
-@breaks("saved-files", "save wrote extra.npz, which holds Python objects")
+@breaks("saved-files", "load unpickled numpy")
 class SavesObjects(Good):
     def save(self, directory):
-        super().save(directory)
-        np.savez(directory / "extra.npz", a=np.array([{}], dtype=object))
+        np.savez(directory / "state.npz", std=self.std_.astype(object))
 
-
-@breaks("saved-files", "save wrote model.pt, which holds the pickle")
-class SavesLikeTorch(Good):
-    def save(self, directory):
-        super().save(directory)
-        with zipfile.ZipFile(directory / "model.pt", "w") as archive:
-            archive.writestr("model/data.pkl", b"\x80\x02N.")
+    def load(self, directory):
+        with np.load(directory / "state.npz", allow_pickle=True) as state:
+            self.std_ = state["std"].astype(np.float64)
+        self.reset()
 
 
 # Manners
@@ -597,7 +521,7 @@ class Seeds(Good):
         np.random.seed(self.seed)  # noqa: NPY002
 
 
-@breaks("thread-settings", "fit or score changed OMP_NUM_THREADS: 3 -> 1: the number")
+@breaks("global-settings", "fit or score changed OMP_NUM_THREADS: 3 -> 1")
 class SetsThreads(Good):
     def fit(self, nominal):
         super().fit(nominal)
@@ -709,17 +633,3 @@ class ReadsHere(Good):
     def fit(self, nominal):
         super().fit(nominal)
         Path("here.txt").read_text()
-
-
-@breaks("time-budget", "fit and score took")
-class Slow(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        time.sleep(0.25)
-
-
-@breaks("memory-budget", "fit and score took")
-class Fat(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        np.ones(25 * 10**6).sum()

@@ -17,15 +17,15 @@ from unittest.mock import patch
 
 import pytest
 
-from oodd_eval.errors import UsageError
-from oodd_eval.plugins.conformance import Result, test_contract, test_effects, test_scores
+from oodd_eval.errors import ContractError, UsageError
+from oodd_eval.plugins.conformance import Result, test_conduct, test_contract
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Offer, offer_of, printable
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
 from oodd_eval.plugins.isolation.worker import connect, reason_of
 
-MODULES: Final = (test_contract, test_scores, test_effects)
+MODULES: Final = (test_contract, test_conduct)
 CHECKS: Final[dict[str, Callable[[Trial], None]]] = {
     name.removeprefix("test_").replace("_", "-"): function
     for module in MODULES
@@ -76,7 +76,7 @@ class _Session:
         if report.skipped:
             message = str(error)
         elif error:
-            failed = isinstance(error, AssertionError)
+            failed = isinstance(error, AssertionError | ContractError)
             message = printable(str(error) if failed else f"the detector raised {reason_of(error)}")
             if cause := error.__cause__ if failed else error:
                 lines = "".join(traceback.format_exception(cause)).splitlines()

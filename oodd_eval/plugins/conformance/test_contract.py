@@ -4,14 +4,15 @@ PYTEST_DONT_REWRITE: messages are whole sentences.
 """
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.metrics.auc import auc
-from oodd_eval.plugins.conformance.trial import SENSORS, Trial, shared_trial, trial
-from oodd_eval.plugins.contract import MAX_WARM_UP, Detector, Scores
+from oodd_eval.plugins.conformance.trial import SENSORS, RaisedError, Trial, shared_trial, trial
+from oodd_eval.plugins.contract import Detector, check_scores
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
 
@@ -42,22 +43,10 @@ def test_unknown_parameter(trial: Trial) -> None:
 
 def test_fits(trial: Trial) -> None:
     """It can be fitted on nominal trajectories, and score one."""
-    if isinstance(trial.first_fit, AssertionError):
-        if trial.needs_actions():
-            pytest.skip("needs actions: see check 'inputs'")
-        raise trial.first_fit
-
-
-def test_inputs(trial: Trial) -> None:
-    """It can do without actions where the spec declares observations alone."""
-    if trial.actions:
-        pytest.skip("may look at actions")
-    assert not trial.needs_actions(), (
-        f"without actions, {trial.first_fit}; with them it works: expected "
-        'inputs="observations+actions" in the spec, as a detector that declares observations '
-        "is handed actions of width 0"
-    )
-    trial.fitted()
+    error = trial.first_fit
+    hint = "" if trial.actions else "; its spec declares no actions, so their width was 0"
+    if isinstance(error, AssertionError):
+        raise RaisedError(f"{error}{hint}") from error.__cause__
 
 
 def test_declared_parameters(trial: Trial) -> None:
@@ -111,52 +100,18 @@ def _refusal(
     return None
 
 
-def test_shape(trial: Trial) -> None:
-    """Scores are one array of one dimension, one score per observation."""
-    for trajectory in trial.nominal():
-        shape, n = np.asarray(trial.fitted().score(trajectory)).shape, len(trajectory)
-        assert shape == (n,), (
-            f"score returned shape {shape} for {n} observations: expected ({n},), one score per "
-            "observation"
-        )
-
-
-def test_dtype(trial: Trial) -> None:
-    """Scores are a numpy array of float64."""
-    scores: object = trial.fitted().score(trial.nominal(1)[0])
-    kind = type(scores).__name__
-    assert isinstance(scores, np.ndarray), f"score returned {kind}, expected a numpy array"
-    assert scores.dtype == np.float64, f"score returned {scores.dtype} scores, expected float64"
-
-
-def test_finite(trial: Trial) -> None:
-    """Scores are finite from the first defined one on, also on a gross anomaly."""
-    for trajectory in [*trial.nominal(), *(wild for wild, _, _ in trial.anomalous())]:
-        scores = trial.scores(trajectory)
-        first, n = _undefined(scores), len(scores)
-        assert first < n, f"all {n} scores of an episode are NaN: expected scores after the warm-up"
-        wrong = first + np.flatnonzero(~np.isfinite(scores[first:]))
-        assert not wrong.size, (
-            f"the score at t = {wrong[0]} of {n} is {scores[wrong[0]]}: expected finite scores but "
-            "for one leading block of NaN"
-        )
+def test_scores(trial: Trial) -> None:
+    """Scores are one float64 per observation, finite from the first defined one on."""
+    trajectories = [*trial.nominal(), *(wild for wild, _, _ in trial.anomalous())]
+    _check_scores(trial, trial.fitted(), trial.horizon, trajectories)
 
 
 def test_warm_up(trial: Trial) -> None:
-    """The leading block of NaN is as long as horizon and declared warm-up say."""
-    declared: object = getattr(trial.fitted(), "warm_up", 0)
-    assert type(declared) is int and 0 <= declared <= MAX_WARM_UP, (
-        f"warm_up is {declared!r}, expected an int between 0 and {MAX_WARM_UP}"
-    )
-    longest = max(_undefined(trial.scores(x)) for x in trial.nominal())
-    allowed = max(trial.horizon, declared)
-    assert longest <= allowed, (
-        f"the first {longest} scores are NaN, but with horizon {trial.horizon} and warm_up "
-        f"{declared} at most {allowed} may be: declare warm_up = {longest}, or pad"
-    )
-    assert longest >= declared, (
-        f"warm_up is {declared}, but only the first {longest} scores are NaN: declare what is left "
-        "undefined"
+    """No more rows are declared undefined than are."""
+    declared = getattr(trial.fitted(), "warm_up", 0)
+    undefined = max(int(np.isnan(trial.scores(x)).sum()) for x in trial.nominal())
+    assert undefined >= declared, (
+        f"warm_up is {declared}, but only {undefined} scores are NaN: declare what is left so"
     )
 
 
@@ -165,13 +120,22 @@ def test_horizon(trial: Trial) -> None:
     # Not the one of all the other checks, and long enough to tell from a fixed block.
     horizon = 4 if trial.horizon != 4 else 2
     trial.fitted()
-    detector = trial.fit(horizon=horizon)
-    n = _undefined(trial.scores(trial.nominal(1)[0], detector))
-    declared = getattr(detector, "warm_up", 0)
-    allowed = max(horizon, declared if isinstance(declared, int) else 0)
-    assert n <= allowed, (
-        f"with horizon {horizon} the first {n} scores are NaN: expected at most {allowed}"
-    )
+    _check_scores(trial, trial.fit(horizon=horizon), horizon, trial.nominal(1))
+
+
+def _check_scores(
+    trial: Trial, detector: Detector, horizon: int, trajectories: Sequence[Trajectory]
+) -> None:
+    """Check scores as a run does."""
+    for trajectory in trajectories:
+        check_scores(
+            detector.score(trajectory),
+            trajectory,
+            horizon=horizon,
+            warm_up=getattr(detector, "warm_up", 0),
+            detector=trial.spec.name or type(detector).__name__,
+            where=f"an episode, fitted with horizon {horizon}",
+        )
 
 
 def test_gross_anomaly(trial: Trial) -> None:
@@ -181,7 +145,7 @@ def test_gross_anomaly(trial: Trial) -> None:
         for wild, twin, onset in trial.anomalous()
     ]
     if np.isnan(areas).any():
-        pytest.skip("needs defined scores: see check 'finite'")
+        pytest.skip("needs defined scores: see check 'scores'")
     mean = float(np.mean(areas))
     advice = "do not tell a gross anomaly"
     if mean < 1 - LEAST_AUC:
@@ -190,8 +154,3 @@ def test_gross_anomaly(trial: Trial) -> None:
         f"an episode whose sensors go wild scores above its nominal twin in {mean:.0%} of pairs, "
         f"expected at least {LEAST_AUC:.0%}: scores {advice}"
     )
-
-
-def _undefined(scores: Scores) -> int:
-    """Return the length of the leading block of NaN."""
-    return int(np.argmin([*np.isnan(scores), False]))
