@@ -297,7 +297,7 @@ def test_parameters_are_those_of_the_class_and_the_windows():
 def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
     before = offer("forecast:their_models.Mean").version
     theirs.write_text(THEIRS + "\n# changed\n")
-    from oodd_eval.scoring.keys import source_digest
+    from oodd_eval.scoring.plan import source_digest
 
     source_digest.cache_clear()
     assert before.startswith("0.")

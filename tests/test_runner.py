@@ -25,8 +25,7 @@ from oodd_eval.plugins.isolation.supervisor import _send
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.keys import source_digest
-from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.plan import make_plan, source_digest
 from oodd_eval.scoring.runner import run
 
 HOSTILE = """

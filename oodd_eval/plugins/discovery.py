@@ -111,7 +111,7 @@ class Plugin:
 
     def offer(self, spec: DetectorSpec) -> Offer:
         """Return a spec as an offer; its version names the library that does the work, too."""
-        version = "+".join(filter(None, (_version(self.point), spec.version)))
+        version = "+".join(filter(None, (_metadata(self.point.dist)[1], spec.version)))
         return Offer(spec, self.point.name, self.point.module, _distribution(self.point), version)
 
 
@@ -193,7 +193,7 @@ class Plugins:
         for maker in self._makers():
             function = maker.hook.oodd_detector_from_spec.get_hookimpls()[0].function
             known = (inspect.getdoc(function) or "").partition("\n")[0].removesuffix(".")
-            origin = f"{_distribution(maker.point)} {_version(maker.point)}"
+            origin = " ".join(_metadata(maker.point.dist))
             forms.append((maker.point.name, origin, known))
         return forms
 
@@ -244,7 +244,11 @@ class Plugins:
             if point in self._waiting:
                 self._load(point)
             plugin = self.loaded.get(point.name)
-            if plugin and plugin.point is point and _implements(plugin, "oodd_detector_from_spec"):
+            if (
+                plugin
+                and plugin.point is point
+                and plugin.hook.oodd_detector_from_spec.get_hookimpls()
+            ):
                 yield plugin
 
     def _from_spec(self, text: str) -> Offer:
@@ -330,10 +334,6 @@ def _list_of(returned: object, kind: type[_Spec], hook: str) -> list[_Spec]:
     return returned
 
 
-def _implements(plugin: Plugin, hook: str) -> bool:
-    return bool(getattr(plugin.hook, hook).get_hookimpls())
-
-
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
     for names, expected, fits in _FIELDS:
@@ -410,16 +410,14 @@ def _foreign(point: EntryPoint) -> bool:
 
 
 def _distribution(point: EntryPoint) -> str:
-    return _metadata(point.dist)[0] if point.dist else "unknown distribution"
-
-
-def _version(point: EntryPoint) -> str:
-    return _metadata(point.dist)[1] if point.dist else ""
+    return _metadata(point.dist)[0]
 
 
 @functools.lru_cache(maxsize=64)
-def _metadata(distribution: Distribution) -> tuple[str, str]:
+def _metadata(distribution: Distribution | None) -> tuple[str, str]:
     """Return name and version, for which a distribution reads its files anew every time."""
+    if distribution is None:
+        return "unknown distribution", ""
     return distribution.name, distribution.version
 
 

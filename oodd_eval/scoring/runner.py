@@ -4,13 +4,16 @@ The runner prints nothing. Observers (`oodd_eval.scoring.observers`) are called 
 results are the same bytes for any number of jobs.
 """
 
+import functools
+import math
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, TypeAlias
 
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
@@ -23,6 +26,9 @@ from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, o
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.unit import COSTS, Scored, UnitJob
+
+# The place of a job as it begins, and with its future as it ends.
+Events: TypeAlias = "SimpleQueue[tuple[int, Future[Scored] | None]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,23 +108,18 @@ def _as_they_finish(
 
     Only a few more units are begun than are taken, so that few scores are in memory.
     """
-    end = None if settings.deadline is None else time.monotonic() + settings.deadline
+    end = math.inf if settings.deadline is None else time.monotonic() + settings.deadline
     # With twice as many, no thread is idle while records are made. What waits in the pool begins
     # later, however, which a deadline forbids.
-    most = executor.jobs * (2 if end is None else 1)
+    most = executor.jobs * (2 if end == math.inf else 1)
     waiting = _in_dependence(jobs, executor, settings, results)
     waiting.prepare()
     ready: list[int] = []
-    running: dict[Future[Scored], int] = {}
-    announced: set[int] = set()
+    events: Events = SimpleQueue()
+    running = 0
 
-    def begun() -> list[int]:
-        """Return the jobs at work that are not announced: the pool takes them in their order."""
-        new = [index for index in [*running.values()][: executor.jobs] if index not in announced]
-        announced.update(new)
-        return new
-
-    def score(job: UnitJob) -> Scored:
+    def score(index: int) -> Scored:
+        job = jobs[index]
         scored = executor(job)
         if results:
             if scored.status == "ok" and not scored.resumed:
@@ -127,36 +128,39 @@ def _as_they_finish(
                 write_text(results.log_path(job.unit.scores_key), scored.log)
         return scored
 
+    def begin(index: int) -> Scored:
+        events.put((index, None))
+        return score(index)
+
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
     try:
         while waiting.is_active():
             ready = sorted([*ready, *waiting.get_ready()])
-            while ready and len(running) < most:
-                if end is not None and time.monotonic() >= end:
-                    ready.clear()
-                    break
+            while ready and running < most and time.monotonic() < end:
                 index = ready.pop(0)
                 if jobs[index].unit.local:
                     yield index, None
-                    yield index, score(jobs[index])  # in this thread, where it can be interrupted
+                    yield index, score(index)  # in this thread, where it can be interrupted
                     waiting.done(index)
                     ready = sorted([*ready, *waiting.get_ready()])
                 else:
-                    running[pool.submit(score, jobs[index])] = index
-            yield from ((index, None) for index in begun())
+                    future = pool.submit(begin, index)
+                    future.add_done_callback(functools.partial(_put, events, index))
+                    running += 1
             if not running:
                 return
-            finished = wait(running, return_when=FIRST_COMPLETED).done
-            for future in [f for f in running if f in finished]:
-                index = running.pop(future)
+            index, finished = events.get()
+            if finished:
+                running -= 1
                 waiting.done(index)
-                if index not in announced:  # it began and finished since jobs were last announced
-                    announced.add(index)
-                    yield index, None
-                yield index, future.result()
+            yield index, finished.result() if finished else None
     finally:
         executor.stop()
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _put(events: Events, index: int, future: Future[Scored]) -> None:
+    events.put((index, future))
 
 
 def _in_dependence(

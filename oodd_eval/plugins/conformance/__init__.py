@@ -1,6 +1,6 @@
 """Tests that a detector honours the contract, in pytest, and what they came to.
 
-Modules ``test_*.py`` of this package hold the tests; `oodd_eval.testing` is their public face.
+The module `test_detector` holds the tests; `oodd_eval.testing` is their public face.
 """
 
 import textwrap
