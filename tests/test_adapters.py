@@ -5,13 +5,12 @@ import sys
 import numpy as np
 import pytest
 from oodd_adapters import windows as w
-from oodd_adapters.names import Signature
 from sklearn.ensemble import IsolationForest
 from sklearn.neighbors import KernelDensity
 
 from oodd_eval import Trajectory
 from oodd_eval.cli.main import main
-from oodd_eval.errors import ContractError, MissingExtraError, UnknownNameError, UsageError
+from oodd_eval.errors import ContractError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
@@ -340,33 +339,6 @@ def test_a_value_that_a_class_needs_is_asked_for(theirs):
     spec.factory(seed=0, horizon=1, **resolved(spec, order=2, scale=1.0))
     with pytest.raises(UnknownNameError, match="did you mean 'order'"):
         spec.factory(seed=0, horizon=1, oder=2)
-
-
-def test_signature_tells_plain_defaults_from_others():
-    class Thing:
-        def __init__(self, a, b=1, c=np.nan, *rest, d=None, e=print): ...
-
-    found = Signature.of(Thing)
-    assert (dict(found.plain), found.required, found.others) == (
-        {"b": 1, "d": None}, ("a",), ("c", "e"),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("name", "missing", "helps"),
-    [
-        ("pyod:IForest", "pyod", 'needs pyod: pip install "oodd-eval[pyod]"'),
-        ("sklearn:IsolationForest", "sklearn", 'pip install "oodd-eval[reference]"'),
-        ("forecast:sklearn.linear_model.Ridge", "sklearn", 'pip install "oodd-eval[reference]"'),
-    ],
-)
-def test_without_its_library_a_detector_is_unavailable(monkeypatch, name, missing, helps):
-    monkeypatch.setitem(sys.modules, missing, None)
-    found = offer(name)
-    assert helps in found.unavailable()
-    assert resolved(found.spec, n_estimators=3)["n_estimators"] == 3
-    with pytest.raises(MissingExtraError):
-        found.require()
 
 
 # The whole way

@@ -94,13 +94,6 @@ class Talks(Plain):
     def score(self, x): return np.full(len(x), np.inf)
 
 
-class Closes(Plain):
-    def score(self, x):
-        sys.stdout.close()
-        sys.stderr.close()
-        if len(x) > 0: raise ValueError("no more")
-
-
 class Dies(Plain):
     def score(self, x): os.kill(os.getpid(), signal.SIGSEGV)
 
@@ -136,7 +129,7 @@ def oodd_detectors():
             "threads-saved": ThreadsSaved, "dies": Dies, "grows": Grows, "acts": Acts,
             "pool": Pool, "helped": Helped, "helped-saved": HelpedSaved, "talks": Talks,
             "notes": Notes,
-            "closes": Closes, "saved-dies": SavedDies, "saved-grows": SavedGrows}
+            "saved-dies": SavedDies, "saved-grows": SavedGrows}
     both = DetectorSpec("acts-both", Acts, "", inputs="observations+actions")
     return [*(DetectorSpec(name, one, "") for name, one in made.items()), both]
 '''
@@ -202,11 +195,6 @@ def test_what_a_fit_prints_is_printed_once(plugin, tiny_split, tmp_path):
     assert first("talks", tiny_split, output=tmp_path / "out").status == "invalid"
     (log,) = (tmp_path / "out" / "logs").iterdir()
     assert log.read_text().count("fitted once") == 1
-
-
-def test_an_error_is_told_although_the_detector_closed_its_streams(plugin, tiny_split):
-    record = first("closes", tiny_split)
-    assert (record.status, record.reason[:19]) == ("error", "ValueError: no more")
 
 
 @pytest.mark.parametrize(

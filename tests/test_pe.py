@@ -264,18 +264,6 @@ def test_the_sensor_that_is_named_stays_that_of_the_onset(fitted):
     np.testing.assert_allclose(np.nansum(found.shares[1:], axis=1), 1.0)
 
 
-def test_a_stream_is_explained_as_the_whole_episode_is(fitted):
-    detector, x = fitted["pe-a"], corrupted(episode(100), 80, 1, 2.0)
-    whole = detector.explain(x)
-    detector.reset()
-    found = []
-    for row in zip(x.observations, [None, *x.actions], strict=True):
-        detector.update(*row)
-        found.append(detector.explain_last())
-    np.testing.assert_allclose([shares for shares, _ in found], whole.shares, atol=1e-9)
-    np.testing.assert_array_equal([onset for _, onset in found], whole.onsets)
-
-
 def test_a_robot_may_reuse_the_arrays_of_its_readings_and_commands(fitted):
     detector, x = fitted["pe-a"], episode(100)
     reading, command = np.empty(3, np.float32), np.empty(1, np.float32)
@@ -306,13 +294,6 @@ def test_the_step_row_is_the_chart_without_memory_of_the_same_fit(fitted, tmp_pa
     charts = fitted["pe-a"].charts_
     first = charts.statistic(sums(charts, fitted["pe-a"]._evidence(x)))[0]
     np.testing.assert_array_equal(step.score(x)[1:], first)
-
-
-def test_no_score_depends_on_actions_without_them(fitted):
-    x = NOMINAL[0]
-    np.testing.assert_array_equal(fitted["pe"].score(x), fitted["pe"].score(x.without_actions()))
-    other = Trajectory(x.observations, x.actions + 1)
-    assert (fitted["pe-a"].score(x)[5:] != fitted["pe-a"].score(other)[5:]).any()
 
 
 def test_more_memories_is_another_fit(fitted, tmp_path):

@@ -118,16 +118,6 @@ def test_a_failure_may_be_expected(check):
     assert "it is a clock [an episode" in " ".join(out.split())
 
 
-def test_verbose_prints_where_a_detector_raised(check):
-    _, out, _ = check("raises", "-v", "-k", "fits")
-    assert "Traceback" in out
-    assert 'raise RuntimeError("no mood")' in out
-    assert "Traceback" not in check("raises", "-k", "fits")[1]
-    code, out, _ = check("fine", "-k", "scores", "--expect", "scores=why not")
-    assert code == 1
-    assert "XPASSED  scores" in out
-
-
 def test_messages_of_a_detector_are_made_fit_to_print(check):
     assert 'raise RuntimeError("no mood")' in check("raises", "-v", "-k", "fits")[1]
     code, out, err = check("ugly", "-v", "-k", "fits")

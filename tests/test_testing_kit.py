@@ -13,8 +13,8 @@ from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
 from oodd_eval import check_detector
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.conformance import CheckReport, Result
-from oodd_eval.plugins.conformance.session import CHECKS, MOST_ENDS, run_tests
-from oodd_eval.plugins.conformance.trial import ACTIONS, EPISODES, SENSORS, Trial
+from oodd_eval.plugins.conformance.session import CHECKS, run_tests
+from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.testing import NonConformingError, run_checks
 
 pytest_plugins = ["pytester"]
@@ -87,18 +87,6 @@ def rows_of_the_page():
 def test_the_page_has_every_check_in_its_order_and_its_own_words():
     rows = [(name.strip("`"), what) for name, what, *_ in rows_of_the_page()]
     assert rows == [(name, check.__doc__.removesuffix(".")) for name, check in CHECKS.items()]
-
-
-def test_the_page_says_of_every_check_why_and_how_to_mend_it():
-    reasons = [row[2:] for row in rows_of_the_page()]
-    assert all(len(text) >= 10 for row in reasons for text in row)
-    assert len({text for row in reasons for text in row}) == 2 * len(NAMES)
-
-
-def test_the_page_names_the_size_of_the_problem():
-    for text in (f"{EPISODES} short nominal episodes", f"{SENSORS} sensors",
-                 f"{ACTIONS} action", f"{MOST_ENDS} such ends"):  # fmt: skip
-        assert text in PAGE
 
 
 # Results
