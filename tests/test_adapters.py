@@ -126,21 +126,6 @@ def test_of_too_many_windows_a_random_choice_is_taken():
     assert not np.array_equal(few, other)
 
 
-def test_rows_are_given_in_blocks_of_one_size():
-    sizes = []
-
-    def count(rows):
-        sizes.append(len(rows))
-        return rows.sum(axis=1)
-
-    rows = np.arange(2 * w.BLOCK + 5.0)[:, None]
-    np.testing.assert_array_equal(w.row_by_row(count, rows, alone=False), rows[:, 0])
-    assert sizes == [w.BLOCK] * 3
-    sizes.clear()
-    np.testing.assert_array_equal(w.row_by_row(count, rows[:3], alone=True), rows[:3, 0])
-    assert sizes == [1] * 3
-
-
 @pytest.mark.parametrize(
     ("function", "compares"),
     [

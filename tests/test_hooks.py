@@ -1,7 +1,6 @@
 """Hooks of plug-ins are called and checked; observers cannot stop a run."""
 
 import sys
-from dataclasses import replace
 
 import pytest
 from helpers_own import TANK
@@ -12,7 +11,6 @@ from oodd_eval.cli.main import main
 from oodd_eval.errors import PluginError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
@@ -108,24 +106,6 @@ def test_oodd_detector_from_spec(monkeypatch, tmp_path):
     assert plugins.select("clock, mine:8,mine:07") == ["clock", "mine:8", "mine:7"]
 
 
-def test_a_detector_from_a_spec_runs_in_a_worker(watched, monkeypatch, tmp_path, tiny_split):
-    install(monkeypatch, tmp_path, "maker", MAKER)
-    split = load_split(tiny_split)
-    plugins = discover()
-    plan = make_plan(
-        plugins, split=split, detectors=plugins.select("mine:07"),
-        environments=["cartpole"], anomalies=["iid"],
-    )  # fmt: skip
-    results = ResultsDirectory(tmp_path / "out")
-    done = run(plan, split, plugins, RunSettings(jobs=1), results)
-    assert [(r.status, r.detector) for r in done.records] == [("ok", "mine:7")]
-    assert str(done.records[0].cell) == f"{split.name}/cartpole/iid::mine:7[h=1,seed=0]"
-    (kept,) = (tmp_path / "out" / "scores").glob("*.h5")
-    assert kept.name.startswith("mine-7-cartpole-")
-    again = run(plan, split, discover(), RunSettings(jobs=1), results)
-    assert [r.status for r in again.records] == ["ok"]
-
-
 def test_list_tells_which_names_with_a_colon_there_are(monkeypatch, tmp_path, capsys):
     install(monkeypatch, tmp_path, "maker", MAKER)
     assert main(["list", "detectors"]) == 0
@@ -146,19 +126,6 @@ def test_a_plugin_may_not_make_something_else(monkeypatch, tmp_path, made):
     install(monkeypatch, tmp_path, "odd", code)
     with pytest.raises(PluginError, match="expected None or a DetectorSpec whose name has a colon"):
         discover().offer("odd:1")
-
-
-def test_a_name_with_a_colon_in_results_causes_no_import(watched, monkeypatch, tmp_path, capsys):
-    install(monkeypatch, tmp_path, "maker", MAKER)
-    _, _, done = watched()
-    record = replace(done.records[0], detector="mine:7", plugin="oodd-maker:maker")
-    results = ResultsDirectory(tmp_path / "out")
-    results.prepare()
-    results.merge_records([record])
-    # The plug-in is on the path, where importing it would now fail.
-    (tmp_path / "oodd_maker.py").write_text("raise SystemExit('imported')")
-    assert main(["show", str(tmp_path / "out"), "--stored"]) == 0
-    assert "mine:7" in capsys.readouterr().out
 
 
 def test_observers_hear_of_a_run_in_order(watched):

@@ -160,12 +160,6 @@ HANGING = {
             for number in set(signal.Signals) - {signal.SIGKILL, signal.SIGSTOP}:
                 signal.signal(number, signal.SIG_IGN)
             time.sleep(600)""",
-    "stops": "def score(self, x): os.kill(os.getpid(), signal.SIGSTOP)",
-    "bomb": """
-        def fit(self, nominal):
-            threads = [threading.Thread(target=time.sleep, args=(600,)) for _ in range(200)]
-            for thread in threads: thread.start()
-            for thread in threads: thread.join()""",
     "floods": """
         def score(self, x):
             while True: os.write(1, b"garbage " * 1000)""",
