@@ -4,7 +4,6 @@ The runner prints nothing. Observers (`oodd_eval.scoring.observers`) are called 
 results are the same bytes for any number of jobs.
 """
 
-import functools
 import math
 import time
 from collections.abc import Generator, Sequence
@@ -13,7 +12,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from queue import SimpleQueue
-from typing import Any, TypeAlias
+from typing import Any
 
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
@@ -26,9 +25,6 @@ from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, o
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.unit import COSTS, Scored, UnitJob
-
-# The place of a job as it begins, and with its future as it ends.
-Events: TypeAlias = "SimpleQueue[tuple[int, Future[Scored] | None]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +111,7 @@ def _as_they_finish(
     waiting = _in_dependence(jobs, executor, settings, results)
     waiting.prepare()
     ready: list[int] = []
-    events: Events = SimpleQueue()
+    events: SimpleQueue[int | Future[tuple[int, Scored]]] = SimpleQueue()
     running = 0
 
     def score(index: int) -> Scored:
@@ -128,9 +124,9 @@ def _as_they_finish(
                 write_text(results.log_path(job.unit.scores_key), scored.log)
         return scored
 
-    def begin(index: int) -> Scored:
-        events.put((index, None))
-        return score(index)
+    def begin(index: int) -> tuple[int, Scored]:
+        events.put(index)
+        return index, score(index)
 
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
     try:
@@ -144,23 +140,21 @@ def _as_they_finish(
                     waiting.done(index)
                     ready = sorted([*ready, *waiting.get_ready()])
                 else:
-                    future = pool.submit(begin, index)
-                    future.add_done_callback(functools.partial(_put, events, index))
+                    pool.submit(begin, index).add_done_callback(events.put)
                     running += 1
             if not running:
                 return
-            index, finished = events.get()
-            if finished:
-                running -= 1
-                waiting.done(index)
-            yield index, finished.result() if finished else None
+            event = events.get()
+            if isinstance(event, int):
+                yield event, None
+                continue
+            running -= 1
+            index, scored = event.result()
+            waiting.done(index)
+            yield index, scored
     finally:
         executor.stop()
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _put(events: Events, index: int, future: Future[Scored]) -> None:
-    events.put((index, future))
 
 
 def _in_dependence(
