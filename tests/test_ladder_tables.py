@@ -301,7 +301,9 @@ def test_a_column_has_the_places_with_its_strength_alone():
 
 
 def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
-    (record,) = [r for r in RECORDS if r.detector == "rf" and r.place == ("hopper", "iid@kept90")]
+    (record,) = [
+        r for r in RECORDS if r.detector == "rf" and r.position == ("hopper", "iid@kept90")
+    ]
     (rung,) = Strengths.of([record]).rungs["hopper", "iid"].values()
     assert (rung.strength, rung.kept) == (40.0, 0.9)
     other = dataclasses.replace(record, magnitude=30.0)

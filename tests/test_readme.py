@@ -1,6 +1,5 @@
 """The README's commands and the names in the documents cannot rot."""
 
-import csv
 import re
 import tomllib
 from pathlib import Path
@@ -60,19 +59,6 @@ def test_citations_have_the_version():
     assert f"version = {{{__version__}}}" in cite
     assert f"oodd-eval {__version__}, split" in cite
     assert f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "index.md").read_text()
-
-
-def test_the_three_lines_are_the_boards():
-    (file,) = (ROOT / "leaderboard" / "tables").glob("mini-*-ranking.csv")
-    with file.open() as lines:
-        board = {r["detector"]: r for r in csv.DictReader(lines) if r["primary"] == "true"}
-    line = r"^\| `([a-z-]+)`, [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$"
-    rows = re.findall(line, README, re.MULTILINE)
-    assert [name for name, *_ in rows] == ["pe-a", "mewma-a", "riqn"]
-    for name, *shown in rows:
-        metrics = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
-        expected = [100 * float(board[name][metric]) for metric in metrics]
-        assert [float(n) for n in shown] == pytest.approx(expected, abs=0.051), name
 
 
 def test_the_output_of_the_main_command_is_that_of_the_committed_records(

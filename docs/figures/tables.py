@@ -1,0 +1,218 @@
+"""Fill the tables of README.md and docs/results.md from what is committed under leaderboard/.
+
+A table below a comment such as ``<!-- table: board mini -->`` has rows whose first cell the author
+writes; this program writes the other cells. Run ``python docs/figures/tables.py`` after a change of
+committed results, or of the rows; with ``--check`` it writes nothing and fails where a page would
+change.
+"""
+
+import csv
+import functools
+import re
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from oodd_eval.leaderboard.entry import read_entries, read_grants
+from oodd_eval.results.board import Board, boards
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.identity import Setting
+
+ROOT = Path(__file__).parents[2]
+BOARD = ROOT / "leaderboard"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+HEADLINE = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
+
+Row = Callable[[str], str]
+"""Return the cells of a row behind its first one, separated by bars, from what the first names."""
+
+
+def lines(path: str) -> list[dict[str, str]]:
+    """Return the rows of a committed CSV file."""
+    with (BOARD / path).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@functools.cache
+def ranking(split: str) -> dict[str, dict[str, str]]:
+    """Return the primary rows of a board by detector."""
+    (file,) = (BOARD / "tables").glob(f"{split}-*-ranking.csv")
+    rows = lines(str(file.relative_to(BOARD)))
+    return {row["detector"]: row for row in rows if row["primary"] == "true"}
+
+
+@functools.cache
+def board(name: str, seed: int | None = None) -> Board:
+    """Return a suite's board, or that of the entries on mini."""
+    if name == "mini":
+        records = [r for e in read_entries(BOARD / "results") for r in e.records]
+        records = [r for r in records if r.split == "mini" and seed in (None, r.seed)]
+    else:
+        records = ResultsDirectory(BOARD / "suites" / name).records()
+    (of_split,) = boards(records)
+    return of_split
+
+
+def mean(
+    name: str,
+    row: str | Setting,
+    metric: str,
+    *,
+    seed: int | None = None,
+    environments: Iterable[str] = (),
+    anomalies: Iterable[str] = (),
+) -> float:
+    """Return a row's mean of a metric in per cent, by default over all cells."""
+    records = board(name, seed)
+    setting = row if isinstance(row, Setting) else Setting(row)
+    over = [*environments] or records.environments, [*anomalies] or records.anomalies
+    return 100 * records.mean(setting, *over, metric).value
+
+
+def cells(values: Iterable[float]) -> str:
+    """Return numbers with one decimal as cells."""
+    return " | ".join(f"{value:.1f}" for value in values)
+
+
+def of_board(split: str, *metrics: str) -> Row:
+    """Return the row of a detector on a board."""
+    return lambda name: cells(100 * float(ranking(split)[name][metric]) for metric in metrics)
+
+
+def by_environment(name: str) -> str:
+    """Return matched AUC by group, and dynamics anomalies that are missed, of an environment."""
+    sensor, dynamics = board("mini").in_group("sensor"), board("mini").in_group("dynamics")
+
+    def value(row: str, metric: str, group: Iterable[str]) -> float:
+        return mean("mini", row, metric, environments=[name], anomalies=group)
+
+    pairs = [
+        ", ".join(f"{value(row, 'auc_matched', group):.1f}" for row in ("pe", "pe-a"))
+        for group in (sensor, dynamics)
+    ]
+    missed = (value(row, "missed_at_5pct", dynamics) for row in ("mewma-a", "pe", "pe-a"))
+    return " | ".join([*pairs, *(f"{share:.0f}" for share in missed)])
+
+
+def at_horizons(name: str) -> str:
+    """Return three metrics of a detector, each at three horizons."""
+    return cells(mean("horizons", Setting(name, h), m) for m in HEADLINE for h in (1, 10, 20))
+
+
+def run_again(name: str) -> str:
+    """Return the means of a row's entry and of its re-run, in turn."""
+    means = {
+        row: pairs
+        for g in read_grants(BOARD / "results").values()
+        for row, pairs in g.means.items()
+    }
+    units = {"auc_matched": 100, "false_episodes_at_5pct": 100, "delay_censored_at_5pct": 1}
+    return cells(unit * value for metric, unit in units.items() for value in means[name][metric])
+
+
+def under_noise(name: str) -> str:
+    """Return three metrics of a detector, each without noise and with two amounts of it."""
+    metrics = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
+    splits = (("mini", 0), ("noisy-1", None), ("noisy-5", None))
+    return cells(mean(split, name, m, seed=seed) for m in metrics for split, seed in splits)
+
+
+def of_protocols(name: str) -> str:
+    """Return matched AUC under protocol 1, from the archive, and today."""
+    archive = (ROOT / "docs" / "archive" / "protocol-1.md").read_text(encoding="utf-8")
+    mini = archive.split("## Board of mini")[1].split("## Board of reduced")[0]
+    (old,) = re.findall(rf"\| {name}(?: \(trivial\))? \| Δ=1(?:, 3 seeds)? \| ([\d.]+) ", mini)
+    return f"{old} → {100 * float(ranking('mini')[name]['auc_matched']):.1f}"
+
+
+def of_reproductions(table1: str, losses: str) -> Row:
+    """Return AUC by group of a model: of the paper, at Table 1's strengths, at equal losses."""
+
+    def means(split: str) -> dict[tuple[str, str], dict[str, str]]:
+        rows = lines(f"reproduction/{split}/tables/table-5.csv")
+        rows = [r for r in rows if (r["environment"], r["metric"]) == ("mean", "auc")]
+        return {(r["series"], r["anomalies"]): r for r in rows}
+
+    def row(name: str) -> str:
+        ours, same = means(table1), means(losses)
+        keys = [(name, group) for group in ("sensor", "dynamics")]
+        texts = (t for k in keys for t in (same[k]["paper"], ours[k]["value"], same[k]["value"]))
+        return cells(100 * float(text) for text in texts)
+
+    return row
+
+
+def of_ladder(name: str) -> str:
+    """Return a row of the overview on the ladder's page: threshold, and shares by rung."""
+    page = (BOARD / "suites" / "ladder" / "README.md").read_text(encoding="utf-8")
+    table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    (row,) = (row for row in rows if row[0] == name)
+    return " | ".join([row[1].replace("\\", ""), *row[5:]])
+
+
+@functools.cache
+def claims(split: str) -> dict[tuple[str, str], dict[str, str]]:
+    """Return the judgements of a reproduction by claim and measure."""
+    return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}
+
+
+def verdicts(text: str) -> str:
+    """Return the verdicts on a claim, by the paper's measure and by the fair one."""
+    by_text = {(r["text"], kind): r["verdict"] for (_, kind), r in claims("mini").items()}
+    return f"{by_text[text, 'paper']} | {by_text.get((text, 'fair'), '–')}"  # noqa: RUF001  an en dash
+
+
+WHOLE = ("auc_matched", "auc_unpaired", "auc_smoothed", *HEADLINE[1:], "false_episodes_at_5pct")
+
+TABLES: dict[str, Row] = {
+    "headline": of_board("mini", *HEADLINE),
+    "board mini": of_board("mini", *WHOLE),
+    "board standard": of_board("standard", *WHOLE),
+    "environments": by_environment,
+    "horizons": at_horizons,
+    "run again": run_again,
+    "noise": under_noise,
+    "protocols": of_protocols,
+    "losses mini-paper": of_reproductions("mini", "mini-paper"),
+    "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
+    "ladder": of_ladder,
+    "claims": verdicts,
+}
+
+
+def filled(page: str) -> str:
+    """Return a page with the numbers of its tables; an unknown table or row raises `KeyError`."""
+
+    def table(match: re.Match[str]) -> str:
+        row = TABLES[match["name"]]
+        texts = []
+        for line in match["rows"].splitlines():
+            label = line.split("|")[1].strip()
+            named = re.match(r"`([a-z0-9-]+)`", label)  # behind the name may stand a description
+            texts.append(f"| {label} | {row(named[1] if named else label)} |\n")
+        return match["head"] + "".join(texts)
+
+    pattern = (
+        r"(?P<head><!-- table: (?P<name>[a-z0-9 -]+) -->\n\|[^\n]*\n\|[-|]+\|\n)"
+        r"(?P<rows>(?:\|[^\n]*\n)+)"
+    )
+    return re.sub(pattern, table, page)
+
+
+def main(arguments: list[str]) -> int:
+    """Fill the pages, or with ``--check`` say which would change."""
+    changed = []
+    for path in PAGES:
+        before = path.read_text(encoding="utf-8")
+        if (after := filled(before)) != before:
+            changed.append(str(path.relative_to(ROOT)))
+            if "--check" not in arguments:
+                path.write_text(after, encoding="utf-8")
+    if changed:
+        print("changed:" if "--check" not in arguments else "out of date:", ", ".join(changed))
+    return int(bool(changed) and "--check" in arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
