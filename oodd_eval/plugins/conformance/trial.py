@@ -45,9 +45,19 @@ class RaisedError(AssertionError):
 class Trial:
     """All that the checks of one detector share.
 
-    The factory is called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec`
-    tells what the detector declares too. Episodes have actions where the spec declares them, and
-    for a factory, which declares nothing.
+    Episodes have actions where the spec declares them, and for a factory, which declares nothing.
+
+    Parameters
+    ----------
+    factory
+        Called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec` tells what the
+        detector declares too.
+    horizon
+        Prediction horizon in steps.
+    seed
+        Seed of the detector.
+    parameters
+        Further arguments of the factory.
     """
 
     def __init__(
