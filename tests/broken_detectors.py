@@ -223,10 +223,6 @@ def undefined(first, last):
 
 for name, message, change in (
     ("OneShort", "80 scores for an episode, fitted with horizon 1", lambda _, s, x: s[1:]),
-    ("Single", "float32 scores for", lambda _, s, x: s.astype(np.float32)),
-    ("PlainList", "list for", lambda _, s, x: s.tolist()),
-    ("LateNan", "nan at t = 30", undefined(30, 31)),
-    ("Overflows", "inf at t = 40", lambda _, s, x: np.where(s > 25, np.inf, s)),
     ("SecretWarmUp", "nan at t = 1", undefined(0, 3)),
 ):
     fails = {"horizon"} if name == "OneShort" else ()

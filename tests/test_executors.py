@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import re
 import subprocess
 import sys
@@ -65,11 +64,6 @@ def ordered(job, tiny_split, limits=Limits(), stop=NEVER.is_set, **changes):  # 
 def test_an_executor_that_does_not_exist_is_refused(name):
     with pytest.raises(UsageError, match="expected 'local' or 'dask://HOST:PORT'"):
         open_executor(RunSettings(executor=name), None, None)
-
-
-def test_the_local_executor_uses_all_cores_unless_told():
-    assert open_executor(RunSettings(jobs=3), None, None).jobs == 3
-    assert open_executor(RunSettings(), None, None).jobs == len(os.sched_getaffinity(0))
 
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):

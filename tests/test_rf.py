@@ -143,14 +143,6 @@ def test_ewma_is_the_running_mean_of_rf_from_its_first_score(horizon):
     np.testing.assert_array_equal(alone.score(episode(90)), raw)
 
 
-def test_ewma_takes_over_a_fit_of_rf(rf, tmp_path):
-    rf.save(tmp_path)
-    made = make_rf_ewma(**SMALL)
-    made.load(tmp_path)
-    x = episode(90)
-    np.testing.assert_allclose(made.score(x), smoothed(rf.score(x), 0.03), rtol=1e-12)
-
-
 def test_ewma_shares_the_fits_of_rf_and_is_its_own_statistic():
     rf, ewma = oodd_detectors()
     assert (ewma.name, ewma.alarm, rf.alarm) == ("rf-ewma", "score", "cusum")

@@ -13,7 +13,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import AlarmKind
 from oodd_eval.plugins.contract import Detector, StreamingDetector, make_detector
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.explanations import ExplainingDetector, StreamingExplainer
+from oodd_eval.plugins.explanations import ExplainingDetector
 
 Row = NDArray[np.float32]
 
@@ -88,8 +88,7 @@ def streaming(detector: Detector) -> StreamingDetector:
         " which takes longer and longer until reset",
         stacklevel=4,
     )
-    explains = isinstance(detector, ExplainingDetector)
-    return _ExplainedPrefixes(detector) if explains else _Prefixes(detector)
+    return _Prefixes(detector)
 
 
 class _Prefixes:
@@ -98,6 +97,8 @@ class _Prefixes:
     def __init__(self, detector: Any) -> None:
         self._detector = detector
         self.fit, self.score = detector.fit, detector.score
+        if isinstance(detector, ExplainingDetector):
+            self.explain_last = self._explain_last
         self.reset()
 
     def reset(self) -> None:
@@ -111,10 +112,6 @@ class _Prefixes:
         self._sofar = Trajectory(self._observations, self._actions or None)
         return float(self._detector.score(self._sofar)[-1])
 
-
-class _ExplainedPrefixes(_Prefixes, StreamingExplainer):
-    """The same, of a detector that explains."""
-
-    def explain_last(self) -> tuple[NDArray[np.float64], int]:
+    def _explain_last(self) -> tuple[NDArray[np.float64], int]:
         shares, onsets = self._detector.explain(self._sofar)
         return shares[-1], int(onsets[-1])

@@ -11,8 +11,6 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from helpers_plugins import install
-from helpers_processes import wait_until
 
 from oodd_eval import load_split
 from oodd_eval.errors import OutputError, ResultsError
@@ -361,22 +359,3 @@ def test_a_directory_removed_while_running(tiny_split, tmp_path, what):
     assert found == {"clock", "persistence"}
     again, _ = run_tiny(tiny_split, tmp_path / "out", detectors)
     assert [r.status for r in again.records] == ["ok"] * 4
-
-
-SAVES = """
-class Saves(Good):
-    def save(self, directory):
-        Path(directory, "w").touch()
-        os.truncate(Path(directory, "w"), 10**13)
-    def load(self, directory): pass
-
-@hookimpl
-def oodd_detectors(): return offer(saves=Saves)
-"""
-
-
-def test_an_enormous_fit_is_not_kept(tiny_split, tmp_path, monkeypatch):
-    install(monkeypatch, tmp_path / "plugin", "saves", SAVES)
-    done, _ = run_tiny(tiny_split, tmp_path / "out", ["saves"])
-    assert [r.status for r in done.records] == ["ok", "ok"]
-    assert wait_until(lambda: list((tmp_path / "out" / "fitted").iterdir()) == [])
