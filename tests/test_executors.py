@@ -17,7 +17,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
+from oodd_eval.scoring.executors import Executor, RunSettings, check_executor
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
@@ -63,7 +63,7 @@ def ordered(job, tiny_split, limits=Limits(), stop=NEVER.is_set, **changes):  # 
 )
 def test_an_executor_that_does_not_exist_is_refused(name):
     with pytest.raises(UsageError, match="expected 'local' or 'dask://HOST:PORT'"):
-        open_executor(RunSettings(executor=name), None, None)
+        check_executor(name)
 
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
