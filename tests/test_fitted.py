@@ -8,8 +8,7 @@ from helpers_plugins import install
 from oodd_eval.data.split import load_split
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import FitStore, ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run

@@ -8,8 +8,7 @@ import pytest
 from helpers_plugins import install
 from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
 
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import FitStore, ResultsDirectory
 
 pytestmark = pytest.mark.slow
 

@@ -15,9 +15,9 @@ from oodd_eval.data.fetch import fetch
 from oodd_eval.data.info import describe
 from oodd_eval.data.layout import MANIFEST, own_facts, write_environment, write_manifest
 from oodd_eval.errors import SplitError, UsageError
+from oodd_eval.results import tables
 from oodd_eval.results.board import boards
-from oodd_eval.results.reference import read_record_set, write_reference
-from oodd_eval.results.tables import layout
+from oodd_eval.results.compare import read_record_set, write_reference
 
 OWN = {"slip": "dynamics", "fog": "sensor"}
 LIKE = {"slip": "gravity", "fog": "iid"}
@@ -84,10 +84,10 @@ def test_a_run_scores_what_each_environment_has_and_tables_name_it(place):
     (board,) = boards(results.records)
     assert board.environments == ["cartpole", "valve", "pump"]
     assert board.in_group("dynamics") == ["gravity", "slip"]
-    table = layout.by_anomaly(board, board.entries[0])
+    table = tables.by_anomaly(board, board.entries[0])
     assert table.header == ["Environment", "gravity", "slip", "fog"]
     assert [row[0] for row in table.rows] == ["CartPole", "valve", "pump"]
-    assert not [line for line in layout.notes(board) if "without" in line]
+    assert not [line for line in tables.notes(board) if "without" in line]
 
 
 def test_results_are_shown_described_and_kept_as_a_reference(place, tmp_path, capsys, monkeypatch):

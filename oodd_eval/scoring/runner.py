@@ -19,8 +19,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
 from oodd_eval.results.evaluate import evaluated
-from oodd_eval.results.provenance import gather
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan

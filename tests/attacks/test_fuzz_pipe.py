@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 
 from oodd_eval.errors import OoddError
 from oodd_eval.plugins.isolation import Channel, supervisor
-from oodd_eval.results.directory import RECORDS, ResultsDirectory, ScoreFile
-from oodd_eval.results.fits import INDEX, FitStore
+from oodd_eval.results.directory import INDEX, RECORDS, FitStore, ResultsDirectory, ScoreFile
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.scoring.unit import Scored
 
