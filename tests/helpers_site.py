@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from helpers_records import make_record
 
+from oodd_eval.data.condition import rungs_of
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.ladder import rungs_of
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import (
     EntryInfo,

@@ -13,10 +13,19 @@ from oodd_recording.build import build_split
 from oodd_recording.values import bound_of, unit_of
 
 from oodd_eval.cli.main import main
-from oodd_eval.data import ladder
-from oodd_eval.data.condition import FRACTIONS, LEVELS, RUNGS, Condition
+from oodd_eval.data import condition
+from oodd_eval.data.condition import (
+    FRACTIONS,
+    LEVELS,
+    RUNGS,
+    WHOLE,
+    Condition,
+    all_rungs_of,
+    conditions_of,
+    rungs_of,
+    strength_of,
+)
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, SplitDefinition
-from oodd_eval.data.ladder import WHOLE, all_rungs_of, conditions_of, rungs_of, strength_of
 from oodd_eval.data.split import load_split
 
 pytestmark = pytest.mark.slow
@@ -32,7 +41,7 @@ STRENGTHS = {
 
 @pytest.fixture
 def own_ladder(monkeypatch):
-    monkeypatch.setattr(ladder, "read_ladder", lambda: STRENGTHS)
+    monkeypatch.setattr(condition, "read_ladder", lambda: STRENGTHS)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +70,7 @@ def graded(base, **changes):
 
 
 def test_strengths_rise_from_rung_to_rung_within_their_bound():
-    for environment, kinds in ladder.read_ladder().items():
+    for environment, kinds in condition.read_ladder().items():
         for kind, entry in kinds.items():
             where = f"{environment} {kind}"
             assert entry["unit"] == unit_of(environment, kind), where
@@ -89,7 +98,7 @@ def test_strengths_rise_from_rung_to_rung_within_their_bound():
 def test_only_robots_have_strengths_for_whole_episodes_and_splits_without_a_cap_take_them():
     for environment, info in ENVIRONMENTS.items():
         capped, whole = (conditions_of("paper", environment, cap) for cap in (300, None))
-        for kind in ladder.read_ladder()[environment]:
+        for kind in condition.read_ladder()[environment]:
             own = WHOLE in all_rungs_of(environment, kind)
             assert own == (kind in TABLE1 and not info.discrete), (environment, kind)
         for kind in TABLE1:

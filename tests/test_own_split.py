@@ -9,7 +9,6 @@ from helpers_split import make_group, make_split
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.condition import Condition, in_suite_order
-from oodd_eval.data.export import export
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity, in_order
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.info import describe
@@ -110,18 +109,6 @@ def test_results_are_shown_described_and_kept_as_a_reference(place, tmp_path, ca
 def test_an_unknown_anomaly_of_the_chosen_environments_is_named(place):
     with pytest.raises(UsageError, match=r"unknown anomaly 'gravity'.*Known: slip"):
         evaluate("clock", place, environments="pump", anomalies="gravity")
-
-
-def test_an_export_knows_which_actions_are_discrete(place, tmp_path):
-    export(load_split(place), tmp_path, environments=["valve", "pump"])
-    for name, kind in (("valve", "Discrete"), ("pump", "Box")):
-        file = tmp_path / "oodd" / "mine" / name / "test-slip-v0" / "data" / "metadata.json"
-        assert json.loads(json.loads(file.read_text())["action_space"])["type"] == kind
-
-
-def test_a_copy_is_fetched(place, tmp_path):
-    split = fetch(str(place), output=tmp_path / "copy").split
-    assert split.environments == ("cartpole", "valve", "pump")
 
 
 def edited(place, change):

@@ -11,9 +11,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from oodd_eval.data.condition import PAPER, RUNGS
+from oodd_eval.data.condition import PAPER, RUNGS, Rung, rungs_of
 from oodd_eval.data.facts import title_of
-from oodd_eval.data.ladder import Rung, rungs_of
 from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, RANKING, UNDEFINED
