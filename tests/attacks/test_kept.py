@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from oodd_eval import load_split
-from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.errors import ResultsError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results import directory as results_directory
