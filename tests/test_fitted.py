@@ -51,11 +51,6 @@ class Mean:
             log.write("load\\n")
         self.mean = json.loads((directory / "mean.json").read_text())
 
-class Cannot(Mean):
-    def save(self, directory):
-        (directory / "half").write_text("half")
-        raise RuntimeError("disk is not to my taste")
-
 class Forgets(Mean):
     def load(self, directory):
         raise RuntimeError("forgot how")
@@ -66,7 +61,6 @@ def oodd_detectors():
     return [
         DetectorSpec("mean", Mean, "mean", **common),
         DetectorSpec("mean-too", Mean, "same fit", fit_name="mean", **common),
-        DetectorSpec("cannot", Cannot, "cannot save", **common),
         DetectorSpec("forgets", Forgets, "cannot load", **common),
     ]
 """

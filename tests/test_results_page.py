@@ -5,19 +5,24 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from oodd_eval.cli.main import main
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.results.identity import Setting
 
 ROOT = Path(__file__).parents[1]
 SPEC = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "figures" / "tables.py")
 tables = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(tables)
-claims = tables.claims
+claims, lines, mean = tables.claims, tables.lines, tables.mean
 
 BOARD = ROOT / "leaderboard"
 PAGE, README = ((ROOT / name).read_text() for name in ("docs/results.md", "README.md"))
 TEXT = " ".join(PAGE.split())
+ROBOTS = [name for name, info in ENVIRONMENTS.items() if not info.discrete]
+CLASSIC = [name for name in ENVIRONMENTS if name not in ROBOTS]
 
 
 def test_tables_are_those_of_what_is_committed():
@@ -39,8 +44,94 @@ def test_the_page_of_a_suite_is_printed_from_its_records(suite, capsys):
     assert capsys.readouterr().out == (directory / "README.md").read_text(encoding="utf-8"), advice
 
 
+# Claims of the paper
+
+
+def counted(split):
+    """The verdicts by the paper's measures that data decide, by claim."""
+    settled = {"by definition", "by construction"}
+    rows = {c: r["verdict"] for (c, kind), r in claims(split).items() if kind == "paper"}
+    return {claim: verdict for claim, verdict in rows.items() if verdict not in settled}
+
+
 def test_verdicts_are_counted():
     counts = Counter(r["verdict"] for (_, kind), r in claims("mini").items() if kind == "paper")
     assert f"Of {sum(counts.values())} claims" in TEXT
     for verdict, many in counts.items():
         assert re.search(rf"\b{many}( are)? {verdict}", TEXT), verdict
+
+
+def test_claims_that_were_run_on_other_splits_are_counted_rightly():
+    for split in ("standard", "reduced-paper"):
+        verdicts = counted(split)
+        run = [claim for claim, verdict in verdicts.items() if verdict != "not run"]
+        assert f"{len(run)} of {len(verdicts)}" in TEXT
+        assert f"reproduction/{split}/README.md" in PAGE
+    mini = counted("mini")
+    differ = [c for c, v in counted("standard").items() if v not in ("not run", mini[c])]
+    assert sorted(differ) == ["delay-riqn-npn", "delay-riqn-rf", "memory-1-7"]
+
+
+# Sentences: a phrase of the page with the numbers that it has to have
+
+
+def points(claim, kind="paper", factor=100, split="reduced-paper", ends=("value",)):
+    return [f"{factor * float(claims(split)[claim, kind][end]):.1f}" for end in ends]
+
+
+def gains(horizon, environments, names, sign=1):
+    auc = "auc_matched"
+    for name in names:
+        one, other = (mean("horizons", Setting(name, h), auc, environments=environments or ())
+                      for h in (1, horizon))  # fmt: skip
+        yield f"{sign * (other - one):.1f}"
+
+
+STEPS = ("pe-step", "rf", "riqn-ms", "npn")
+ENDS = ("value", "low", "high")
+EASIER = "sensor-above-dynamics-models"
+
+
+@pytest.mark.parametrize(
+    ("phrase", "numbers"),
+    [
+        ("gains {} points of matched AUC there, `rf` {}, `riqn-ms` {} and `npn` {}.",
+         lambda: gains(10, ROBOTS, STEPS)),
+        ("they lose {}, {}, {} and {}.",
+         lambda: gains(10, CLASSIC, STEPS, -1)),
+        ("falls by {} points from Δ = 1 to 20, `riqn` by {} and `riqn-ms` by {}.",
+         lambda: gains(20, None, ("n-riqn", "riqn", "riqn-ms"), -1)),
+        ("by {} [{}, {}] points, and by {} [{}, {}] of matched AUC",
+         lambda: [*points(EASIER, ends=ENDS), *points(EASIER, "fair", ends=ENDS)]),
+        ("sensor anomalies were easier by {} points", lambda: points(EASIER, split="mini-paper")),
+        ("by {} points of AUC and {} of matched AUC",
+         lambda: [*points("riqn-above-npn-1", "paper", -100),
+                  *points("riqn-above-npn-1", "fair", -100)]),
+        ("longer than NPN's by {} steps, as on", lambda: points("delay-riqn-npn", factor=-1)),
+        ("RIQN by {} points", lambda: points("riqn-above-riqn-ms-10", factor=-100)),
+        ("N-RIQN by {} points; at Δ = 1", lambda: points("memory-10-7")),
+        ("one by {} points at Δ = 1", lambda: points("ensemble-1")),
+    ],
+)  # fmt: skip
+def test_sentences_have_the_numbers_of_what_is_committed(phrase, numbers):
+    assert phrase.format(*numbers()) in TEXT
+
+
+def test_losses_on_whole_episodes_are_those_of_table_2():
+    kept = {"value": {}, "paper": {}}
+    for r in lines("reproduction/reduced-paper/tables/table-2.csv"):
+        for column, by_environment in kept.items():
+            if r["environment"] in ENVIRONMENTS:
+                by_environment.setdefault(r["environment"], {})[r["kind"]] = float(r[column])
+
+    def lost(column, environment):
+        of = dict(kept[column][environment])
+        nominal = of.pop("nominal")
+        return round(100 * (1 - np.mean([*of.values()]) / nominal) * np.sign(nominal))
+
+    for environment in ROBOTS:
+        title = ENVIRONMENTS[environment].title
+        assert re.search(rf"\b{lost('value', environment)} %? ?\({title}\)", TEXT), title
+    for column, names in (("paper", ROBOTS), ("value", CLASSIC), ("paper", CLASSIC)):
+        losses = [lost(column, name) for name in names]
+        assert f"{min(losses)} to {max(losses)} %" in TEXT

@@ -100,14 +100,6 @@ def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
     assert "error" in seen
 
 
-def test_the_errors_of_a_conversation_are_those_that_a_run_expects():
-    """The test above takes the errors for garbled that `run_isolated` takes for it."""
-    source = Path(supervisor.__file__).read_text()
-    assert "except (ChannelGarbledError, LookupError, TypeError, ValueError, OverflowError)" in (
-        source
-    )
-
-
 @contextmanager
 def directory():
     with tempfile.TemporaryDirectory() as path:

@@ -1,6 +1,6 @@
 """Tests that a detector honours the contract, in pytest, and what they came to.
 
-Modules ``test_*.py`` of this package hold the tests; `oodd_eval.testing` is their public face.
+The module `test_detector` holds the tests; `oodd_eval.testing` is their public face.
 """
 
 import textwrap
@@ -77,7 +77,7 @@ class CheckReport:
     Parameters
     ----------
     results
-        One per check, in the order in which they ran.
+        The result of every check, in the order in which they ran.
     """
 
     results: Sequence[Result] = ()
@@ -93,12 +93,12 @@ class CheckReport:
         return [result for result in self.results if not result.ok]
 
     def summary(self) -> str:
-        """Count the checks by their result.
+        """Return one line: how many checks there were, and how many came to what.
 
         Returns
         -------
         str
-            Such as ``"40 checks: 38 passed, 2 skipped in 3.1 s"``.
+            Such as ``"32 checks: 29 passed, 3 skipped in 0.4 s"``.
         """
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[s]} {meaning}" for s, meaning in STATUSES.items() if counts[s]]
