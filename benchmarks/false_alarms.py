@@ -26,7 +26,7 @@ from oodd_eval.metrics.alarms import GuaranteedAlarm, offered_levels, quantile_r
 from oodd_eval.names import select
 from oodd_eval.plugins.contract import make_detector, score_chunk
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import FitStore
 from oodd_eval.scoring.plan import make_unit
 
 ROWS = (

@@ -16,9 +16,8 @@ import numpy as np
 from oodd_recording.calibrate import kept_shares, measure, twins_of
 from oodd_recording.record import return_of
 
-from oodd_eval.data.condition import RUNGS
+from oodd_eval.data.condition import RUNGS, WHOLE, all_rungs_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
-from oodd_eval.data.ladder import WHOLE, all_rungs_of
 from oodd_eval.names import select
 
 FIRST_SEED = 970_000_000  # the calibration's begin at 950 000 000

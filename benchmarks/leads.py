@@ -13,7 +13,7 @@ from tabulate import tabulate
 
 from oodd_eval.results.board import grouped
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.paired import compare
+from oodd_eval.results.standings import compare_rows
 
 
 def main():
@@ -26,7 +26,7 @@ def main():
     table = []
     for environment, own in grouped(plain, lambda r: r.environment).items():
         others = {r.detector for r in own} - {options.row}
-        leads = [compare(own, options.row, other) for other in others]
+        leads = [compare_rows(own, options.row, other) for other in others]
         leads.sort(key=lambda t: t.low)
         unsure = ", ".join(t.second for t in leads if t.low <= 0) or "none"
         low = leads[0]

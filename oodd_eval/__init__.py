@@ -37,21 +37,18 @@ __all__ = [
     "load_split",
 ]
 
-_HOMES = {
-    "AnomalySpec": "data.registry",
-    "Attribute": "data.registry",
-    "EnvironmentSpec": "data.registry",
-    "Quantity": "data.facts",
-    "Detector": "plugins.contract",
-    "DetectorSpec": "plugins.contract",
-    "Explanation": "plugins.explanations",
-    "Trajectory": "data.trajectory",
-    "check_detector": "testing",
-    "evaluate": "api",
-    "hookimpl": "plugins",
-    "load_results": "api",
-    "load_split": "data.split",
+_NAMES = {
+    "api": ("evaluate", "load_results"),
+    "data.facts": ("Quantity",),
+    "data.registry": ("AnomalySpec", "Attribute", "EnvironmentSpec"),
+    "data.split": ("load_split",),
+    "data.trajectory": ("Trajectory",),
+    "plugins": ("hookimpl",),
+    "plugins.contract": ("Detector", "DetectorSpec"),
+    "plugins.explanations": ("Explanation",),
+    "testing": ("check_detector",),
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> object:

@@ -18,16 +18,11 @@ SPEC_NAME: Final = DETECTOR_NAME + r"(:\w{1,64}(\.\w{1,64}){0,7})?"
 PARAMETER_NAME: Final = r"[A-Za-z_]\w{0,63}"
 
 _TIMES: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
-_AMOUNTS: Final = {
-    "": 1,
-    "b": 1,
-    "kb": 10**3,
-    "mb": 10**6,
-    "gb": 10**9,
-    "kib": 2**10,
-    "mib": 2**20,
-    "gib": 2**30,
-}
+_AMOUNTS: Final = (
+    {"": 1, "b": 1}
+    | {f"{prefix}b": 1000**i for i, prefix in enumerate("kmg", start=1)}
+    | {f"{prefix}ib": 1024**i for i, prefix in enumerate("kmg", start=1)}
+)
 
 
 def check_known(kind: str, known: Collection[str], *names: str) -> None:

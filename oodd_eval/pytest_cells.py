@@ -18,10 +18,16 @@ from oodd_eval.names import select
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
-from oodd_eval.results.compare import Difference, compare, message, parse_tolerances
+from oodd_eval.results.compare import (
+    Difference,
+    RecordSet,
+    compare,
+    parse_tolerances,
+    read_record_set,
+)
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.reference import RecordSet, read_record_set
+from oodd_eval.results.report import message
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
@@ -61,17 +67,17 @@ class Cells:
         self.plugins = discover()
         names = _detectors(option("oodd_detector"), self.plugins)
         self.split = load_split(option("oodd_split"))
-        path = option("oodd_reference")
-        reference = _of_split(read_record_set(path), self.split, names) if path else None
-        metrics = reference.metrics() if reference else ()
+        environments = select("environment", option("oodd_env") or "all", self.split.environments)
+        self.reference = None
+        if path := option("oodd_reference"):
+            self.reference = _comparable(read_record_set(path), self.split, names, environments)
+            if not option("oodd_env"):
+                covered = {record.environment for record in self.reference.records}
+                environments = [name for name in environments if name in covered]
+        metrics = self.reference.metrics() if self.reference else ()
         self.tolerances = parse_tolerances(option("oodd_fail"), [*NAMES, *metrics])
-        self.plan = _plan(self.plugins, self.split, names, option("oodd_env"), reference)
+        self.plan = _plan(self.plugins, self.split, names, environments, self.reference)
         self.names = list(map(str, self.plan.cells))
-        self.reference = reference.selected(set(self.names).__contains__) if reference else None
-        if self.reference and not self.reference.boards:
-            what = f"{', '.join(names)} in {option('oodd_env') or 'these environments'}"
-            where = self.reference.where
-            raise UsageError(f"{where} has no cell of {what}: name others with --oodd-env")
 
     def pytest_report_header(self) -> str:
         """Return a line on what is checked, and against what."""
@@ -167,48 +173,41 @@ def _detectors(patterns: str, plugins: Plugins) -> list[str]:
         raise UsageError("; ".join([str(error), *broken])) from None
 
 
-def _of_split(reference: RecordSet, split: Split, names: list[str]) -> RecordSet:
-    """Return a reference's cells of these detectors and of this split as it is here."""
+def _comparable(
+    reference: RecordSet, split: Split, detectors: list[str], environments: list[str]
+) -> RecordSet:
+    """Return a reference's cells of this split as it is here, of detectors at their defaults."""
     conditions = Conditions(split.name, split.digest, PROTOCOL, None)
     records = list(reference.boards.get(conditions, {}).values())
-    if not records:
-        boards = "; ".join(map(str, reference.boards)) or "no cells"
-        raise UsageError(
-            f"nothing in common: {reference.where} has {boards}, expected {conditions}"
-        )
-    selected = RecordSet.of((r for r in records if r.detector in names), reference.where)
-    if not selected.boards:
-        others = ", ".join(sorted({r.detector for r in records}))
-        has = f"{reference.where} has no cell of {', '.join(names)}, only of {others}"
-        raise UsageError(f"{has}: write one with oodd-eval compare DIR --write-reference FILE")
-    return selected
+    chosen = [r for r in records if r.detector in detectors and r.environment in environments]
+    if plain := [r for r in chosen if not r.overrides]:
+        return RecordSet.of(plain, reference.where)
+    has = "; ".join(map(str, reference.boards)) or "no cells"
+    if records:
+        has = f"only others, such as {(chosen or records)[0].cell}"
+    raise UsageError(
+        f"nothing in common: {reference.where} has {has}, expected cells of {conditions}, of "
+        f"{', '.join(detectors)} with default parameters in {', '.join(environments)}: name "
+        "others, or write a reference with oodd-eval compare DIR --write-reference FILE"
+    )
 
 
 def _plan(
     plugins: Plugins,
     split: Split,
     detectors: list[str],
-    envs: str | None,
+    environments: list[str],
     reference: RecordSet | None,
 ) -> Plan:
-    """Plan what the reference has: its environments, horizons and seeds, at default parameters."""
+    """Plan what a reference has: its horizons and seeds, at default parameters."""
     cells = [record.cell for record in reference.records] if reference else []
-    plain = [cell for cell in cells if not cell.setting.parameters]
-    if reference and not plain:
-        has = f"{reference.where} has only cells with parameters of their own, such as {cells[0]}"
-        raise UsageError(f"{has}; here detectors run with their defaults")
-    covered = {cell.environment for cell in cells}
-    environments = [e for e in split.environments if not reference or e in covered]
-    if envs:
-        environments = select("environment", envs, split.environments)
-    horizons, seeds = {cell.setting.horizon for cell in plain}, {cell.seed for cell in plain}
     plan = make_plan(
         plugins,
         split=split,
         detectors=detectors,
         environments=environments,
-        horizons=sorted(horizons) or [1],
-        seeds=sorted(seeds) or [0],
+        horizons=sorted({cell.setting.horizon for cell in cells}) or [1],
+        seeds=sorted({cell.seed for cell in cells}) or [0],
     )
     labels = {cell.label for cell in cells}
     selected = {str(cell) for cell in plan.cells if not reference or cell.label in labels}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from helpers_records import make_record
 
-from oodd_eval.data.ladder import rungs_of
+from oodd_eval.data.condition import rungs_of
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import (
     EntryInfo,

@@ -20,7 +20,7 @@ from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 
@@ -72,13 +72,6 @@ def test_a_built_split_holds_what_recording_gives(built):
     assert data.sensors == ENVIRONMENTS["cartpole"].sensors
     assert stored.parameters[1] == episode.parameters
     assert stored.returns[1] == episode.rewards.sum()
-
-
-def test_the_manifest_names_recipe_policy_and_versions(built):
-    manifest = load_split(built).manifest
-    assert manifest["definition"] == SMALL.recipe
-    assert manifest["environments"]["cartpole"]["policy"] == load_policy("cartpole").digest
-    assert {"oodd-eval", "numpy", "gymnasium", "python"} <= set(manifest["versions"])
 
 
 def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
@@ -219,9 +212,3 @@ def test_wrong_requests_fail_before_any_work(tmp_path):
         with pytest.raises(UsageError, match=message):
             build_split(dataclasses.replace(SMALL, **change), target, **FEW)
     assert not target.exists()
-
-
-def test_reduced_differs_from_standard_in_sizes_alone():
-    sizes = {"train": 500, "calibration": 200, "test": 50}
-    reduced = dataclasses.replace(SPLITS["reduced"], name="standard", **sizes)
-    assert reduced == SPLITS["standard"]

@@ -9,15 +9,7 @@ from hypothesis import strategies as st
 
 from oodd_eval import evaluate
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import (
-    MIN_ROWS,
-    PROBES,
-    TOLERANCE,
-    _spread,
-    check_prefix,
-    difference,
-    probes,
-)
+from oodd_eval.plugins.contract import MIN_ROWS, PROBES, TOLERANCE, check_prefix, difference, probes
 
 LENGTHS = st.dictionaries(
     st.sampled_from(["calibration", "test/nominal", "test/iid"]),
@@ -43,37 +35,12 @@ def test_probes_are_of_different_episodes_and_the_first_reaches_the_last_quarter
     assert found == probes(lengths, seed)
 
 
-def test_the_seed_decides_and_every_part_and_place_is_probed():
-    lengths = {"calibration": [100] * 20, "test/iid": [100] * 20}
-    drawn = [probes(lengths, i) for i in range(50)]
-    rows = {p.rows for found in drawn for p in found}
-    assert min(rows) < 35
-    assert max(rows) > 95
-    assert len({tuple(found) for found in drawn}) == 50
-    share = np.mean([p.part == "calibration" for found in drawn for p in found])
-    assert abs(share - 0.5) < 4 * 0.5 / math.sqrt(50 * PROBES)
-
-
 WHOLE = np.array([math.nan, 1.0, 2.0, 3.0, 2.0])
 
 
 @pytest.mark.parametrize("found", [WHOLE[:3], WHOLE[:2] + 3e-4, WHOLE, WHOLE[:0]])
 def test_the_same_up_to_single_precision_is_the_same(found):
     check_prefix(found, WHOLE, detector="mine", where="hopper/test/iid[7]")
-
-
-def test_what_differs_is_named_with_both_values():
-    with pytest.raises(ContractError) as error:
-        check_prefix(
-            np.array([math.nan, 1.0, 2.01]), WHOLE, detector="mine", where="hopper/test/iid[7]"
-        )
-    for text in (
-        "is not causal",
-        "hopper/test/iid[7]",
-        "2.01 instead of 2",
-        "check mine -k prefix",
-    ):
-        assert text in str(error.value)
 
 
 @pytest.mark.parametrize("constant", [0.0, 5e3, -1e7, 1e12, 1e15])
@@ -125,7 +92,9 @@ def test_the_spread_is_the_distance_to_the_k_th_nearest_other_score(scores, n):
     k = max(1, len(whole) // 10)
     nearest = np.sort(np.abs(whole - whole[:, None]), axis=1)
     expected = nearest[:, k] if k < len(whole) else np.zeros(1)
-    assert np.array_equal(_spread(whole[:n], whole), expected[:n])
+    allowed = TOLERANCE * expected
+    assert not difference((whole + 0.99 * allowed)[:n], whole, TOLERANCE)
+    assert difference((whole + 1.01 * allowed + 1e-12)[:n], whole, TOLERANCE)
 
 
 class Magnitude:

@@ -1,9 +1,7 @@
 """The command line: answers, exit codes, and what is said where."""
 
 import contextlib
-import csv
 import io
-import json
 import os
 import re
 import shlex
@@ -19,7 +17,6 @@ from helpers_split import make_split
 
 from oodd_eval.cli import listing
 from oodd_eval.cli import main as cli
-from oodd_eval.metrics.catalogue import NAMES
 
 
 @pytest.fixture
@@ -171,15 +168,6 @@ def test_an_unavailable_detector_is_listed_with_the_command_and_fails_when_run(
     assert "8 unavailable in" in out
 
 
-def test_the_device_is_no_part_of_a_cell(run):
-    selected = ("run", "--env", "cartpole", "--split", "tiny", "--anomaly", "iid", "--collect-only")
-    _, out, _ = run(*selected, "--detector", "npn,clock", "--device", "auto")
-    assert out.splitlines()[:2] == [
-        "tiny/cartpole/iid::npn[h=1,seed=0]",
-        "tiny/cartpole/iid::clock[h=1,seed=0]",
-    ]
-
-
 def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, failing):
     (tmp_path / "run.toml").write_text(
         'detector = ["clock", "random"]\nenv = "all"\nsplit = "tiny"\nhorizon = [1, 2]\n'
@@ -284,31 +272,6 @@ def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
     file.write_text(before.replace("0.5", "0.9"))
     assert "90.0" in run("show", "oodd-results", "--stored", "--markdown")[1]
     assert "90.0" not in run("show", "oodd-results", "--markdown")[1]
-
-
-def test_show_prints_every_metric_by_anomaly(run, clock):
-    shown = ("show", clock, "--stored", "--detector", "clock", "--metric")
-    for metric in NAMES:
-        code, out, err = run(*shown, metric)
-        assert re.search(r"^clock: .* by anomaly$", out, re.MULTILINE), err
-        assert code == 0
-    assert "clock: Missed at 5 % (%) by anomaly" in run(*shown, "missed_at_5pct")[1]
-    code, out, err = run(*shown, "missed_at_2pct")
-    assert code == 4
-    assert "did you mean 'missed_at_5pct'" in out + err
-
-
-def test_show_prints_a_line_a_cell_as_csv_and_json(run, clock):
-    code, out, _ = run("show", clock, "--csv", "--stored", "--env", "cartpole", "-k", "iid")
-    assert code == 0
-    (row,) = csv.DictReader(io.StringIO(out))
-    code, out, _ = run("show", clock, "--json", "-k", "iid or gravity")
-    iid, gravity = json.loads(out)
-    assert (iid["anomaly"], gravity["anomaly"]) == ("iid", "gravity")
-    assert float(row["auc_matched"]) == iid["auc_matched"] == 0.5
-    assert row["seconds_fit"]
-    assert (iid["delay"] is None) == (row["delay"] == "")
-    assert run("show", clock, "--csv", "-k", "nothing")[0] == 5
 
 
 def test_two_rows_of_one_run_are_compared(run):
@@ -450,14 +413,6 @@ def test_a_shell_completes_by_the_printed_script(shell):
         assert done.stdout == b"leaderboard\n"
 
 
-def test_options_with_several_words_take_all_of_them():
-    options = parse("oodd-eval leaderboard submit --primary a 'b[h=1,n=2]' -q out")
-    assert options.primary == ("a", "b[h=1,n=2]")
-    assert (options.verbosity, str(options.directory)) == (-1, "out")
-    assert parse("oodd-eval reproduce --render-only --records a b").render_only
-    assert parse("oodd-eval show -v out").verbosity == 1
-
-
 def test_info_describes_detectors_environments_and_anomalies(run):
     code, out, _ = run("info", "rf")
     assert code == 0
@@ -471,12 +426,3 @@ def test_info_describes_detectors_environments_and_anomalies(run):
     code, _, err = run("info", "gravty")
     assert code == 4
     assert "did you mean 'gravity'" in err
-
-
-def test_records_say_where_they_are_from(clock):
-    (line, *_) = (clock / "records.jsonl").read_text().splitlines()
-    record = json.loads(line)
-    assert record["provenance"]["command"] == f"oodd-eval {' '.join(CLOCK)}"
-    assert {"oodd_eval", "git_commit", "python", "time"} <= set(record["provenance"])
-    assert record["plugin_source"]
-    assert (clock / "scores" / f"{record['scores']}.h5").exists()

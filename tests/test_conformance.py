@@ -73,11 +73,9 @@ def must_conform(name, horizon, parameters):
         expected_failures=EXPECTED_FAILURES.get(name),
     )
     assert report.ok, report
-    assert sum(result.status == "passed" for result in report.results) >= 30
+    assert sum(result.status == "passed" for result in report.results) >= 22
 
 
 def test_no_plugin_is_left_out():
     assert not PLUGINS.broken
-    assert {"random", "persistence", "clock", "comb", "range", "mahalanobis", "rf", "rf-ewma",
-            "riqn", "riqn-ms", "riqn-r", "n-riqn", "npn", "mewma", "mewma-a",
-            "pe", "pe-a", "pe-step", "pe-step-a"} <= set(PLUGINS.offers)  # fmt: skip
+    assert {*SMALL, "random", "mewma"} - {*ADAPTERS} <= {*PLUGINS.offers}

@@ -74,13 +74,14 @@ def test_what_was_fitted_is_kept(example, tmp_path):
 def swimmer(monkeypatch):
     """The specs of the swimmer, known in this process as long as the test runs."""
     pytest.importorskip("mujoco", reason="needs the extra mujoco")
-    from oodd_eval.data import own
+    from oodd_eval.data import registry
 
     monkeypatch.syspath_prepend(str(EXAMPLE.parent / "oodd-swimmer"))
     import oodd_swimmer
 
-    own.register([*oodd_swimmer.oodd_environments(), *oodd_swimmer.oodd_anomalies()])
-    yield own
+    specs = [*oodd_swimmer.oodd_environments(), *oodd_swimmer.oodd_anomalies()]
+    registry.register(specs)
+    yield specs
     forget_own()
 
 
@@ -90,7 +91,7 @@ def test_the_swimmer_swims_and_passes_its_checks(swimmer):
     from oodd_recording.record import evaluate_policy
 
     assert evaluate_policy("swimmer", load_policy("swimmer"), episodes=3).min() > 60
-    for spec in swimmer.registered():
+    for spec in swimmer:
         assert not [
             wrong for _, carry_out in custom_checks(spec, "swimmer") if (wrong := carry_out())
         ]

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import re
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import Executor, RunSettings, open_executor
+from oodd_eval.scoring.executors import Executor, RunSettings, check_executor
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
@@ -64,12 +63,7 @@ def ordered(job, tiny_split, limits=Limits(), stop=NEVER.is_set, **changes):  # 
 )
 def test_an_executor_that_does_not_exist_is_refused(name):
     with pytest.raises(UsageError, match="expected 'local' or 'dask://HOST:PORT'"):
-        open_executor(RunSettings(executor=name), None, None)
-
-
-def test_the_local_executor_uses_all_cores_unless_told():
-    assert open_executor(RunSettings(jobs=3), None, None).jobs == 3
-    assert open_executor(RunSettings(), None, None).jobs == len(os.sched_getaffinity(0))
+        check_executor(name)
 
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):

@@ -10,7 +10,6 @@ import pytest
 from helpers_simulate import Reflex
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oodd_recording import faults
 from oodd_recording.environments import make
 from oodd_recording.faults import make_fault
 from oodd_recording.policies import load_policy
@@ -347,7 +346,3 @@ def faults_of_noise(setup):
 
     add = _noise(setup, 7)
     return np.array([add(np.zeros(4, np.float32)) for _ in range(2000)]) / spread_of("cartpole")
-
-
-def test_every_kind_has_a_maker():
-    assert faults.MAKERS.keys() == ANOMALIES.keys()

@@ -8,8 +8,7 @@ from helpers_plugins import install
 from oodd_eval.data.split import load_split
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import FitStore, ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
@@ -52,11 +51,6 @@ class Mean:
             log.write("load\\n")
         self.mean = json.loads((directory / "mean.json").read_text())
 
-class Cannot(Mean):
-    def save(self, directory):
-        (directory / "half").write_text("half")
-        raise RuntimeError("disk is not to my taste")
-
 class Forgets(Mean):
     def load(self, directory):
         raise RuntimeError("forgot how")
@@ -67,7 +61,6 @@ def oodd_detectors():
     return [
         DetectorSpec("mean", Mean, "mean", **common),
         DetectorSpec("mean-too", Mean, "same fit", fit_name="mean", **common),
-        DetectorSpec("cannot", Cannot, "cannot save", **common),
         DetectorSpec("forgets", Forgets, "cannot load", **common),
     ]
 """

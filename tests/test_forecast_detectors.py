@@ -1,8 +1,6 @@
 """riqn, riqn-ms, n-riqn and npn: loss, learned distributions, rollouts, and the score contract."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from helpers_saved import assert_zero_scales_are_refused
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms, riqn_r
 from oodd_torch import forecast
-from oodd_torch.forecast import Forecaster, arrange, quantile_levels, rollouts
+from oodd_torch.forecast import Forecaster, arrange, rollouts
 from oodd_torch.gru import Sequence
 from oodd_torch.network import GRID, Architecture, Ensemble
 from oodd_torch.training import (
@@ -217,22 +215,6 @@ def test_training_lowers_the_held_out_loss():
     assert max(after) < 0.7 * min(before)
 
 
-NO_SYMPY = """
-import sys
-import numpy as np
-from oodd_eval import Trajectory
-from oodd_riqn import riqn
-
-rows = np.random.default_rng(0).normal(size=(4, 40, 2))
-riqn(members=1, updates=1).fit([Trajectory(r, np.zeros((39, 1))) for r in rows])
-assert "sympy" not in sys.modules
-"""
-
-
-def test_a_fit_does_without_sympy_whose_import_takes_half_a_second():
-    subprocess.run([sys.executable, "-c", NO_SYMPY], check=True)
-
-
 def test_an_update_sees_pieces_of_whole_episodes_in_turn_without_padding():
     """Readers together see every transition once a round; the first step of each is marked."""
     episodes = [w.observations for n in (30, 10, 21) for w in waves(1, n, 2, seed=n)]
@@ -398,12 +380,6 @@ def test_riqn_r_scores_by_the_median_in_nominal_distances(tmp_path):
     assert np.nanmean(np.concatenate(other.score_many(waves(9, seed=5)))) == pytest.approx(
         1, abs=0.3
     )
-
-
-def test_levels_depend_on_seed_and_time_alone():
-    whole = quantile_levels(3, range(10), 2, 2, 4, 3)
-    assert np.array_equal(whole[4:6], quantile_levels(3, range(4, 6), 2, 2, 4, 3))
-    assert not np.array_equal(whole, quantile_levels(4, range(10), 2, 2, 4, 3))
 
 
 def test_one_fit_serves_other_horizons_beyond_one_and_samples(tmp_path):

@@ -14,10 +14,10 @@ import pytest
 from oodd_eval import evaluate, live, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data import logs
-from oodd_eval.data.export import export
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.importing import import_data
 from oodd_eval.data.logs import FORMATS, quantity
+from oodd_eval.data.logs.minari import export
 from oodd_eval.errors import TrajectoryError, UsageError
 
 ROWS, SENSORS = 60, 3

@@ -20,9 +20,7 @@ from oodd_eval.metrics.bootstrap import (
     cell_samples,
     drawn_cell,
     mean_interval,
-    mean_over_cells,
     mean_samples,
-    nan_mean,
     resampled,
     sample_cells,
 )
@@ -36,18 +34,6 @@ def interval(contribution, environment="", kind="mean"):
 
 def samples(cells):
     return sample_cells([drawn_cell(*cell) for cell in cells])
-
-
-def test_every_resample_draws_n_trajectories():
-    weights = bootstrap_weights(7, resamples=50)
-    assert weights.shape == (50, 7)
-    assert (weights.sum(axis=1) == 7).all()
-
-
-def test_same_seed_and_key_same_weights():
-    assert np.array_equal(bootstrap_weights(9, key="ant"), bootstrap_weights(9, key="ant"))
-    assert not np.array_equal(bootstrap_weights(9, key="ant"), bootstrap_weights(9, key="hopper"))
-    assert not np.array_equal(bootstrap_weights(9), bootstrap_weights(9, seed=1))
 
 
 def test_a_resample_is_the_metric_of_the_drawn_trajectories():
@@ -76,12 +62,6 @@ def test_an_interval_does_not_depend_on_what_is_computed_beside_it():
     alone = [interval(c, "ant") for c in cells]
     assert alone[::-1] == [interval(c, "ant") for c in cells[::-1]]
     assert bounds(samples([("ant", 0, cells[0])]), cells[0].value, [10]) == alone[0]
-
-
-def test_differences_are_paired():
-    noise = np.random.default_rng(2).normal(size=30)
-    first, second = (samples([("ant", 0, mean_of(noise + shift))]) for shift in (0.1, 0.0))
-    assert bounds(first - second, 0.1, [30]) == pytest.approx((0.1, 0.1))
 
 
 def test_differences_over_several_seeds_are_paired():
@@ -117,13 +97,6 @@ def test_undefined_cells_are_left_out_of_a_mean_and_undefined_seeds_leave_out_th
     seeds = samples([("ant", 0, nothing), ("ant", 1, two)])
     assert set(seeds[~np.isnan(seeds)]) == {2.0}
     assert np.isnan(seeds).mean() == pytest.approx(0.75, abs=0.03)
-
-
-def test_mean_over_cells_leaves_undefined_cells_out_and_counts_seeds_alike():
-    assert nan_mean([1.0, NAN, 3.0]) == 2
-    assert mean_over_cells([(0, 1.0), (0, NAN), (1, 5.0), (1, 7.0), (2, NAN)]) == 3.5
-    assert math.isnan(mean_over_cells([]))
-    assert math.isnan(mean_over_cells([(0, NAN)]))
 
 
 def test_cells_of_one_environment_stay_dependent():
@@ -209,15 +182,6 @@ def test_a_mean_over_cells_is_that_of_their_resamples():
     some = mean_samples([cell_samples("ant", terms[i]) for i in (1, 3, 5)])
     np.testing.assert_allclose(sample_cells([cells.only((1, 3, 5))]), some, rtol=1e-12)
     assert cells.values == pytest.approx([one.value for one in terms], nan_ok=True)
-
-
-def test_an_interval_contains_its_value():
-    rng = np.random.default_rng(5)
-    for kind in ("mean", "share", "exact"):
-        for n in (1, 2, 3, 10):
-            cell = mean_of((rng.random(n) < 0.3).astype(float))
-            low, high = interval(cell, kind=kind)
-            assert low <= cell.value <= high
 
 
 # -- coverage -------------------------------------------------------------------------------------

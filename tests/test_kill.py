@@ -1,6 +1,5 @@
 """A run that is killed at any moment loses no finished unit, and ends as if it never had been."""
 
-import contextlib
 import json
 import signal
 
@@ -9,8 +8,7 @@ import pytest
 from helpers_plugins import install
 from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
 
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import FitStore, ResultsDirectory
 
 pytestmark = pytest.mark.slow
 
@@ -127,20 +125,6 @@ def test_killed_at_chosen_points_it_ends_like_an_uninterrupted_run(tiny_split, p
         assert FitStore(killed / "fitted").find(fit.name), "a fit is not whole"
 
 
-def test_finished_units_are_not_fitted_again_after_a_kill(tiny_split, plugin, tmp_path):
-    log, output = tmp_path / "fits", tmp_path / "out"
-    process = start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1)
-    assert wait_until(lambda: len(list((output / "scores").glob("slow-*.h5"))) >= 2)
-    process.kill()
-    process.communicate()
-    finished = len(list((output / "scores").glob("slow-*.h5")))
-    begun = fits_in(log)
-    assert wait_until(lambda: not workers_of(f"RUN={output}"))
-    finish(start(tiny_split, plugin, log, output, seeds="0,1,2", jobs=1))
-    assert len(begun) - finished in (0, 1)  # the one that was under way
-    assert len(fits_in(log)) == 6 + len(begun) - finished
-
-
 def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, plugin, tmp_path):
     log, output = tmp_path / "fits", tmp_path / "out"
     process = start(tiny_split, plugin, log, output, seeds="0,1", jobs=1, ENDLESS="1")
@@ -153,15 +137,3 @@ def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, pl
     assert "interrupted" in printed
     assert {r.seed for r in ResultsDirectory(output).records()} == {0}
     assert not workers_of(f"RUN={output}")
-
-
-def test_records_are_there_while_the_run_goes_on(tiny_split, plugin, tmp_path):
-    output = tmp_path / "out"
-    process = start(tiny_split, plugin, tmp_path / "fits", output, pause=1, jobs=1)
-    with contextlib.ExitStack() as stack:
-        stack.callback(process.communicate)
-        stack.callback(process.kill)
-        assert wait_until((output / "records.jsonl").exists)
-        assert ResultsDirectory(output).records()
-        assert process.poll() is None
-        assert len(list((output / "scores").glob("slow-*.h5"))) < 8

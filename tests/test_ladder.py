@@ -13,12 +13,20 @@ from oodd_recording.build import build_split
 from oodd_recording.values import bound_of, unit_of
 
 from oodd_eval.cli.main import main
-from oodd_eval.data import ladder
-from oodd_eval.data.condition import FRACTIONS, LEVELS, RUNGS, Condition
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, SplitDefinition
-from oodd_eval.data.ladder import WHOLE, all_rungs_of, conditions_of, rungs_of, strength_of
+from oodd_eval.data import condition
+from oodd_eval.data.condition import (
+    FRACTIONS,
+    LEVELS,
+    RUNGS,
+    WHOLE,
+    Condition,
+    all_rungs_of,
+    conditions_of,
+    rungs_of,
+    strength_of,
+)
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, SplitDefinition
 from oodd_eval.data.split import load_split
-from oodd_eval.errors import SplitError, UnknownNameError
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +41,7 @@ STRENGTHS = {
 
 @pytest.fixture
 def own_ladder(monkeypatch):
-    monkeypatch.setattr(ladder, "read_ladder", lambda: STRENGTHS)
+    monkeypatch.setattr(condition, "read_ladder", lambda: STRENGTHS)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,7 @@ def graded(base, **changes):
 
 
 def test_strengths_rise_from_rung_to_rung_within_their_bound():
-    for environment, kinds in ladder.read_ladder().items():
+    for environment, kinds in condition.read_ladder().items():
         for kind, entry in kinds.items():
             where = f"{environment} {kind}"
             assert entry["unit"] == unit_of(environment, kind), where
@@ -87,35 +95,16 @@ def test_strengths_rise_from_rung_to_rung_within_their_bound():
                     assert name == [*rungs][-1], where
 
 
-def test_every_kind_has_strengths_in_every_environment():
-    found = {e: set(kinds) for e, kinds in ladder.read_ladder().items()}
-    assert found == {e: set(ANOMALIES) for e in ENVIRONMENTS}
-    for environment in ENVIRONMENTS:
-        assert set(conditions_of("paper", environment)) == {Condition(a, "paper") for a in TABLE1}
-        for anomaly in TABLE1:
-            assert strength_of(environment, anomaly, "paper") > 0
-
-
 def test_only_robots_have_strengths_for_whole_episodes_and_splits_without_a_cap_take_them():
     for environment, info in ENVIRONMENTS.items():
         capped, whole = (conditions_of("paper", environment, cap) for cap in (300, None))
-        for kind in ladder.read_ladder()[environment]:
+        for kind in condition.read_ladder()[environment]:
             own = WHOLE in all_rungs_of(environment, kind)
             assert own == (kind in TABLE1 and not info.discrete), (environment, kind)
         for kind in TABLE1:
             expected = "paper" if info.discrete else WHOLE
             assert whole[Condition(kind, "paper")] == strength_of(environment, kind, expected)
             assert capped[Condition(kind, "paper")] == strength_of(environment, kind, "paper")
-
-
-def test_unknown_rungs_and_what_is_not_calibrated_are_refused(own_ladder):
-    assert strength_of("cartpole", "iid", "4th") == 0.5
-    with pytest.raises(UnknownNameError, match="rung of iid in cartpole"):
-        strength_of("cartpole", "iid", "kept50")
-    with pytest.raises(SplitError, match="data calibrate --env ant"):
-        rungs_of("ant", "iid")
-    with pytest.raises(SplitError, match="data calibrate --env ant"):
-        conditions_of("ladder", "ant")
 
 
 # Calibration
@@ -198,17 +187,6 @@ def test_a_step_is_found_and_levels_on_it_share_its_two_sides(measured):
         assert (rung["kept_low"], rung["kept"], rung["kept_high"]) == (kept, kept, kept)
 
 
-def test_a_kind_that_costs_nothing_stops_at_its_bound_and_says_so(measured):
-    go, _, _ = measured
-    rungs = go(kinds=["stuck"])["stuck"]["rungs"]
-    assert [*rungs] == [*FRACTIONS, "kept99"]
-    assert rungs["kept99"] == {
-        "strength": 1.0, "low": 1.0, "high": 1.0, "kept": pytest.approx(1, abs=0.01),
-        "kept_low": pytest.approx(1, abs=0.01), "kept_high": pytest.approx(1, abs=0.01),
-        "reached": False,
-    }  # fmt: skip
-
-
 def test_a_calibration_goes_on_where_it_was_interrupted(measured):
     go, calls, place = measured
     whole = go()
@@ -252,12 +230,6 @@ def test_crossings_worked_by_hand():
     assert [calibrate.nearest(flat, level) for level in (0.99, 0.5)] == [1, 2]
 
 
-def test_what_is_kept_counts_negative_returns_alike():
-    nominal = np.array([-80.0, -80.0])
-    assert calibrate.kept_shares(np.array([-88.0, -88.0]), nominal) == pytest.approx(0.9)
-    assert calibrate.kept_shares(np.array([90.0]), np.array([100.0])) == pytest.approx(0.9)
-
-
 # Splits
 
 
@@ -280,14 +252,6 @@ def test_a_ladder_has_its_bases_episodes_and_one_part_a_rung(
     before = (tmp_path / "up" / "cartpole.h5").stat().st_mtime_ns
     build_split(graded(base), tmp_path / "up", **FEW)
     assert (tmp_path / "up" / "cartpole.h5").stat().st_mtime_ns == before
-
-
-def test_other_strengths_are_built_again(base, own_ladder, in_process, tmp_path, monkeypatch):
-    first = load_split(build_split(graded(base), tmp_path / "up", **FEW)).digest
-    other = json.loads(json.dumps(STRENGTHS))
-    other["cartpole"]["gravity"]["rungs"]["kept99"]["strength"] = 0.6
-    monkeypatch.setattr(ladder, "read_ladder", lambda: other)
-    assert load_split(build_split(graded(base), tmp_path / "up", **FEW)).digest != first
 
 
 def test_noise_is_part_of_the_recipe_and_of_every_episode(base, in_process, tmp_path):

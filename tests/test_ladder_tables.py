@@ -8,19 +8,17 @@ import pytest
 from helpers_records import example, make_record
 from rich.console import Console
 
-from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
-from oodd_eval.data.ladder import Rung
+from oodd_eval.data.condition import Rung
 from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.results import strengths
 from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
-from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
-from oodd_eval.results.strengths import DETECTION, Strengths, at_strength, curve, thresholds
-from oodd_eval.results.tables import ladder
+from oodd_eval.results.strengths import DETECTION, Strengths, curve, thresholds
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -74,7 +72,7 @@ def rows_of(table):
 
 
 def table_of(records, start, **settings):
-    made = ladder.tables(Board(records), **settings)
+    made = strengths.strength_tables(Board(records), **settings)
     return next(t for t in made if t.title.startswith(start))
 
 
@@ -100,17 +98,6 @@ def test_the_overview_has_multiples_of_riqns_thresholds_the_lowest_first():
     assert shares == ["0.0", "0.0", "25.0", "58.3"]
 
 
-def test_without_riqn_thresholds_are_in_units_of_what_costs_one_percent():
-    table = table_of([r for r in RECORDS if r.detector != "riqn"], "Detection thresholds, lower")
-    assert rows_of(table)["rf"]["threshold"].startswith(">6.35 [")  # (8 * 8 * 4) ** (1/3)
-    assert "of the strength that costs 1 % of the return" in table.note
-
-
-def test_matched_auc_is_shown_by_rung():
-    rows = rows_of(table_of(RECORDS, "Matched AUC"))
-    assert [rows["pe"][n] for n in TIMES] == ["75.0", "87.5", "100.0", "100.0"]
-
-
 def test_means_by_kind_say_on_which_side_censored_ones_are():
     rows = rows_of(table_of(RECORDS, "Detection thresholds by anomaly"))
     assert rows["riqn"] == {"detector": "riqn", "iid": "4", "gravity": "4"}
@@ -121,17 +108,6 @@ def test_means_by_kind_say_on_which_side_censored_ones_are():
     assert rows_of(table_of(mixed, "Detection thresholds by anomaly"))["rf"]["iid"] == "~2"
     rows = rows_of(table_of(RECORDS, "Detection thresholds by anomaly", intervals=True))
     assert rows["riqn"]["iid"].startswith("4 [")
-
-
-def test_one_rows_thresholds_are_shown_by_place():
-    table = table_of(RECORDS, "rf: detection thresholds", places=True)
-    assert rows_of(table) == {
-        "Ant": {"Environment": "Ant", "iid": "16", "gravity": ">4"},
-        "Hopper": {"Environment": "Hopper", "iid": "80", "gravity": ""},
-    }
-    table = table_of(RECORDS, "rf: detection thresholds", places=True, intervals=True)
-    # The one episode of four that is found may be drawn three times: 3/4, from 1 to 4.
-    assert rows_of(table)["Ant"]["gravity"] == ">4 [2.52, >4]"
 
 
 def test_a_place_with_a_missing_or_failed_rung_has_no_threshold():
@@ -165,34 +141,36 @@ def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
         return {n: r for n, r in usual(*place).items() if place[0] != "ant" or n != "kept90"}
 
     monkeypatch.setattr(of_records, "rungs_of", without)
-    found = {(r.environment, r.anomaly): r.strength for r in at_strength(RECORDS, "kept90")}
+    found = {
+        (r.environment, r.anomaly): r.strength for r in Strengths.of(RECORDS).at(RECORDS, "kept90")
+    }
     assert found["ant", "iid"] == found["ant", "gravity"] == "kept99"
     assert found["hopper", "iid"] == "kept90"
 
 
 def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
-    at_end = at_strength(RECORDS, "kept50")
+    at_end = Strengths.of(RECORDS).at(RECORDS, "kept50")
     assert {(r.environment, r.anomaly, r.strength) for r in at_end} == {
         ("ant", "iid", "kept50"), ("hopper", "iid", "kept50"), ("ant", "gravity", "kept90"),
     }  # fmt: skip
     # A rung that was not run is missing.
     fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
-    assert {r.environment for r in at_strength(fewer, "kept50")} == {"ant"}
+    assert {r.environment for r in Strengths.of(fewer).at(fewer, "kept50")} == {"ant"}
     fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
-    assert not at_strength(fewer, "kept50")
+    assert not Strengths.of(fewer).at(fewer, "kept50")
 
 
 def test_strengths_that_no_ladder_has_are_left_out():
     cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
     other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
     assert Strengths.of(other).rungs == {}
-    assert not ladder.tables(Board(other))
+    assert not strengths.strength_tables(Board(other))
     assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
 
 
 def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
     bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
-    assert [t.title for t in ladder.tables(Board(bare), places=True)] == [
+    assert [t.title for t in strengths.strength_tables(Board(bare), places=True)] == [
         "Matched AUC (%) by strength"
     ]
 
@@ -207,16 +185,6 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
         assert f"### {title}" in text
         assert title in shown.getvalue()
     assert "### rf: detection thresholds" in text
-
-
-def test_show_prints_thresholds(tmp_path, capsys):
-    ResultsDirectory(tmp_path).merge_records(RECORDS)
-    assert main(["show", str(tmp_path), "--stored"]) == 0
-    assert "Detection thresholds by anomaly" in capsys.readouterr().out
-    assert main(["show", str(tmp_path), "--stored", "--detector", "rf", "--intervals"]) == 0
-    out = capsys.readouterr().out
-    assert "rf: detection thresholds by anomaly" in out
-    assert ">4 [2.52, >4]" in out
 
 
 # Results
@@ -294,12 +262,6 @@ def test_strengths_of_ones_own_give_a_threshold_and_a_column_each():
     assert rows_of(table_of(records, "rf: detection", places=True))["tank"]["gravity"] == "0.224"
 
 
-def test_a_column_has_the_places_with_its_strength_alone():
-    records = own("rf", (0, 0, 1, 1)) + own("rf", (0.5, 0.5, 0.5, 0.5), environment="ant")[:2]
-    rows = rows_of(table_of(records, "Matched AUC"))
-    assert [rows["rf"][name] for name in GRAVITY] == ["62.5", "62.5", "100.0", "100.0"]
-
-
 def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
     (record,) = [
         r for r in RECORDS if r.detector == "rf" and r.position == ("hopper", "iid@kept90")
@@ -310,11 +272,3 @@ def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
     (rung,) = Strengths.of([other]).rungs["hopper", "iid"].values()
     assert rung.strength == 30.0
     assert math.isnan(rung.kept)
-
-
-def test_curves_of_ones_own_strengths_are_drawn_against_them():
-    pytest.importorskip("matplotlib")
-    (axis,) = Results(own("rf", (0, 0.25, 0.5, 1))).plot_ladder().axes
-    assert list(axis.lines[0].get_xdata()) == pytest.approx([*GRAVITY.values()])
-    assert list(axis.lines[0].get_ydata()) == pytest.approx([0, 25, 50, 100])
-    assert axis.get_xlabel() == "strength"

@@ -24,13 +24,13 @@ from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
 from oodd_eval.results import board as results_board
+from oodd_eval.results import tables
 from oodd_eval.results.board import Board, expected_cells
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric
 from oodd_eval.results.render.data import comparisons_csv, number, ranking_csv
 from oodd_eval.results.standings import cost_of, primary_settings, ranked
-from oodd_eval.results.tables import layout
 
 SEEDS = 12
 
@@ -204,9 +204,9 @@ def test_rows_that_were_not_run_again_stand_below_those_that_were():
     *above, last = found.ranks.standings
     assert (str(last.entry), last.below, last.primary, last.rank) == ("claimed", True, True, 1)
     assert above == alone.standings
-    rows = layout.ranking(found.ranks, found.trust).rows
+    rows = tables.ranking(found.ranks, found.trust).rows
     assert [rows[-1][i] for i in (0, 1, 3, 6)] == ["(1)", UNDEFINED, "claimed", "reported"]
-    assert any("run again on seeds of their own" in n for n in layout.ranking_notes(found.ranks))
+    assert any("run again on seeds of their own" in n for n in tables.ranking_notes(found.ranks))
     # Re-scored is not run again; and where nothing was, all rows are ranked.
     claims = [entry("official", official, trust="re-scored"), entry("stranger", best)]
     assert not any(s.below for s in sections(claims)[0].ranks.standings)
@@ -307,7 +307,7 @@ def test_equals_share_a_rank_and_a_letter_and_the_better_stand_before_the_trivia
         dataclasses.replace(r, detector="mine", horizon=1) if r.horizon == 10 else r
         for r in board()
     ]
-    table = layout.ranking(ranked(other), {})
+    table = tables.ranking(ranked(other), {})
     places = [(r[0], r[1], r[3]) for r in table.rows]
     assert set(places[:2]) == {("1", "a", "riqn"), ("1", "a", "mine")}
     assert places[2:] == [
@@ -319,10 +319,10 @@ def test_equals_share_a_rank_and_a_letter_and_the_better_stand_before_the_trivia
 
 def test_a_further_row_of_a_detector_is_a_variant_that_pushes_nobody_down():
     ranks = ranked(board())
-    places = [(r[0], r[3], r[4]) for r in layout.ranking(ranks, {}).rows]
+    places = [(r[0], r[3], r[4]) for r in tables.ranking(ranks, {}).rows]
     assert set(places[:2]) == {("1", "riqn", "Δ=1"), ("1", "riqn (variant)", "Δ=10")}
     assert [place[0] for place in places[2:]] == ["2", "3", UNDEFINED]
-    assert any("pushes no other row down" in line for line in layout.ranking_notes(ranks))
+    assert any("pushes no other row down" in line for line in tables.ranking_notes(ranks))
     # Another row may be declared primary.
     ten = {s.entry for s in ranks.standings if s.entry.horizon == 10}
     others = {s.entry for s in ranks.standings if s.entry.detector != "riqn"}
@@ -340,7 +340,7 @@ def test_a_primary_row_with_randomness_needs_three_seeds():
     clock = record("clock", [0.5] * SEEDS)
     for n in (1, 2):
         ranks = ranked([*seeds(n), clock])
-        assert f"Not ranked: riqn, {n} of 3 detector seeds." in layout.ranking_notes(ranks)
+        assert f"Not ranked: riqn, {n} of 3 detector seeds." in tables.ranking_notes(ranks)
         assert ranks.ranking.ranks == {"clock": 1}
     assert ranked([*seeds(3), clock]).ranking.ranks == {"riqn": 1, "clock": 2}
     # A variant is marked anyway.
@@ -368,7 +368,7 @@ def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
         }) if (r.setting, r.environment) == (Setting("riqn"), "ant") else r
         for r in board()
     ]  # fmt: skip
-    notes = layout.ranking_notes(ranked(undefined))
+    notes = tables.ranking_notes(ranked(undefined))
     assert "Without an alarm rank: riqn, undefined in 2 of 4 cells." in notes
     assert ranked(undefined).ranking.ranks == ranks.ranking.ranks
 
@@ -387,7 +387,7 @@ def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
 )  # fmt: skip
 def test_a_row_that_is_not_whole_is_listed_with_its_state_and_no_rank(records, row, state):
     ranks = ranked(records)
-    assert f"Not ranked: {row}, {state}." in layout.ranking_notes(ranks)
+    assert f"Not ranked: {row}, {state}." in tables.ranking_notes(ranks)
     standing = next(s for s in ranks.standings if str(s.entry) == row)
     assert (standing.rank, np.isnan(standing.wins)) == (None, True)
     assert ranks.ranking.ranks["clock"] >= 1
@@ -413,7 +413,7 @@ def test_win_rate_is_the_mean_over_the_other_rows():
     assert {str(s.entry): s.wins for s in ranks.standings} == {
         "a": (3 / 4 + 1) / 2, "b": (1 / 4 + 7 / 8) / 2, "c": (0 + 1 / 8) / 2
     }  # fmt: skip
-    table = layout.wins(ranks)
+    table = tables.wins(ranks)
     assert dict(zip(table.header, table.rows[1], strict=True)) == {
         "detector": "b", "a": "25", "b": "", "c": "88"
     }  # fmt: skip
@@ -430,8 +430,8 @@ def test_cost_counts_a_fit_once_for_all_its_anomalies():
     ]  # fmt: skip
     cost = cost_of(records)
     tiny = dataclasses.replace(record("clock", [0.5] * SEEDS), seconds_fit=8.4e-05)
-    assert layout.cost(ranked([tiny])).rows[0][3:] == ["< 0.001", "50", "100"]
-    assert layout.cost(ranked([make_record()])).rows[0][3:] == [UNDEFINED] * 3
+    assert tables.cost(ranked([tiny])).rows[0][3:] == ["< 0.001", "50", "100"]
+    assert tables.cost(ranked([make_record()])).rows[0][3:] == [UNDEFINED] * 3
     # 0.4 s for 20 000 steps.
     assert (cost.fit, cost.peak) == (2.5, 50.0)
     assert cost.step == pytest.approx(20.0)

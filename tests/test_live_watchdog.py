@@ -171,14 +171,6 @@ def test_endless_operation_keeps_its_promise_within_the_interval(name, episodes,
     assert promise.low < episodes * length / rate / 3600 / alarms < promise.high
 
 
-def test_a_promise_beyond_what_was_observed_says_so_and_has_a_wide_interval():
-    lengths = [Watchdog.fit("mewma", TRAIN, CALIBRATION, hours=h, rate=50) for h in (0.02, 10)]
-    assert lengths[0].rule.threshold < lengths[1].rule.threshold
-    short, long = (w.run_length for w in lengths)
-    assert long.high / long.low > short.high / short.low > 1
-    assert "by the shape of the tail" in lengths[1].promise
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -55,12 +55,6 @@ def test_auc_leaves_undefined_scores_out_and_needs_both_classes():
     assert math.isnan(auc(np.array([NAN]), np.array([1.0])))
 
 
-@given(st.lists(st.integers(-9, 9).map(float), min_size=4, max_size=20))
-def test_auc_does_not_change_under_a_monotone_transform(values):
-    a, b = np.array(values[::2]), np.array(values[1::2])
-    assert auc(a, b) == auc(2 * a + 1, 2 * b + 1)
-
-
 def test_paper_auc_compares_scores_from_the_onset_on_with_those_before():
     found = auc_contributions(arrays([0, 1, 5, 6]), arrays([3, 2, 1, 0]), [2])
     assert found["auc"].value == 1
@@ -80,11 +74,6 @@ def test_matched_comparisons_begin_at_the_effect_and_the_papers_at_the_onset():
     assert found["auc_matched"].value == 1
     assert found["auc"].value == found["auc_null"].value == 1
     assert auc_contributions(anomalous, twins, [1])["auc_matched"].value == 14 / 16
-
-
-def test_an_effect_beyond_the_end_of_the_twin_leaves_nothing_to_match():
-    found = auc_contributions(arrays([0, 1, 2, 9, 9]), arrays([0, 1, 2]), [1], [3])
-    assert [found[n].n for n in ("auc_matched", "auc_smoothed", "auc")] == [0, 0, 1]
 
 
 def test_unpaired_compares_with_the_next_twin_where_both_are():
@@ -127,18 +116,6 @@ def test_smoothed_auc_is_the_matched_auc_of_the_smoothed_scores(seed):
     assert found.numerator.tolist() == expected.numerator.tolist()
 
 
-def test_smoothing_helps_the_memoryless_and_not_what_accumulates_already():
-    rng = np.random.default_rng(9)
-    twins = list(rng.normal(size=(20, 400)))
-    anomalous = [b + 0.5 * (np.arange(400) >= 200) for b in rng.normal(size=(20, 400))]
-    weak = auc_contributions(anomalous, twins, [200] * 20)
-    assert weak["auc_smoothed"].value > weak["auc_matched"].value + 0.2
-    sums = [[smoothed(s) for s in part] for part in (anomalous, twins)]
-    strong = auc_contributions(*sums, [200] * 20)
-    gained = strong["auc_smoothed"].value - strong["auc_matched"].value
-    assert gained < 0.1
-
-
 def test_placebo_compares_each_twin_with_the_next():
     twins = arrays([0, 1, 1], [0, 2, 0], [0, 0, 0])
     found = auc_contributions(arrays(*[[0, 0, 0]] * 3), twins, [1, 1, 1])
@@ -151,10 +128,6 @@ def test_placebo_of_a_clock_is_one_half_although_twins_differ_in_length():
     assert auc_contributions(clock, clock, [30, 40, 50])["auc_placebo"].value == 0.5
 
 
-def test_placebo_of_a_single_twin_is_undefined():
-    assert math.isnan(auc_contributions(arrays([0, 1]), arrays([0, 1]), [1])["auc_placebo"].value)
-
-
 def test_clock_has_paper_auc_one_and_matched_auc_one_half():
     clock = [np.arange(n, dtype=float) for n in (80, 120, 95)]
     twins = [np.arange(100, dtype=float)] * 3
@@ -162,12 +135,6 @@ def test_clock_has_paper_auc_one_and_matched_auc_one_half():
     assert found["auc"].value == 1
     equal = auc_contributions(twins, twins, [30, 40, 50])
     assert equal["auc_matched"].value == equal["auc_placebo"].value == 0.5
-
-
-def test_a_constant_detector_has_every_auc_one_half():
-    flat = [np.zeros(50)] * 3
-    found = auc_contributions(flat, flat, [10, 20, 30])
-    assert {c.value for c in found.values()} == {0.5}
 
 
 def test_delay_counts_from_the_onset_and_may_be_zero():
@@ -202,11 +169,6 @@ def test_an_alarm_before_the_onset_is_not_a_detection():
     found = alarm_contributions(arrays([2, 0, 0]), arrays([0, 0, 0]), [1], RULE)
     assert found["missed"].value == 1
     assert math.isnan(found["delay"].value)
-
-
-def test_the_sum_is_not_reset_at_the_onset():
-    rule = AlarmRule(Standardization(0.0, 0.01), drift=0.0, threshold=1.0)
-    assert alarm_contributions(arrays([0.6, 0.6]), arrays([0, 0]), [1], rule)["delay"].value == 0
 
 
 def test_delay_null_is_the_twins_delay_at_its_partners_onset():

@@ -123,14 +123,6 @@ def test_the_workflow_runs_what_the_readme_says(address):
     )
 
 
-def test_what_needs_oodd_eval_waits_for_its_wheel_until_there_is_an_address(address):
-    *first, (last, lines) = workflow()
-    assert all("if" not in step for step, _ in first)
-    assert not any("oodd-eval" in line for _, own in first for line in own)
-    assert last.get("if", "") == ("" if address else "hashFiles('wheels/oodd_eval-*.whl') != ''")
-    assert len(lines) == 5
-
-
 def test_the_project_links_to_an_address_only_where_there_is_one(address):
     text = "".join(Project("slow").render().values())
     links = set(re.findall(r"https?://[^\s)\"]+", text))

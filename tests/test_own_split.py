@@ -9,15 +9,14 @@ from helpers_split import make_group, make_split
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.condition import Condition, in_suite_order
-from oodd_eval.data.export import export
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity, in_order
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.info import describe
 from oodd_eval.data.layout import MANIFEST, own_facts, write_environment, write_manifest
 from oodd_eval.errors import SplitError, UsageError
+from oodd_eval.results import tables
 from oodd_eval.results.board import boards
-from oodd_eval.results.reference import read_record_set, write_reference
-from oodd_eval.results.tables import layout
+from oodd_eval.results.compare import read_record_set, write_reference
 
 OWN = {"slip": "dynamics", "fog": "sensor"}
 LIKE = {"slip": "gravity", "fog": "iid"}
@@ -84,10 +83,10 @@ def test_a_run_scores_what_each_environment_has_and_tables_name_it(place):
     (board,) = boards(results.records)
     assert board.environments == ["cartpole", "valve", "pump"]
     assert board.in_group("dynamics") == ["gravity", "slip"]
-    table = layout.by_anomaly(board, board.entries[0])
+    table = tables.by_anomaly(board, board.entries[0])
     assert table.header == ["Environment", "gravity", "slip", "fog"]
     assert [row[0] for row in table.rows] == ["CartPole", "valve", "pump"]
-    assert not [line for line in layout.notes(board) if "without" in line]
+    assert not [line for line in tables.notes(board) if "without" in line]
 
 
 def test_results_are_shown_described_and_kept_as_a_reference(place, tmp_path, capsys, monkeypatch):
@@ -110,18 +109,6 @@ def test_results_are_shown_described_and_kept_as_a_reference(place, tmp_path, ca
 def test_an_unknown_anomaly_of_the_chosen_environments_is_named(place):
     with pytest.raises(UsageError, match=r"unknown anomaly 'gravity'.*Known: slip"):
         evaluate("clock", place, environments="pump", anomalies="gravity")
-
-
-def test_an_export_knows_which_actions_are_discrete(place, tmp_path):
-    export(load_split(place), tmp_path, environments=["valve", "pump"])
-    for name, kind in (("valve", "Discrete"), ("pump", "Box")):
-        file = tmp_path / "oodd" / "mine" / name / "test-slip-v0" / "data" / "metadata.json"
-        assert json.loads(json.loads(file.read_text())["action_space"])["type"] == kind
-
-
-def test_a_copy_is_fetched(place, tmp_path):
-    split = fetch(str(place), output=tmp_path / "copy").split
-    assert split.environments == ("cartpole", "valve", "pump")
 
 
 def edited(place, change):

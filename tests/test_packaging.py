@@ -30,13 +30,13 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_eval/py.typed",
         "oodd_common/py.typed",
         "oodd_riqn/py.typed",
-        "oodd_recording.train/train.py",
+        "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
         "oodd_eval/plugins/template/templates/pyproject.toml.in",
         "oodd_eval/plugins/template/templates/gitignore.in",
         "oodd_eval/leaderboard/published.jsonl.gz",
     } <= names
-    assert "recording/oodd_recording/frozen/ant.npz" in names
+    assert "oodd_recording/frozen/ant.npz" in names
 
 
 def test_what_is_handed_out_works_in_an_environment_of_its_own(tmp_path):

@@ -56,15 +56,6 @@ def test_nominal_values_are_those_of_the_simulators(environment):
     simulator.close()
 
 
-def test_every_environment_and_kind_has_words_and_no_other():
-    assert set(page._WORDS["environment"]) == set(ENVIRONMENTS)
-    bases = {kind for kind in ANOMALIES if not kind.endswith("-intermittent")}
-    assert set(page._WORDS["kind"]) == bases
-    known = {*ENVIRONMENTS, "all", "discrete", "continuous"}
-    assert all(set(words) <= known for words in page._WORDS["kind"].values())
-    assert all(page._meaning(e, kind).endswith(".") for e in ENVIRONMENTS for kind in ANOMALIES)
-
-
 def episodes(changed, rows=200, onset=60, sensors=None):
     """An episode of CartPole with some sensors changed from the onset on, and its twin of zeros."""
     twin = np.zeros((rows, 4), np.float32)

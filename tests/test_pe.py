@@ -13,7 +13,6 @@ from oodd_pe.statistic import Charts, Evidence, Onsets, Running, deviance
 from scipy import stats
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError
 
 SMALL = {"updates": 300, "width": 16, "batch": 64}
 
@@ -225,14 +224,6 @@ def test_sums_count_less_while_the_sensors_stand_still(charts):
     assert moving[1, -1] > 2
 
 
-def test_running_charts_continue_where_they_ended(charts):
-    whole = evidence(60)
-    running = Running(charts)
-    parts = [Evidence(*(v[i : i + 7] for v in whole)) for i in range(0, 60, 7)]
-    found = np.concatenate([sums(charts, part, running) for part in parts], axis=1)
-    np.testing.assert_allclose(found, sums(charts, whole))
-
-
 def test_onsets_by_hand(charts):
     r = np.zeros((30, 2))
     r[20:] = 6.0
@@ -262,18 +253,6 @@ def test_the_sensor_that_is_named_stays_that_of_the_onset(fitted):
     assert set(found.onsets[80:84]) == {80}
     assert (found.shares[80:84].argmax(axis=1) == 1).all()
     np.testing.assert_allclose(np.nansum(found.shares[1:], axis=1), 1.0)
-
-
-def test_a_stream_is_explained_as_the_whole_episode_is(fitted):
-    detector, x = fitted["pe-a"], corrupted(episode(100), 80, 1, 2.0)
-    whole = detector.explain(x)
-    detector.reset()
-    found = []
-    for row in zip(x.observations, [None, *x.actions], strict=True):
-        detector.update(*row)
-        found.append(detector.explain_last())
-    np.testing.assert_allclose([shares for shares, _ in found], whole.shares, atol=1e-9)
-    np.testing.assert_array_equal([onset for _, onset in found], whole.onsets)
 
 
 def test_a_robot_may_reuse_the_arrays_of_its_readings_and_commands(fitted):
@@ -306,19 +285,6 @@ def test_the_step_row_is_the_chart_without_memory_of_the_same_fit(fitted, tmp_pa
     charts = fitted["pe-a"].charts_
     first = charts.statistic(sums(charts, fitted["pe-a"]._evidence(x)))[0]
     np.testing.assert_array_equal(step.score(x)[1:], first)
-
-
-def test_no_score_depends_on_actions_without_them(fitted):
-    x = NOMINAL[0]
-    np.testing.assert_array_equal(fitted["pe"].score(x), fitted["pe"].score(x.without_actions()))
-    other = Trajectory(x.observations, x.actions + 1)
-    assert (fitted["pe-a"].score(x)[5:] != fitted["pe-a"].score(other)[5:]).any()
-
-
-def test_more_memories_is_another_fit(fitted, tmp_path):
-    fitted["pe"].save(tmp_path)
-    with pytest.raises(FittedStateError, match="memories"):
-        make_pe("pe", **SMALL, memories=[0.5]).load(tmp_path)
 
 
 def test_a_saved_scale_of_zero_is_refused(fitted, tmp_path):

@@ -101,25 +101,6 @@ def test_digest_covers_every_weight_and_ignores_order_and_byte_order():
         assert policy_digest(p | {name: changed}) != digest, name
 
 
-def test_pickled_objects_are_not_opened(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return exec, ("raise SystemExit('unpickled')",)
-
-    file = tmp_path / "hopper.npz"
-    np.savez(file, W1=np.array([Trap()], dtype=object))
-    with pytest.raises(PolicyError, match="expected numbers"):
-        load_policy("hopper", file)
-
-
-@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04broken"])
-def test_a_damaged_file_is_named(tmp_path, content):
-    file = tmp_path / "mine.npz"
-    file.write_bytes(content)
-    with pytest.raises(PolicyError, match=r"mine\.npz"):
-        load_policy("hopper", file)
-
-
 def test_a_policy_of_another_algorithm_environment_or_with_nan_is_refused(tmp_path, hopper):
     with pytest.raises(PolicyError, match=r"15 sensors to 3 actions, expected 22 and 6"):
         load_policy("walker2d", hopper)
@@ -135,9 +116,10 @@ def test_a_policy_of_another_algorithm_environment_or_with_nan_is_refused(tmp_pa
     [
         (td3() | {"W2": np.zeros((8, 5), "f4")}, "do not fit"),
         (td3() | {"b1": np.array(["1"] * 7)}, "expected numbers"),
+        ({"W1": np.array([{}], dtype=object)}, "expected numbers"),
         (np.zeros(3), r"hopper\.npz cannot be read"),
     ],
-    ids=["layers", "text", "single array"],
+    ids=["layers", "text", "objects", "single array"],
 )
 def test_arrays_that_make_no_policy_are_refused(tmp_path, arrays, message):
     with (tmp_path / "hopper.npz").open("wb") as out:

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.cli.main import main
-from oodd_eval.cli.terminal import TerminalReporter, summary
+from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
-from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.terminal import print_table
+from oodd_eval.results.render.text import print_table
 from oodd_eval.results.report import Report
-from oodd_eval.results.tables import Table, layout
+from oodd_eval.results.tables import Table
 
 
 def rendered(records, name="markdown", **settings):
@@ -164,7 +164,7 @@ def test_many_findings_are_folded_and_few_are_not():
 
 
 def test_separability_is_by_mean_matched_auc_with_failures_last():
-    table = layout.separability(Board(example()))
+    table = tables.separability(Board(example()))
     assert [row[0] for row in table.rows] == ["riqn", "persistence", "clock", "rf"]
     # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
     assert cells(table, 0) == {
@@ -176,7 +176,7 @@ def test_separability_is_by_mean_matched_auc_with_failures_last():
 
 
 def test_table_five_has_the_papers_layout_and_averages_without_trivial_rows():
-    sensor, dynamics = layout.anomaly_groups(Board(example()))
+    sensor, dynamics = tables.anomaly_groups(Board(example()))
     assert sensor.header == ["Environment", "Result", "riqn", "rf", "persistence", "clock", "AVG"]
     assert [row[:2] for row in sensor.rows] == [
         [e, m] for e in ("Ant", "Hopper") for m in ("AUC", "Delay", "FAR")
@@ -189,20 +189,7 @@ def test_table_five_has_the_papers_layout_and_averages_without_trivial_rows():
     assert cells(dynamics, 4)["riqn"] == "4.0"
     for detectors in (("riqn", "rf"), ("clock",)):
         board = Board([r for r in example() if r.detector in detectors])
-        assert not layout.anomaly_groups(board)[0].note
-
-
-def test_undefined_is_a_dash_and_not_run_is_empty():
-    values = {"delay": [None, None]}
-    board = Board([make_record(values=values), make_record("rf", anomaly="gravity")])
-    row = cells(layout.anomaly_groups(board)[0], 1)
-    assert (row["riqn"], row["rf"]) == (UNDEFINED, "")
-
-
-def test_a_metric_that_only_some_rows_have_is_empty_in_the_others():
-    board = Board([make_record(values={"missed_at_1pct": [0, 1]}), make_record("rf")])
-    table = layout.guaranteed(board, "at_1pct")
-    assert [cells(table, i)["missed"] for i in (0, 1)] == ["50.0", ""]
+        assert not tables.anomaly_groups(board)[0].note
 
 
 def test_settings_and_horizons_are_rows_of_their_own():
@@ -211,7 +198,7 @@ def test_settings_and_horizons_are_rows_of_their_own():
     ])  # fmt: skip
     assert [str(e) for e in board.entries] == ["riqn", "riqn[h=10]", "riqn[members=1]"]
     assert board.horizons == [1, 10]
-    assert layout.anomaly_groups(board)[1].header[2:] == ["riqn", "AVG"]
+    assert tables.anomaly_groups(board)[1].header[2:] == ["riqn", "AVG"]
 
 
 def test_no_table_mixes_digests_protocols_or_limits():
@@ -225,7 +212,7 @@ def test_no_table_mixes_digests_protocols_or_limits():
 
 def test_a_mean_over_fewer_cells_is_marked():
     board = Board([make_record(), make_record(anomaly="drift"), make_record("rf")])
-    texts = {row[0]: row[1] for row in layout.separability(board).rows}
+    texts = {row[0]: row[1] for row in tables.separability(board).rows}
     assert texts == {"riqn": "50.0", "rf": "50.0*"}
 
 
@@ -234,7 +221,7 @@ def test_seeds_are_averaged_into_one_row():
         make_record(seed=0, values={"auc_matched": [0.4, 0.4]}),
         make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
     ])  # fmt: skip
-    assert [row[:2] for row in layout.separability(board).rows] == [["riqn", "60.0"]]
+    assert [row[:2] for row in tables.separability(board).rows] == [["riqn", "60.0"]]
     # Trajectories agree within each seed, so that the interval is the seeds' alone.
     value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
     assert (value.low, value.high) == (0.4, 0.8)
@@ -257,40 +244,31 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
 
 
 def test_a_simple_row_that_wins_is_named_for_both_metrics():
-    assert layout.findings(Board(example())) == [
+    assert tables.findings(Board(example())) == [
         "rf beats riqn in mean matched AUC: 72.5 against 67.5 over 2 cells."
     ]
     board = Board([
         make_record("riqn", values={"auc": [0.5, 0.5], "auc_matched": [0.5, 0.5]}),
         make_record("persistence", values={"auc": [0.6, 0.6], "auc_matched": [0.7, 0.7]}),
     ])  # fmt: skip
-    assert len(layout.findings(board)) == 2
+    assert len(tables.findings(board)) == 2
 
 
 @pytest.mark.parametrize("simple", ["range", "mahalanobis", "rf-ewma", "comb", "clock"])
 def test_every_simple_row_is_named_and_the_auc_of_what_knows_the_time_is_no_finding(simple):
     board = Board([make_record(), make_record(simple, values={"auc_matched": [0.7, 0.7]})])
-    (sentence,) = layout.findings(board)
+    (sentence,) = tables.findings(board)
     assert sentence.startswith(f"{simple} beats riqn in mean matched AUC: 70.0 against 50.0")
     if simple in ("comb", "clock"):
-        assert not layout.findings(
+        assert not tables.findings(
             Board([make_record(), make_record(simple, values={"auc": [1.0, 1.0]})])
         )
-
-
-def test_comparison_is_over_common_cells_only():
-    board = Board([
-        make_record("riqn", values={"auc_matched": [0.6, 0.6]}),
-        make_record("riqn", anomaly="drift", values={"auc_matched": [0.1, 0.1]}),
-        make_record("persistence", values={"auc_matched": [0.5, 0.5]}),
-    ])  # fmt: skip
-    assert layout.findings(board) == []
 
 
 def test_notes_name_the_split_and_what_is_missing():
     records = [make_record(limit=3), make_record(anomaly="drift", limit=3)]
     records[1].provenance["git_dirty"] = True
-    notes = " ".join(layout.notes(Board(records)))
+    notes = " ".join(tables.notes(Board(records)))
     for phrase in (
         "Split mini, digest abababababab, protocol 1",
         "first 3 trajectories",
@@ -298,7 +276,7 @@ def test_notes_name_the_split_and_what_is_missing():
         "uncommitted changes of oodd-eval's checkout: 1 cells",
     ):
         assert phrase in notes
-    assert "uncommitted" not in " ".join(layout.notes(Board(records[:1])))
+    assert "uncommitted" not in " ".join(tables.notes(Board(records[:1])))
 
 
 ALARMS = {
@@ -310,31 +288,31 @@ ALARMS = {
 
 def test_guaranteed_alarms_stand_beside_false_episodes_with_their_interval():
     board = Board([make_record(anomaly=a, values=ALARMS) for a in ("iid", "drift")])
-    table = layout.guaranteed(board)
+    table = tables.guaranteed(board)
     assert cells(table, 0) == {
         "detector": "riqn", "delay": "4.0", "missed": "50.0", "found within 20": "50.0",
         "found within 100": "50.0", "found within 100 null": "50.0",
         "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
     }  # fmt: skip
-    nulls = layout.guaranteed(board, nulls=True)
+    nulls = tables.guaranteed(board, nulls=True)
     assert nulls.header[-2:] == ["found within 100", "found within 100 null"]
 
 
 def test_the_table_of_alarms_is_of_the_strictest_level_where_5_percent_is_not_offered():
-    assert layout.guaranteed(Board([make_record()])) is None
+    assert tables.guaranteed(Board([make_record()])) is None
     few = {"false_episodes_at_10pct": [0, 0], "missed_at_10pct": [0, 1]}
-    assert "at 10 %" in layout.guaranteed(Board([make_record(values=few)])).title
+    assert "at 10 %" in tables.guaranteed(Board([make_record(values=few)])).title
     both = few | {"missed_at_1pct": [1, 1], "false_episodes_at_1pct": [0, 0]}
-    assert "at 1 %" in layout.guaranteed(Board([make_record(values=both)])).title
-    assert len(layout.all_alarms(Board([make_record(values=both | ALARMS)]))) == 3
+    assert "at 1 %" in tables.guaranteed(Board([make_record(values=both)])).title
+    assert len(tables.all_alarms(Board([make_record(values=both | ALARMS)]))) == 3
 
 
 def test_brief_cells_are_marked_and_named():
     records = [make_record(anomaly="iid", brief=True), make_record(anomaly="drift")]
     board = Board(records)
-    (row,) = layout.by_anomaly(board, board.entries[0]).rows
+    (row,) = tables.by_anomaly(board, board.entries[0]).rows
     assert row == ["Hopper", "50.0\N{DAGGER}", "50.0"]
-    (note,) = [line for line in layout.notes(board) if "Brief" in line]
+    (note,) = [line for line in tables.notes(board) if "Brief" in line]
     assert "hopper/iid" in note
 
 
@@ -395,20 +373,8 @@ def test_a_table_that_is_too_wide_both_ways_comes_in_parts_with_its_labels():
     assert [w.strip() for h in headers for w in h[1:] if w] == WIDE.header[1:]
 
 
-def test_rows_have_their_colours_where_they_stand_as_rows():
-    table = Table("t", ["a", "b"], [["1", "2"], ["3", "4"]], colours=["red", ""])
-    *_, first, second, _ = printed_table(table, 40, terminal=True)
-    assert ["\x1b[31m" in line for line in (first, second)] == [True, False]
-    assert table.transposed().transposed().rows == table.rows
-
-
 def test_names_of_others_are_not_taken_for_markup():
     one = reporter()
     one.failures([make_record("[red]x", status="error", reason="[/b] oops")])
     assert "[red]x" in printed(one)
     assert "[/b] oops" in printed(one)
-
-
-def test_summary_counts_states():
-    assert summary(example()) == "14 ok, 2 timeout"
-    assert summary([]) == "no cells"

@@ -76,16 +76,6 @@ def test_score_is_the_mean_distance_in_standard_deviations():
     np.testing.assert_array_equal(rf.score(x), [np.nan, 0.375, 0.0])
 
 
-def test_scores_in_many_batches_are_those_of_one_trajectory(rf, monkeypatch):
-    monkeypatch.setattr("oodd_rf.detector.BATCH", 7)
-    trajectories = [episode(1), episode(2, n=1), episode(3, n=5)]
-    assert rf.score_many([]) == []
-    many = rf.score_many(trajectories)
-    monkeypatch.undo()
-    for x, scores in zip(trajectories, many, strict=True):
-        np.testing.assert_array_equal(scores, rf.score(x))
-
-
 def test_members_differ_in_seed_window_and_settings(rf):
     members = fitted(members=6).members_
     assert [m.window for m in members] == [4, 3, 2, 1, 4, 3]
@@ -151,26 +141,6 @@ def test_ewma_is_the_running_mean_of_rf_from_its_first_score(horizon):
     assert found[horizon] == raw[horizon]
     alone = make_rf_ewma(**SMALL, horizon=horizon, weight=1.0).fit(NOMINAL)
     np.testing.assert_array_equal(alone.score(episode(90)), raw)
-
-
-def test_ewma_begins_anew_in_every_episode():
-    made = make_rf_ewma(**SMALL).fit(NOMINAL)
-    x, wild = episode(90), Trajectory(100 * episode(91).observations)
-    together = made.score_many([wild, x])
-    np.testing.assert_array_equal(together[1], made.score(x))
-    for row in wild.observations:
-        made.update(row)
-    made.reset()
-    live = [made.update(row) for row in x.observations]
-    np.testing.assert_allclose(live, made.score(x), rtol=1e-12)
-
-
-def test_ewma_takes_over_a_fit_of_rf(rf, tmp_path):
-    rf.save(tmp_path)
-    made = make_rf_ewma(**SMALL)
-    made.load(tmp_path)
-    x = episode(90)
-    np.testing.assert_allclose(made.score(x), smoothed(rf.score(x), 0.03), rtol=1e-12)
 
 
 def test_ewma_shares_the_fits_of_rf_and_is_its_own_statistic():

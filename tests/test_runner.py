@@ -5,11 +5,11 @@ import json
 import os
 import re
 import textwrap
+from collections import deque
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
-import h5py
 import pytest
 from helpers_plugins import install
 from oodd_trivial import Clock
@@ -25,18 +25,10 @@ from oodd_eval.plugins.isolation.supervisor import _send
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.keys import source_digest
-from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.plan import make_plan, source_digest
 from oodd_eval.scoring.runner import run
 
 HOSTILE = """
-class WrongLength(Good):
-    def score(self, x): return super().score(x)[:-1]
-
-class LateNan(Good):
-    def score(self, x):
-        s = super().score(x); s[30:31] = np.nan; return s
-
 class PlainList(Good):
     def score(self, x): return super().score(x).tolist()
 
@@ -52,25 +44,11 @@ class BadWarmUp(Good):
 class RaisesInFit(Good):
     def fit(self, nominal): raise RuntimeError("no mood")
 
-class Crashes(Good):
-    def score(self, x): os.kill(os.getpid(), signal.SIGSEGV)
-
-class Hangs(Good):
-    def fit(self, nominal): time.sleep(600)
-
-class TooLarge(Good):
-    def fit(self, nominal): self.rows = np.ones(10**8); time.sleep(600)
-
 class Unsuited(Good):
     def fit(self, nominal): raise NotImplementedError("continuous actions only")
 
 class Unequipped(Good):
     def fit(self, nominal): import no_such_module
-
-class Prints(Good):
-    def score(self, x):
-        print("garbage " * 1000); os.write(1, bytes(range(256)) * 100); os.write(2, b"x" * 10**5)
-        return super().score(x)
 
 def no_detector(**settings): return 42
 
@@ -83,21 +61,15 @@ def oodd_detectors():
 """
 
 STATES = {
-    "wronglength": ("invalid", r"returned \d+ scores for cartpole/\S+\[\d\], expected \d+ \(one p"),
-    "latenan": ("invalid", r"returned nan at t = 30 of cartpole/"),
     "plainlist": ("invalid", "score returned list, expected a numpy array of float64"),
     "huge": ("invalid", "too large"),
     "fewscores": ("invalid", r"score_many returned \d+ score arrays, expected \d+"),
     "badwarmup": ("invalid", "declares warm_up = 50, expected an int between 0 and 20"),
     "raisesinfit": ("error", r"RuntimeError: no mood \(oodd_hostile.py:\d+\)"),
-    "crashes": ("error", "the worker was killed by SIGSEGV while scoring"),
-    "hangs": ("timeout", r"not done after 1.5 s \(--timeout\)"),
-    "toolarge": ("oom", r"resident memory \d+ MB is over the limit of 300 MB"),
     "unsuited": ("incompatible", "NotImplementedError: continuous actions only"),
     "unequipped": ("unavailable", "No module named 'no_such_module'"),
     "unavailable": ("unavailable", r'needs no_such: pip install "oodd-x\[y\]"'),
     "no-detector": ("invalid", "the factory returned int, expected an object with the methods"),
-    "prints": ("ok", ""),
     "clock": ("ok", ""),
 }
 
@@ -130,11 +102,9 @@ def hostile(tiny_split, tmp_path_factory):
         install(patch, tmp_path_factory.mktemp("plugin"), "hostile", HOSTILE)
         output = tmp_path_factory.mktemp("hostile")
         limits = Limits(seconds=120, memory=300_000_000)
-        others = [name for name in STATES if name != "hangs"]
-        done = run_tiny(tiny_split, others, output, jobs=4, limits=limits)
-        # On its own: a short limit would also end whoever starts slowly on a busy machine.
-        hung = run_tiny(tiny_split, ["hangs"], output, limits=Limits(seconds=1.5))
-    return {record.detector: record for record in [*done.records, *hung.records]}, output
+        done = run_tiny(tiny_split, STATES, output, jobs=4, limits=limits)
+    assert [record.detector for record in done.records] == list(STATES)
+    return {record.detector: record for record in done.records}, output
 
 
 @pytest.mark.parametrize("name", STATES)
@@ -145,10 +115,6 @@ def test_every_way_to_fail_is_a_state_with_a_reason(hostile, name):
     assert re.search(reason, record.reason)
     assert bool(record.reason) == (status != "ok")
     assert bool(record.metrics) == (status == "ok")
-
-
-def test_no_detector_is_left_out_and_the_order_is_the_plans(hostile):
-    assert [name for name in hostile[0] if name != "hangs"] == [n for n in STATES if n != "hangs"]
 
 
 def test_what_a_failing_detector_printed_is_kept(hostile):
@@ -247,28 +213,6 @@ def test_a_limited_run_does_not_pass_for_a_whole_one(tiny_split, tmp_path, count
     assert len(ResultsDirectory(tmp_path / "out").records()) == 2
 
 
-@pytest.mark.parametrize("damage", [b"", b"not HDF5 at all", None])
-def test_a_damaged_score_file_is_computed_again(tiny_split, tmp_path, counting, damage):
-    before = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
-    (file,) = (tmp_path / "out" / "scores").glob("*.h5")
-    content = file.read_bytes()
-    file.write_bytes(content[: len(content) // 2] if damage is None else damage)
-    after = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
-    assert len(counting[1]()) == 2
-    assert stable(before) == stable(after)
-
-
-def test_a_foreign_attribute_of_a_score_file_is_not_taken_over(tiny_split, tmp_path, counting):
-    before = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
-    (file,) = (tmp_path / "out" / "scores").glob("*.h5")
-    file.with_suffix(".sha256").unlink()  # as in an earlier version, which knew of no change
-    with h5py.File(file, "a") as stored:
-        stored.attrs["status"] = 3.0
-    after = run_tiny(tiny_split, ["counting"], tmp_path / "out").records
-    assert len(counting[1]()) == 1
-    assert stable(before) == stable(after)
-
-
 def test_shared_code_of_a_plugin_counts_as_its_source(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path / "a", "user", "import oodd_helper\n")
     helper = install(monkeypatch, tmp_path / "b", "helper", "X = 1\n")
@@ -308,15 +252,6 @@ def test_an_output_that_cannot_be_written_is_found_before_any_work(tiny_split, t
     assert counting[1]() == []
 
 
-def test_earlier_records_that_cannot_be_read_are_found_before_any_work(
-    tiny_split, tmp_path, counting
-):
-    (tmp_path / "records.jsonl").write_text("{")
-    with pytest.raises(ResultsError, match=r"records\.jsonl:1 is no record"):
-        run_tiny(tiny_split, ["counting"], tmp_path)
-    assert counting[1]() == []
-
-
 def test_rescoring_gives_the_same_records(tiny_split, tmp_path):
     records = run_tiny(tiny_split, ["persistence"], tmp_path / "out").records
     bare = [dataclasses.replace(r, metrics={}, per_trajectory={}) for r in records]
@@ -346,7 +281,7 @@ def test_an_error_of_reading_data_is_kept_for_the_caller():
         raise OSError("disk gone")
 
     with Path(os.devnull).open("wb") as file, pytest.raises(OSError, match="disk gone"):
-        _send(_child(os.dup(file.fileno())), {"train": 0}, broken(), [], [], Future())
+        _send(_child(os.dup(file.fileno())), {"train": 0}, broken(), [], [], Future(), deque())
 
 
 def _child(descriptor):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from oodd_eval import __version__
+from oodd_eval.data.condition import rungs_of
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.ladder import rungs_of
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site

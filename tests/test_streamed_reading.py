@@ -130,33 +130,6 @@ def test_iterating_reads_in_blocks_what_an_index_reads_alone(tiny_split, monkeyp
             assert all(map(same, found, one_by_one))
 
 
-class CountedReads:
-    """Stands for a dataset and counts the rows that are read from the file."""
-
-    def __init__(self, dataset):
-        self.dataset, self.nbytes, self.rows = dataset, dataset.nbytes, 0
-
-    def __getitem__(self, rows):
-        found = self.dataset[rows]
-        self.rows += len(found)
-        return found
-
-
-@pytest.mark.parametrize(("kept", "times"), [(10**9, 1), (0, 3)])
-def test_a_small_part_is_decompressed_once_in_any_order(tiny_split, monkeypatch, kept, times):
-    monkeypatch.setattr("oodd_eval.data.parts._KEPT", kept)
-    data = load_split(tiny_split).environment("hopper")
-    with contextlib.closing(data):
-        part = data.anomalous("iid")
-        expected = list(data.anomalous("iid"))
-        names = ("observations", "actions")
-        part._data = {name: CountedReads(part._data[name]) for name in names}
-        order = [2, 0, 1] * 3
-        assert all(same(part[i], expected[i]) for i in order)
-        assert part._data["observations"].rows == times * sum(map(len, expected))
-        assert part[0].observations is not part[0].observations  # nobody writes into another's
-
-
 # Trajectories in a temporary file
 
 
@@ -218,11 +191,3 @@ def test_a_dataset_in_blocks_is_the_same_file(tmp_path):
         found = write_environment(tmp_path / "blocks.h5", [("train", blocks)], "", **names)
         assert found == whole | {"file": "blocks.h5"}
         assert (tmp_path / "blocks.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
-
-
-def test_blocks_of_any_length_come_in_one_length():
-    array = np.arange(20).reshape(10, 2)
-    blocks = Blocks(array.shape, lambda: [array[:1], array[1:1], array[1:9], array[9:]])
-    assert [len(block) for block in blocks.of_length(4)] == [4, 4, 2]
-    assert np.concatenate(list(blocks.of_length(3))).tolist() == array.tolist()
-    assert list(Blocks((0,), list).of_length(2)) == []

@@ -11,11 +11,9 @@ import pytest
 from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
 
 from oodd_eval import check_detector
-from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.conformance import CheckReport, Result
-from oodd_eval.plugins.conformance import test_effects as effects
-from oodd_eval.plugins.conformance.session import CHECKS, MOST_ENDS, run_tests
-from oodd_eval.plugins.conformance.trial import ACTIONS, EPISODES, SENSORS, Trial
+from oodd_eval.plugins.conformance.session import CHECKS, run_tests
+from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.testing import NonConformingError, run_checks
 
 pytest_plugins = ["pytester"]
@@ -41,18 +39,13 @@ def apart(monkeypatch, tmp_path):
     os.environ.update(environment)
 
 
-WHOLE_KIT = ["fits-NoMood", "shape-OneShort", *(name for name in BROKEN if BROKEN[name].also)]
+WHOLE_KIT = ["fits-NoMood", "scores-OneShort", *(name for name in BROKEN if BROKEN[name].also)]
 """Those after which little else can be carried out, and those that fail several checks."""
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_detector_fails_its_check_with_its_message(name, apart, monkeypatch):
+def test_a_broken_detector_fails_its_check_with_its_message(name, apart):
     broken = BROKEN[name]
-    # One of the two: on a busy machine, what takes memory takes its time, too.
-    if broken.check == "time-budget":
-        monkeypatch.setattr(effects, "MOST_SECONDS", 0.2)
-    if broken.check == "memory-budget":
-        monkeypatch.setattr(effects, "MOST_MEGABYTES", 100.0)
     results = []
     run_tests(Trial(broken.spec), results.append, [broken.check])
     (result,) = results
@@ -93,19 +86,6 @@ def rows_of_the_page():
 def test_the_page_has_every_check_in_its_order_and_its_own_words():
     rows = [(name.strip("`"), what) for name, what, *_ in rows_of_the_page()]
     assert rows == [(name, check.__doc__.removesuffix(".")) for name, check in CHECKS.items()]
-
-
-def test_the_page_says_of_every_check_why_and_how_to_mend_it():
-    reasons = [row[2:] for row in rows_of_the_page()]
-    assert all(len(text) >= 10 for row in reasons for text in row)
-    assert len({text for row in reasons for text in row}) == 2 * len(NAMES)
-
-
-def test_the_page_names_the_budgets_and_the_size_of_the_problem():
-    for text in (f"{effects.MOST_SECONDS:g} s", f"{effects.MOST_MEGABYTES:g} MB",
-                 f"{EPISODES} short nominal episodes", f"{SENSORS} sensors",
-                 f"{ACTIONS} action", f"{MOST_ENDS} such ends"):  # fmt: skip
-        assert text in PAGE
 
 
 # Results
@@ -156,11 +136,6 @@ def test_an_expected_failure_that_passes_is_a_failure():
     assert "a guess" in report.failed[0].message
 
 
-def test_expected_failures_have_names_of_checks():
-    with pytest.raises(UnknownNameError, match="did you mean 'order'"):
-        run_checks(GOOD, expected_failures={"ordr": "typo"})
-
-
 def test_a_report_counts_every_status():
     statuses = ("passed", "failed", "skipped", "xfailed", "xpassed")
     report = CheckReport([Result(s, s, seconds=0.2) for s in statuses])
@@ -172,18 +147,11 @@ def test_a_report_counts_every_status():
     assert CheckReport([]).summary() == "0 checks: none ran in 0.0 s"
 
 
-def test_long_messages_stand_below_in_80_columns():
-    lines = Result("order", "failed", "many words " * 20).line(10).splitlines()
-    assert lines[0] == "FAILED   order"
-    assert len(lines) > 2
-    assert all(len(line) <= 80 and line.startswith(" " * 9) for line in lines[1:])
-
-
 def test_what_needs_more_than_there_is_names_the_check_to_look_at():
     for name, check, needs in [
         ("fits-NoMood", "order", "needs a fitted detector: see check 'fits'"),
         ("factory-NoScore", "fits", "needs a detector: see check 'factory'"),
-        ("shape-OneShort", "order", "needs one score per observation"),
+        ("scores-OneShort", "order", "needs one score per observation"),
     ]:
         results = []
         run_tests(Trial(BROKEN[name].spec), results.append, [check])
@@ -199,7 +167,7 @@ def test_checks_share_a_fit():
             fits.append(len(nominal))
             super().fit(nominal)
 
-    run_tests(Trial(Counts), lambda _: None, ["fits", "shape", "causality", "prefix"])
+    run_tests(Trial(Counts), lambda _: None, ["fits", "scores", "prefix"])
     assert fits == [12]
 
 

@@ -78,19 +78,10 @@ def test_a_threshold_beyond_the_ladder_is_censored(rungs, value, text):
     assert np.isfinite(own.within).all()
 
 
-def test_one_rung_says_on_which_side_the_threshold_is():
-    assert threshold([1, 1, 0], strengths=[2.0]).value == 0
-    assert threshold([1, 0, 0], strengths=[2.0]).value == math.inf
-
-
 @pytest.mark.parametrize("strengths", [(1, 4), (4, 1, 16), (0, 1, 4), (math.nan, 1, 4)])
 def test_strengths_that_are_no_ladder_are_refused(strengths):
     with pytest.raises(ValueError, match="of 3 rungs: expected as many positive numbers"):
         threshold([0], [0], [1], strengths=strengths)
-
-
-def test_rungs_of_one_strength_are_allowed():
-    assert threshold([0, 0], [0, 0], [1, 1], strengths=(1, 4, 4)).value == pytest.approx(4)
 
 
 # Other ways to the same numbers
@@ -207,25 +198,6 @@ def test_a_censored_threshold_counts_as_the_end_of_its_ladder_and_is_counted():
     assert geometric_mean([below], [threshold([1, 1], [1, 1], [1, 1])]).side == "~"
 
 
-def test_a_row_is_its_own_multiple_without_doubt():
-    rng = np.random.default_rng(0)
-    own = of("ant", STRENGTHS, drawn_at(rng, rng.normal(size=9), STRENGTHS))
-    assert geometric_mean([own], [own])[:3] == (1, 1, 1)
-
-
-def test_episodes_are_drawn_together_for_all_detectors():
-    rng = np.random.default_rng(1)
-    strengths = np.geomspace(0.05, 20, 8)
-    taken = rng.normal(size=30)
-    found = drawn_at(rng, taken, strengths, noise=0.1)
-    other = drawn_at(rng, taken + 0.5, strengths, noise=0.1)
-    shuffled = other[:, :, rng.permutation(30)]
-    own = of("ant", strengths, found)
-    paired, apart = (geometric_mean([own], [of("ant", strengths, x)]) for x in (other, shuffled))
-    assert paired.value == apart.value
-    assert math.log(paired.high / paired.low) < 0.75 * math.log(apart.high / apart.low)
-
-
 def test_intervals_contain_the_true_threshold_in_most_samples():
     strengths = np.geomspace(0.05, 20, 8)
     hits = 0
@@ -254,19 +226,6 @@ def test_more_found_never_raises_a_threshold(found, more, counted):
         assert (many.logs <= few.logs + 1e-6).all()
     else:
         assert math.isnan(few.value)
-
-
-@given(outcomes, st.floats(0.01, 100))
-def test_other_units_change_a_threshold_alike(found, factor):
-    one, two = (of("ant", scale * np.array(LADDER), found) for scale in (1.0, factor))
-    np.testing.assert_allclose(two.logs, one.logs + math.log(factor), atol=1e-9)
-
-
-@given(outcomes)
-def test_an_interval_contains_its_threshold_and_one_run_is_like_another(found):
-    own = of("ant", LADDER, found)
-    assert own.interval[0] <= own.value <= own.interval[1]
-    assert own.interval == of("ant", LADDER, found).interval
 
 
 @given(arrays.arrays(np.float64, (4, 3), elements=st.floats(0, 1)))

@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import oodd_recording.train
 import pytest
-from oodd_recording.benchmark import FROZEN
 from oodd_recording.policies import load_policy
 
 from oodd_eval.data.facts import ENVIRONMENTS
@@ -159,22 +158,3 @@ def test_freezing_adds_the_evaluation_to_the_provenance(tmp_path):
     assert facts["flagged"]
     frozen = load_policy("cartpole", tmp_path / "frozen" / "cartpole.npz")
     assert frozen.digest == facts["digest"] == load_policy("cartpole", trained).digest
-
-
-@pytest.mark.parametrize("file", sorted(FROZEN.glob("*.npz")), ids=lambda f: f.stem)
-def test_frozen_policies_carry_their_provenance(file):
-    facts = json.loads(file.with_suffix(".json").read_text())
-    info = ENVIRONMENTS[file.stem]
-    assert facts["digest"] == load_policy(file.stem).digest
-    assert facts["algorithm"] == info.policy
-    assert facts["episodes"] >= 100
-    assert facts["paper_return"] == info.paper_return
-    assert facts["share_of_paper"] == freeze.share_of_paper(file.stem, facts["mean_return"])
-    assert facts["finished"] == (facts["share_of_paper"] >= 0.95)
-    assert facts["flagged"] == (facts["share_of_paper"] < 0.8)
-    assert facts["steps"] in [c[0] for c in facts["curve"]]
-    assert {"seed", "hyper_parameters", "selection", "std_return"} <= facts.keys()
-
-
-def test_every_environment_has_a_frozen_policy():
-    assert {f.stem for f in FROZEN.glob("*.npz")} == set(ENVIRONMENTS)

@@ -89,7 +89,3 @@ def test_only_non_empty_prefixes_are_trajectories(rows):
 def test_bad_arrays_are_named(observations, actions, message):
     with pytest.raises(TrajectoryError, match=message):
         Trajectory(observations, actions)
-
-
-def test_a_trajectory_prints_its_sizes():
-    assert repr(Trajectory(np.zeros((301, 4)), np.zeros((300, 2)))) == "Trajectory(T=300, D=4, A=2)"

@@ -24,10 +24,10 @@ from helpers_split import make_split
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
-from oodd_eval.data import export as minari
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.layout import split_digest
+from oodd_eval.data.logs import minari
 from oodd_eval.data.parts import parts_of
 from oodd_eval.data.split import SHIPPED, split_directories
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
@@ -187,49 +187,28 @@ def edit(directory, change):
     file.write_text(json.dumps(manifest))
 
 
-HOPPER = ("environments", "hopper")
-
-
-@pytest.mark.parametrize(
-    ("keys", "value", "message"),
-    [
-        ((*HOPPER, "file"), "../../hopper.h5", r"expected 'hopper.h5'"),
-        ((*HOPPER, "groups", "train", "transitions"), 7, "hopper.h5, train has"),
-    ],
-)
-def test_a_manifest_that_does_not_fit_is_refused(copy, home, keys, value, message):
-    def change(manifest):
-        for key in keys[:-1]:
-            manifest = manifest[key]
-        manifest[keys[-1]] = value
-
-    edit(copy, change)
-    with pytest.raises(SplitError, match=message):
+def test_a_manifest_that_leads_out_of_the_split_is_refused(copy, home):
+    edit(copy, lambda m: m["environments"]["hopper"].update(file="../../hopper.h5"))
+    with pytest.raises(SplitError, match=r"expected 'hopper.h5'"):
         fetch(str(copy))
     assert not list(home.glob("*/manifest.json"))
 
 
-@pytest.mark.parametrize("kind", ["directory", "tar"])
-def test_changed_content_is_refused_with_both_digests(copy, home, tmp_path, kind):
+@pytest.mark.parametrize("pipe", [True, False])
+def test_a_missing_file_is_named(copy, home, pipe):
+    (copy / "hopper.h5").unlink()
+    if pipe:
+        os.mkfifo(copy / "hopper.h5")
+    with pytest.raises(SplitNotFoundError, match=r"hopper\.h5"):
+        fetch(str(copy))
+
+
+def test_changed_content_is_refused_with_both_digests(copy, home, tmp_path):
     with h5py.File(copy / "hopper.h5", "r+") as file:
         file["train/observations"][5, 5] += 1
-    place = pack(copy, tmp_path / "x.tar") if kind == "tar" else copy
     with pytest.raises(DigestError, match=r"hopper.h5, group train: .*expected \w{64}, found"):
-        fetch(str(place))
+        fetch(str(pack(copy, tmp_path / "x.tar")))
     assert split_directories().keys() == {"mini"}
-
-
-def test_a_missing_file_is_named(copy, home):
-    (copy / "hopper.h5").unlink()
-    with pytest.raises(SplitNotFoundError, match=r"hopper\.h5"):
-        fetch(str(copy))
-
-
-def test_a_pipe_in_place_of_a_file_is_refused(copy, home):
-    (copy / "hopper.h5").unlink()
-    os.mkfifo(copy / "hopper.h5")
-    with pytest.raises(SplitNotFoundError, match=r"hopper\.h5"):
-        fetch(str(copy))
 
 
 def test_a_file_longer_than_its_sizes_allow_is_refused_before_it_fills_the_disk(copy, home):

@@ -15,10 +15,18 @@ from typing import Any, Final
 from oodd_recording.benchmark import FROZEN
 from oodd_recording.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
 
-from oodd_eval.data.condition import FRACTIONS, PAPER
+from oodd_eval.data.condition import (
+    FRACTIONS,
+    PAPER,
+    ROBOTS_CAP,
+    WHOLE,
+    Rung,
+    all_rungs_of,
+    read_ladder,
+    rungs_of,
+)
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import write_bytes, write_text
-from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE, Rung, all_rungs_of, read_ladder, rungs_of
 
 NAME: Final = "environments"
 COMMAND: Final = "python docs/figures/environments.py"

@@ -23,16 +23,15 @@ from oodd_eval.leaderboard.published import (
     read_published,
 )
 from oodd_eval.names import check_known, select
+from oodd_eval.results import tables
 from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
-from oodd_eval.results.render.terminal import print_sections
-from oodd_eval.results.render.text import markdown_section
+from oodd_eval.results.render.text import markdown_section, print_sections
 from oodd_eval.results.report import Section
-from oodd_eval.results.strengths import thresholds
-from oodd_eval.results.tables import ladder, layout
+from oodd_eval.results.strengths import overview, thresholds
 
 _format_options: Final = together(
     click.option("--markdown", is_flag=True, help="print Markdown"),
@@ -53,16 +52,19 @@ def show(options: Options) -> int:
     output = _Output(options)
     for board in chosen:
         ranks = board.ranks()
-        notes = [*layout.ranking_notes(ranks), *_of_entries(board)]
-        tables = rankings(ranks, board.trust)
+        notes = [*tables.ranking_notes(ranks), *_of_entries(board)]
         output.print(
-            Section(f"Leaderboard, {board}", tables=tables, notes=[] if output.quiet else notes),
+            Section(
+                f"Leaderboard, {board}",
+                tables=rankings(ranks, board.trust),
+                notes=[] if output.quiet else notes,
+            ),
             ranking_csv(ranks, board.trust) if output.csv else "",
         )
     if options.split or output.csv or output.quiet:
         return 0
     for name, suite in published.suites.items():
-        table = ladder.overview(suite, thresholds(suite.records))
+        table = overview(suite, thresholds(suite.records))
         output.print(Section(f"Suite {name}, digest {suite.digest[:12]}", tables=[table]))
     return 0
 
@@ -85,14 +87,14 @@ def place_run(options: Options) -> int:
         placed = placement(run.records, board, primary)
         new = placed.rows - placed.published
         trust = board.trust | dict.fromkeys(new, "yours")
-        tables, notes = [], _sentences(placed, board.entries)
+        of_ranks, notes = [], _sentences(placed, board.entries)
         if not output.quiet:
-            tables = rankings(placed.ranks, trust, placed.rows)
+            of_ranks = rankings(placed.ranks, trust, placed.rows)
             nearby = (neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str))
-            tables += [table for table in nearby if table]
-            notes = [*layout.ranking_notes(placed.ranks), *notes]
+            of_ranks += [table for table in nearby if table]
+            notes = [*tables.ranking_notes(placed.ranks), *notes]
         output.print(
-            Section(f"Your rows on the leaderboard, {board}", tables=tables, notes=notes),
+            Section(f"Your rows on the leaderboard, {board}", tables=of_ranks, notes=notes),
             ranking_csv(placed.ranks, trust) if output.csv and not output.quiet else "",
         )
     return 0

@@ -31,7 +31,7 @@ STYLES: Final = {
 }
 
 
-@command("check rf", "check mine -k 'prefix or causality' -v", plugins=True)
+@command("check rf", "check mine -k 'prefix or explain' -v", plugins=True)
 @click.argument(
     "name",
     type=Name("detectors", "envs", "anomalies"),

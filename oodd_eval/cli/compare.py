@@ -11,11 +11,11 @@ from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES, RANKING
 from oodd_eval.names import expression, select
 from oodd_eval.results import compare as regression
-from oodd_eval.results import paired
-from oodd_eval.results.reference import RecordSet, read_record_set, write_reference
-from oodd_eval.results.render.junit import junit
-from oodd_eval.results.render.terminal import print_prose, print_table
-from oodd_eval.results.render.text import markdown_section
+from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
+from oodd_eval.results.render.data import junit
+from oodd_eval.results.render.text import markdown_section, print_prose, print_table
+from oodd_eval.results.report import comparison_section
+from oodd_eval.results.standings import compare_rows
 
 LOG_WIDTH: Final = 160
 """Columns that a log has at least."""
@@ -90,7 +90,7 @@ def _rows(now: RecordSet, options: Options) -> int:
     unknown: UnknownNameError | None = None
     for conditions, cells in now.boards.items():
         try:
-            compared = paired.compare(list(cells.values()), first, second, options.metric)
+            compared = compare_rows(list(cells.values()), first, second, options.metric)
             lines.append(f"{conditions}\n{compared}")
         except UnknownNameError as error:
             unknown = unknown or error
@@ -112,19 +112,19 @@ def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:
     if options.junit:
         _write(options.junit, junit(comparison))
     if options.markdown:
-        _write(options.markdown, markdown_section(regression.section(comparison)))
+        _write(options.markdown, markdown_section(comparison_section(comparison)))
     console = make_console()
+    section = comparison_section(comparison, everything=options.verbosity > 0)
     if options.verbosity >= 0:
-        section = regression.section(comparison, everything=options.verbosity > 0)
         # Nobody knows how wide a log is; a row that is broken is hard to read anywhere.
         width = console.width if console.is_terminal else max(console.width, LOG_WIDTH)
         for table in section.tables:
             print_table(table, console, width)
         for note in comparison.notes:
             print_prose(note, console, "yellow")
-    console.print(regression.summary(comparison))
+    console.print(section.facts[0])
     if comparison.failures and options.verbosity >= 0:
-        print_prose(regression.verdict(comparison), console, "bold red")
+        print_prose(section.title, console, "bold red")
     return int(bool(comparison.failures))
 
 

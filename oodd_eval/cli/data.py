@@ -6,12 +6,12 @@ import click
 
 from oodd_eval.cli import COUNT, DIRECTORY, Converted, Name, Names, Options, command
 from oodd_eval.cli.terminal import make_console
-from oodd_eval.data.export import export as export_split
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.fetch import fetch as fetch_split
 from oodd_eval.data.importing import import_data
 from oodd_eval.data.info import describe
 from oodd_eval.data.logs import FORMATS, quantity
+from oodd_eval.data.logs.minari import export as export_split
 from oodd_eval.data.split import load_split
 from oodd_eval.names import assignment, select
 

@@ -8,8 +8,8 @@ from tabulate import tabulate
 
 from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
+from oodd_eval.data.condition import read_ladder, rungs_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
-from oodd_eval.data.ladder import read_ladder, rungs_of
 from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer

@@ -24,7 +24,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.terminal import print_sections
+from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
 
 _format_options: Final = together(

@@ -20,7 +20,7 @@ from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins, discover, printable
 from oodd_eval.results.board import boards
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.render.terminal import print_prose, print_sections
+from oodd_eval.results.render.text import print_prose, print_sections
 from oodd_eval.results.report import Report
 from oodd_eval.scoring.plan import Plan, Unit
 

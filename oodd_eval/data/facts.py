@@ -83,7 +83,7 @@ class EnvironmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class AnomalyInfo:
-    """One kind of anomaly of the benchmark.
+    """One kind of anomaly.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ Suite = Literal["table1", "ladder", "paper"]
 
 @dataclass(frozen=True, slots=True)
 class SplitDefinition:
-    """The recipe of a split.
+    """The recipe of a split: trajectories of each part, longest episode, seeds.
 
     Parameters
     ----------

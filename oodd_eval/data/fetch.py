@@ -10,7 +10,6 @@ import functools
 import hashlib
 import http.client
 import io
-import lzma
 import shutil
 import stat
 import tarfile
@@ -19,7 +18,6 @@ import time
 import urllib.error
 import urllib.request
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
@@ -40,17 +38,6 @@ PATIENCE: Final = 60.0
 SLOWEST: Final = 4096
 """Seconds in which a download may be slow, and the bytes a second that it must have later."""
 _MIB: Final = 2**20
-_DAMAGED: Final = (
-    EOFError,
-    ValueError,
-    OverflowError,
-    RuntimeError,
-    NotImplementedError,
-    zlib.error,
-    lzma.LZMAError,
-    tarfile.TarError,
-    zipfile.BadZipFile,
-)
 
 Progress = Callable[[str], None]
 Source = Callable[[str, Path, int], None]
@@ -254,7 +241,7 @@ def _open_archive(path: Path) -> Iterator[Source]:
             members = _members(path.name, stack.enter_context(kind(path)))
         except SplitError:
             raise
-        except (OSError, *_DAMAGED) as error:
+        except Exception as error:  # zipfile, tarfile and what unpacks raise many kinds for damage
             # tarfile's longest message has a line for every kind that it has tried.
             why = (str(error) or type(error).__name__).splitlines()[0].rstrip(":")
             raise SplitError(
@@ -267,9 +254,9 @@ def _open_archive(path: Path) -> Iterator[Source]:
             try:
                 with members[name]() as content:
                     _copy(content, target, most, f"{name} in {path.name}")
-            except SplitError:
+            except (SplitError, OSError):
                 raise
-            except _DAMAGED as error:
+            except Exception as error:  # zipfile, tarfile and what unpacks raise many kinds
                 raise SplitError(f"{path.name} is damaged at {name}: {error}") from error
 
         yield extract
@@ -351,18 +338,10 @@ class _Response(http.client.HTTPResponse):
         self.fp = io.BufferedReader(_Watched(sock.makefile("rb", buffering=0)))
 
 
-class _Watching(urllib.request.AbstractHTTPHandler):
+class _Watching(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
     def do_open(self, http_class: Any, req: Any, **settings: Any) -> Any:
         watched: Any = type("Watched", (http_class,), {"response_class": _Response})
         return super().do_open(watched, req, **settings)
-
-
-class _Http(_Watching, urllib.request.HTTPHandler):
-    pass
-
-
-class _Https(_Watching, urllib.request.HTTPSHandler):
-    pass
 
 
 def _plain(text: object) -> str:
@@ -379,7 +358,7 @@ def _download(address: str, target: Path, most: int) -> None:
     request = urllib.request.Request(address, headers=headers)  # noqa: S310  http or https
     try:
         # Handlers given here take the place of those that follow a redirect to any scheme.
-        opener = urllib.request.build_opener(_Redirects, _Http, _Https)
+        opener = urllib.request.build_opener(_Redirects, _Watching)
         response = opener.open(request, timeout=60)
     except urllib.error.HTTPError as error:
         error.close()

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,8 @@ def import_data(
             raise UsageError(f"{chosen!r} is the benchmark's {kind}: choose a name of your own")
         _check_name(kind, chosen)
     directory = output or data_home() / name
-    entries = _earlier_entries(directory, name, environment)
+    recipe = {"name": name, "source": IMPORTED}
+    entries = _earlier_entries(directory, recipe, environment)
     tests = {} if test is None else test_parts(form, test)
     kinds = _kinds(tests, test, groups or {})
     columns = _columns(open_logs(form, train), sensors, actions, discrete)
@@ -153,7 +154,7 @@ def import_data(
     )
     ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
     versions = {"oodd-eval": __version__, "numpy": np.__version__}
-    layout.write_manifest(directory, _recipe(name), ordered, 0, versions)
+    layout.write_manifest(directory, recipe, ordered, 0, versions)
     return Split(directory)
 
 
@@ -165,16 +166,15 @@ def _check_name(kind: str, name: str) -> None:
         )
 
 
-def _recipe(name: str) -> dict[str, str]:
-    return {"name": name, "source": IMPORTED}
-
-
-def _earlier_entries(directory: Path, name: str, environment: str) -> dict[str, Any]:
+def _earlier_entries(
+    directory: Path, recipe: Mapping[str, str], environment: str
+) -> dict[str, Any]:
     """Return the entries of the environments that the split has already."""
     if not (directory / layout.MANIFEST).exists():
         return {}
     manifest = layout.read_manifest(directory)
-    if manifest["definition"] != _recipe(name):
+    name = recipe["name"]
+    if manifest["definition"] != recipe:
         raise UsageError(
             f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported as "
             f"{name!r}: choose another name"
@@ -204,10 +204,10 @@ def _kinds(
     if wrong := [n for n, g in groups.items() if n in ANOMALIES and ANOMALIES[n].group != g]:
         shipped = ANOMALIES[wrong[0]].group
         raise UsageError(f"{wrong[0]!r} is a {shipped} anomaly of the benchmark: use another name")
-    chosen = {name: ANOMALIES[name].group for name in anomalies if name in ANOMALIES}
-    sensor = {name for name in anomalies if groups.get(name) == "sensor"}
     return {
-        name: chosen.get(name, "sensor" if name in sensor else "dynamics")
+        name: ANOMALIES[name].group
+        if name in ANOMALIES
+        else cast("Group", groups.get(name, "dynamics"))
         for name in in_order(anomalies, ANOMALIES)
     }
 
@@ -233,29 +233,24 @@ def _columns(
             "--discrete N, or rows of shape (T, 1) where they are amounts"
         )
     count = number or (commands.shape[1] if commands.ndim == 2 else 1)
+    named = logs.actions if len(logs.actions) == count else ()
+    count = 0 if log.actions is None else count
     return Columns(
-        _named("sensor", "--sensors", width, sensors, logs.sensors),
-        _named(
-            "action",
-            "--actions",
-            count if log.actions is not None else 0,
-            actions,
-            logs.actions if len(logs.actions) == count else (),
-        ),
+        _named("sensor", width, sensors or logs.sensors),
+        _named("action", count, actions or named),
         bool(number),
         logs.start,
     )
 
 
-def _named(kind: str, option: str, count: int, *named: Sequence[Quantity]) -> tuple[Quantity, ...]:
-    numbered = tuple(Quantity(f"{kind} {i}", "1") for i in range(count))
-    columns = next((tuple(quantities) for quantities in named if quantities), numbered)
+def _named(kind: str, count: int, quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    columns = tuple(quantities) or tuple(Quantity(f"{kind} {i}", "1") for i in range(count))
     names = [quantity.name for quantity in columns]
     plain = all(f"{quantity.name}{quantity.unit}".isprintable() for quantity in columns)
     if len(columns) != count or len({*names}) < len(names) or not plain:
         raise UsageError(
             f"there are {count} {kind}s, named {', '.join(names)}: expected as many different "
-            f"names ({option})"
+            f"names (--{kind}s)"
         )
     return columns
 
@@ -307,12 +302,11 @@ def _commands(log: Log, actions: NDArray[Any], columns: Columns) -> NDArray[Any]
 
 def _stacked(episodes: Sequence[_Episode], columns: Columns) -> _Arrays:
     """Return the datasets of a nominal part, empty where there are no episodes."""
-    rows = [np.empty((0, len(columns.sensors)), np.float32)]
-    actions = [np.empty((0, len(columns.actions)), np.float32)]
+    rows, actions = (np.empty((0, len(c)), "f4") for c in (columns.sensors, columns.actions))
     seeds = [e.log.seed for e in episodes]
     return {
-        "observations": np.concatenate(rows + [e.trajectory.observations for e in episodes]),
-        "actions": np.concatenate(actions + [e.trajectory.actions for e in episodes]),
+        "observations": np.concatenate([rows, *(e.trajectory.observations for e in episodes)]),
+        "actions": np.concatenate([actions, *(e.trajectory.actions for e in episodes)]),
         "rewards": np.concatenate([np.empty(0), *(e.rewards for e in episodes)]),
         "offsets": np.cumsum([0, *(e.trajectory.transitions for e in episodes)]),
         "seeds": np.array(range(len(seeds)) if None in seeds else seeds, np.int64),

@@ -48,7 +48,7 @@ ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {
 }
 """Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
 
-_BLOCK: Final = 1 << 21  # bytes that are held at once while content is digested or written
+_BLOCK: Final = 1 << 21  # bytes that are held at once while content is digested
 _LONGEST: Final = 1 << 26  # bytes of one block where chunks are longer
 
 
@@ -58,18 +58,6 @@ class Blocks:
 
     shape: tuple[int, ...]
     blocks: Callable[[], Iterable[NDArray[Any]]]
-
-    def of_length(self, rows: int) -> Iterator[NDArray[Any]]:
-        """Yield the rows in blocks of one length; only the last may be shorter."""
-        held: list[NDArray[Any]] = []
-        for block in self.blocks():
-            held.append(block)
-            while sum(map(len, held)) >= rows:
-                joined = np.concatenate(held)
-                yield joined[:rows]
-                held = [joined[rows:]]
-        if sum(map(len, held)):
-            yield np.concatenate(held)
 
 
 Arrays = Mapping[str, NDArray[Any] | Blocks]
@@ -154,13 +142,8 @@ def check_names(file: str, parts: Mapping[str, Mapping[str, Any]]) -> None:
                 )
 
 
-def content_digest(
-    group: Mapping[str, Any], seen: Callable[[str, int, NDArray[Any]], None] | None = None
-) -> str:
-    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size.
-
-    `seen`, if given, is called with each block: name, number of its first row, rows.
-    """
+def content_digest(group: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of datasets by name, HDF5 or arrays, read in blocks of bounded size."""
     sha = hashlib.sha256()
     for name in sorted(group):
         data = group[name]
@@ -173,8 +156,6 @@ def content_digest(
         for start in range(0, len(data), step):
             block = np.asarray(data[start : start + step]).astype(little, copy=False)
             sha.update(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
-            if seen:
-                seen(name, start, block)
     return sha.hexdigest()
 
 
@@ -279,9 +260,8 @@ def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: 
     gzip = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
     packing = gzip if content.shape[0] * row > 512 else {}  # tiny datasets grow
     dataset = group.create_dataset(name, content.shape, dtype, track_times=False, **packing)
-    # Whole chunks, so that each is compressed once.
-    step, start = dataset.chunks[0] if dataset.chunks else 1, 0
-    for block in content.of_length(step * max(1, _BLOCK // max(1, row * step))):
+    start = 0
+    for block in content.blocks():
         dataset[start : start + len(block)] = block.astype(dtype, copy=False)
         start += len(block)
 

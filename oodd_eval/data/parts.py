@@ -5,6 +5,7 @@ Names, onsets and parameters stay with the harness; a detector is handed `Trajec
 
 import contextlib
 import functools
+import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
@@ -155,84 +156,50 @@ class AnomalousSet(TrajectorySet):
         return bool(np.median(self.tails) < BRIEF_TAIL)
 
 
-class TwinCheck:
-    """Compares an anomalous part with its twins, in the blocks in which it is read.
+def check_twins(
+    source: str, part: Mapping[str, Any], twins: Mapping[str, Any], *, recorded: bool
+) -> None:
+    """Raise `SplitError` unless an anomalous part has an episode for each twin, as labelled.
 
     A `recorded` episode is its twin's, bit for bit, up to its onset; before it, imported ones may
     differ. Of both the effect is the first row from the onset on that differs, or the onset where
-    none does. Nothing is raised before `finish`.
+    none does.
     """
-
-    def __init__(
-        self, part: Mapping[str, Any], twins: Mapping[str, Any], *, recorded: bool
-    ) -> None:
-        self._part, self._twins, self._recorded = part, twins, recorded
-        self._pairs = min(len(part["seeds"]), len(twins["seeds"]))
-        self._first = np.full(len(part["seeds"]), -1)  # rows that differ first
-        self._early = ""
-
-    def __call__(self, name: str, start: int, block: NDArray[Any]) -> None:
-        """Compare rows of a dataset from number `start` on."""
-        if name not in {"observations", "actions"}:
-            return
-        seen = name == "observations"
-        mine, others = (
-            p["offsets"] + seen * np.arange(len(p["offsets"])) for p in (self._part, self._twins)
+    if len(part["seeds"]) != len(twins["seeds"]):
+        raise SplitError(
+            f"{source} has {len(part['seeds'])} trajectories, expected {len(twins['seeds'])}, one "
+            "for each twin"
         )
-        i = int(np.searchsorted(mine, start, side="right")) - 1
-        while i < self._pairs and mine[i] < start + len(block):
-            begin = int(mine[i]) - start
-            common = min(int(mine[i + 1] - mine[i]), int(others[i + 1] - others[i]))
-            onset, effect = (min(int(self._part[k][i]), common) for k in ("onsets", "effects"))
-            spans = [(0, onset)] * self._recorded
-            spans += [(onset, effect + 1), (effect + 1, common)] * seen
-            for low, high in spans:
-                a, b = max(low, -begin), min(high, common, len(block) - begin)
-                if a < b and self._first[i] < 0:
-                    twin = self._twins[name][int(others[i]) + a : int(others[i]) + b]
-                    self._compare(name, i, a, block[begin + a : begin + b], twin, early=b <= onset)
-            i += 1
-
-    def _compare(
-        self, name: str, i: int, row: int, mine: NDArray[Any], twin: NDArray[Any], *, early: bool
-    ) -> None:
-        differs = (mine.view("<u4") != twin.view("<u4")) if early else mine != twin
-        if differs.any() and early:
-            self._early = self._early or f"{name} of trajectory {i} differ from its twin's"
-        elif differs.any():
-            self._first[i] = row + int(differs.any(axis=1).argmax())
-
-    def finish(self, where: str) -> None:
-        """Raise `SplitError` unless all episodes are as they must be."""
-        part, twins = self._part, self._twins
-        if len(part["seeds"]) != len(twins["seeds"]):
+    spans = (itertools.pairwise(map(int, rows["offsets"])) for rows in (part, twins))
+    for i, ((start, end), (first, last)) in enumerate(zip(*spans, strict=True)):
+        episode = f"{source}: trajectory {i}"
+        onset, effect = int(part["onsets"][i]), int(part["effects"][i])
+        if recorded and part["seeds"][i] != twins["seeds"][i]:
             raise SplitError(
-                f"{where} has {len(part['seeds'])} trajectories, expected "
-                f"{len(twins['seeds'])}, one for each twin"
+                f"{episode} has the seed {part['seeds'][i]}, its twin {twins['seeds'][i]}, "
+                "expected the same"
             )
-        onsets, effects = part["onsets"], part["effects"]
-        first = np.where(self._first < 0, onsets, self._first)
-        for i in np.flatnonzero(part["seeds"] != twins["seeds"]) if self._recorded else ():
+        if recorded and onset < FIRST_ONSET:
             raise SplitError(
-                f"{where}: trajectory {i} has the seed {part['seeds'][i]}, its twin "
-                f"{twins['seeds'][i]}, expected the same"
+                f"{episode} has its onset at row {onset}, expected {FIRST_ONSET} or a later row"
             )
-        for i in np.flatnonzero(onsets < FIRST_ONSET) if self._recorded else ():
+        if effect > last - first:
+            raise SplitError(f"{episode} has its effect at row {effect}, behind its twin's end")
+        common = min(end - start, last - first) + 1  # observations that both have
+        rows = part["observations"][start + i : start + i + common]
+        nominal = twins["observations"][first + i : first + i + common]
+        actions = part["actions"][start : start + onset], twins["actions"][first : first + onset]
+        pairs = {"observations": (rows[:onset], nominal[:onset]), "actions": actions}
+        for name in (n for n, (a, b) in pairs.items() if recorded and a.tobytes() != b.tobytes()):
             raise SplitError(
-                f"{where}: trajectory {i} has its onset at row {onsets[i]}, expected "
-                f"{FIRST_ONSET} or a later row"
+                f"{source}: {name} of trajectory {i} differ from its twin's before its onset: "
+                "build or fetch it again"
             )
-        for i in np.flatnonzero(effects > np.diff(twins["offsets"])):
+        differs = (rows[onset:] != nominal[onset:]).any(axis=1)
+        if onset + int(differs.argmax()) != effect:
             raise SplitError(
-                f"{where}: trajectory {i} has its effect at row {effects[i]}, behind "
-                "the end of its twin"
-            )
-        if self._early:
-            raise SplitError(f"{where}: {self._early} before its onset: build or fetch it again")
-        for i in np.flatnonzero(first != effects):
-            raise SplitError(
-                f"{where}: trajectory {i} first differs from its twin at row "
-                f"{first[i]}, expected its effect, row {effects[i]}"
+                f"{episode} first differs from its twin at row {onset + int(differs.argmax())}, "
+                f"expected its effect, row {effect}"
             )
 
 

@@ -13,7 +13,7 @@ from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition, in_suite_order
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
-from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, TwinCheck, conditions_in
+from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twins, conditions_in
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
@@ -25,7 +25,7 @@ from oodd_eval.errors import (
 from oodd_eval.names import check_known, select
 
 SHIPPED = Path(__file__).with_name("shipped")  # splits of the package: ``mini``
-_MOST_TWINS: Final = 2**27  # bytes of their rows that are kept while the others are compared
+_KEPT: Final = 2**26  # bytes of a dataset of the test parts that is read at once
 
 
 def split_places(split: "Split") -> tuple[str, ...]:
@@ -331,19 +331,20 @@ class Split:
     ) -> Iterator[GroupCheck]:
         entry = self.manifest["environments"][name]
         recorded = "seed_base" in self.manifest["definition"]
-        # Twins are compared with every other part.
-        twins = {
-            key: rows[:] if rows.nbytes <= _MOST_TWINS else rows
-            for key, rows in parts[TWINS].items()
-        }
+        twins = _read_small(parts[TWINS])
         for group, part in parts.items():
-            names = layout.names_digest(entry) if group == NAMES else ""
-            expected = names or str(entry["groups"][group]["sha256"])
-            pairs = TwinCheck(part, twins, recorded=recorded) if "onsets" in part else None
-            digest = layout.content_digest(twins if group == TWINS else part, pairs)
-            yield GroupCheck(file.name, group, expected, digest)
-            if pairs and digest == expected:
-                pairs.finish(f"{file.name}, group {group}")
+            expected = entry["groups"][group]["sha256"] if group != NAMES else None
+            rows = _read_small(part) if "onsets" in part else twins if group == TWINS else part
+            digest = layout.content_digest(rows)
+            check = GroupCheck(file.name, group, expected or layout.names_digest(entry), digest)
+            yield check
+            if "onsets" in part and check.ok:
+                check_twins(f"{file.name}, group {group}", rows, twins, recorded=recorded)
+
+
+def _read_small(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a part whose datasets are arrays, to be digested and compared, unless too large."""
+    return {name: rows[:] if rows.nbytes <= _KEPT else rows for name, rows in part.items()}
 
 
 @functools.lru_cache(maxsize=32)

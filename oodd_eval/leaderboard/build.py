@@ -24,14 +24,14 @@ from oodd_eval.leaderboard.entry import (
     sections,
 )
 from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
+from oodd_eval.results import tables
 from oodd_eval.results.board import Board
-from oodd_eval.results.directory import without_collector
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
 from oodd_eval.results.report import Section
 from oodd_eval.results.standings import primary_settings
-from oodd_eval.results.tables import Table, layout
+from oodd_eval.results.tables import Table
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -50,7 +50,6 @@ def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool)
     return {"board": board, "entry": entry, "trust": trust, **texts}
 
 
-@without_collector()
 def build(
     entries: Sequence[SubmittedEntry],
     output: Path,
@@ -183,31 +182,31 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    tables = [
-        layout.separability(board),
-        *layout.alarms(ranks),
-        layout.attribution(board, intervals=True, standings=ranks.standings),
-        layout.cost(ranks),
+    body_tables = [
+        tables.separability(board),
+        *tables.alarms(ranks),
+        tables.attribution(board, intervals=True, standings=ranks.standings),
+        tables.cost(ranks),
         *_as_in_the_paper(board),
-        layout.all_metrics(board),
-        *layout.all_alarms(board),
-        layout.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
-        layout.failures(board),
+        tables.all_metrics(board),
+        *tables.all_alarms(board),
+        tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
+        tables.failures(board),
     ]
     body = Section(
         _title(board),
-        findings=layout.findings(board),
-        tables=[table for table in tables if table],
-        notes=layout.notes(board),
+        findings=tables.findings(board),
+        tables=[table for table in body_tables if table],
+        notes=tables.notes(board),
     )
     parts = [
         f"## {escape(body.title)}\n",
         f"{about_split(board)}\n",
         f"{size} As CSV: {files}.\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
-        markdown_table(layout.ranking(ranks, section.trust)),
+        markdown_table(tables.ranking(ranks, section.trust)),
         TEXTS["legend"],
-        *markdown_list(layout.ranking_notes(ranks)),
+        *markdown_list(tables.ranking_notes(ranks)),
         "",
         markdown_body(body),
     ]
@@ -245,7 +244,7 @@ def _as_in_the_paper(board: Board) -> list[Table]:
     It has a column per row of the board, so that it is kept to rows with default parameters.
     """
     records = [r for r in board.records if not r.overrides]
-    return layout.anomaly_groups(Board(records)) if records else []
+    return tables.anomaly_groups(Board(records)) if records else []
 
 
 def _entry(entry: SubmittedEntry) -> str:

@@ -31,12 +31,13 @@ from pydantic import TypeAdapter, ValidationError
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.errors import ResultsError
+from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, expected_cells, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
-from oodd_eval.results.tables import Table, ladder, layout
+from oodd_eval.results.tables import Table
 
 _T = TypeVar("_T")
 
@@ -334,9 +335,9 @@ def suite_sections(directory: Path) -> list[SuiteSection]:
     suites = []
     for path in filter(Path.is_dir, sorted((directory / SUITES).glob("*"))):
         for board in boards(ResultsDirectory(path).records()):
-            graded = ladder.tables(board)
-            tables = graded or [layout.separability(board)]
-            suites.append(SuiteSection(path.name, board, tables, graded=bool(graded)))
+            graded = strengths.strength_tables(board)
+            suite_tables = graded or [tables.separability(board)]
+            suites.append(SuiteSection(path.name, board, suite_tables, graded=bool(graded)))
     return suites
 
 

@@ -13,7 +13,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import AlarmKind
 from oodd_eval.plugins.contract import Detector, StreamingDetector, make_detector
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.explanations import ExplainingDetector, StreamingExplainer
+from oodd_eval.plugins.explanations import ExplainingDetector
 
 Row = NDArray[np.float32]
 
@@ -22,17 +22,14 @@ Row = NDArray[np.float32]
 class DetectorHandle:
     """A detector, with what it takes to make it again.
 
-    `name` is empty for an instance that was passed in; `alarm` is the statistic of its alarms, and
-    `actions` tells whether it gets actions.
+    `alarm` is the statistic of its alarms, and `actions` tells whether it gets actions. `state` has
+    JSON values that `from_state` reads; its name is empty for an instance that was passed in.
     """
 
     detector: Detector
-    name: str
     alarm: AlarmKind
     actions: bool
-    seed: int
-    horizon: int
-    parameters: Mapping[str, Any]
+    state: Mapping[str, Any]
 
     @classmethod
     def make(
@@ -46,7 +43,7 @@ class DetectorHandle:
         """Make the detector of that name, or take an instance."""
         if statistic not in {None, "cusum", "score"}:
             raise UsageError(f"statistic={statistic!r}, expected 'cusum' or 'score'")
-        kind = cast("AlarmKind | None", statistic)
+        kind, name, actions = cast("AlarmKind | None", statistic), "", True
         if isinstance(detector, str):
             offer = discover().offer(detector)
             offer.require()
@@ -54,26 +51,16 @@ class DetectorHandle:
             detector = make_detector(
                 spec.factory, seed=seed, horizon=horizon, parameters=parameters
             )
-            actions = spec.inputs == "observations+actions"
-            return cls(detector, spec.name, kind or spec.alarm, actions, seed, horizon, parameters)
-        if not isinstance(detector, Detector):
+            kind, name, actions = kind or spec.alarm, spec.name, spec.inputs != "observations"
+        elif not isinstance(detector, Detector):
             expected = "a name or an object with the methods fit(nominal) and score(trajectory)"
             raise UsageError(f"detector is {type(detector).__name__}, expected {expected}")
-        return cls(detector, "", kind or "cusum", True, seed, horizon, parameters)
+        state = {"name": name, "statistic": kind or "cusum", "seed": seed, "horizon": horizon}
+        return cls(detector, kind or "cusum", actions, {**state, "parameters": dict(parameters)})
 
     def visible(self, trajectory: Trajectory) -> Trajectory:
         """Return an episode as the detector may see it."""
         return trajectory if self.actions else trajectory.without_actions()
-
-    def state(self) -> dict[str, Any]:
-        """Return what `from_state` reads: JSON values."""
-        return {
-            "name": self.name,
-            "statistic": self.alarm,
-            "seed": self.seed,
-            "horizon": self.horizon,
-            "parameters": dict(self.parameters),
-        }
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], detector: Detector | None) -> Self:
@@ -101,8 +88,7 @@ def streaming(detector: Detector) -> StreamingDetector:
         " which takes longer and longer until reset",
         stacklevel=4,
     )
-    explains = isinstance(detector, ExplainingDetector)
-    return _ExplainedPrefixes(detector) if explains else _Prefixes(detector)
+    return _Prefixes(detector)
 
 
 class _Prefixes:
@@ -111,6 +97,8 @@ class _Prefixes:
     def __init__(self, detector: Any) -> None:
         self._detector = detector
         self.fit, self.score = detector.fit, detector.score
+        if isinstance(detector, ExplainingDetector):
+            self.explain_last = self._explain_last
         self.reset()
 
     def reset(self) -> None:
@@ -124,10 +112,6 @@ class _Prefixes:
         self._sofar = Trajectory(self._observations, self._actions or None)
         return float(self._detector.score(self._sofar)[-1])
 
-
-class _ExplainedPrefixes(_Prefixes, StreamingExplainer):
-    """The same, of a detector that explains."""
-
-    def explain_last(self) -> tuple[NDArray[np.float64], int]:
+    def _explain_last(self) -> tuple[NDArray[np.float64], int]:
         shares, onsets = self._detector.explain(self._sofar)
         return shares[-1], int(onsets[-1])

@@ -342,7 +342,7 @@ class Watchdog:
         save_state(path, kind=KIND, settings={}, arrays=self._limits.arrays())
         nominal = self.rule.standardization
         state = {
-            "made": self._handle.state(),
+            "made": self._handle.state,
             "sensors": self.sensors,
             "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
             "standardization": nominal and [nominal.mean, nominal.std],

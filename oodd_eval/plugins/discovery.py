@@ -111,7 +111,7 @@ class Plugin:
 
     def offer(self, spec: DetectorSpec) -> Offer:
         """Return a spec as an offer; its version names the library that does the work, too."""
-        version = "+".join(filter(None, (_version(self.point), spec.version)))
+        version = "+".join(filter(None, (_metadata(self.point.dist)[1], spec.version)))
         return Offer(spec, self.point.name, self.point.module, _distribution(self.point), version)
 
 
@@ -193,7 +193,7 @@ class Plugins:
         for maker in self._makers():
             function = maker.hook.oodd_detector_from_spec.get_hookimpls()[0].function
             known = (inspect.getdoc(function) or "").partition("\n")[0].removesuffix(".")
-            origin = f"{_distribution(maker.point)} {_version(maker.point)}"
+            origin = " ".join(_metadata(maker.point.dist))
             forms.append((maker.point.name, origin, known))
         return forms
 
@@ -244,7 +244,11 @@ class Plugins:
             if point in self._waiting:
                 self._load(point)
             plugin = self.loaded.get(point.name)
-            if plugin and plugin.point is point and _implements(plugin, "oodd_detector_from_spec"):
+            if (
+                plugin
+                and plugin.point is point
+                and plugin.hook.oodd_detector_from_spec.get_hookimpls()
+            ):
                 yield plugin
 
     def _from_spec(self, text: str) -> Offer:
@@ -330,10 +334,6 @@ def _list_of(returned: object, kind: type[_Spec], hook: str) -> list[_Spec]:
     return returned
 
 
-def _implements(plugin: Plugin, hook: str) -> bool:
-    return bool(getattr(plugin.hook, hook).get_hookimpls())
-
-
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
     for names, expected, fits in _FIELDS:
@@ -342,19 +342,28 @@ def check_detector_spec(spec: DetectorSpec) -> None:
                 raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
 
 
-def _matches(pattern: str, value: object) -> bool:
-    return isinstance(value, str) and bool(re.fullmatch(pattern, value, re.ASCII))
+def _text(pattern: str) -> Callable[[object], bool]:
+    """Return a function that tells whether a value is a text of a pattern."""
+    return lambda value: isinstance(value, str) and bool(re.fullmatch(pattern, value, re.ASCII))
 
 
 def _is_line(value: object) -> bool:
     return isinstance(value, str) and len(value) <= 1000 and value.isprintable()
 
 
+def _are_lines(value: object) -> bool:
+    return isinstance(value, tuple | list) and all(map(_is_line, value))
+
+
+def _is_truth(value: object) -> bool:
+    return isinstance(value, bool)
+
+
 def _declares(parameters: Any) -> bool:
     if parameters is None:
         return True
     declares = isinstance(parameters, type) and is_dataclass(parameters)
-    return declares and all(_matches(PARAMETER_NAME, f.name) for f in fields(parameters))
+    return declares and all(_text(PARAMETER_NAME)(f.name) for f in fields(parameters))
 
 
 def describe(error: BaseException) -> str:
@@ -375,31 +384,20 @@ def printable(reason: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in reason)
 
 
+_INPUTS: Final = ("observations", "observations+actions")
 _FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     (
         "name",
-        "lower-case letters, digits and '-', at most 64, perhaps ':' and a name",
-        lambda value: _matches(SPEC_NAME, value),
+        "lower-case letters, digits, '-', at most 64, perhaps ':' and a name",
+        _text(SPEC_NAME),
     ),
     ("factory", "a function or class", callable),
     ("summary reference extra fit_name", "a printable line of at most 1000 characters", _is_line),
-    (
-        "inputs",
-        "observations or observations+actions",
-        ("observations", "observations+actions").__contains__,
-    ),
+    ("inputs", " or ".join(_INPUTS), _INPUTS.__contains__),
     ("alarm", "cusum or score", ("cusum", "score").__contains__),
-    (
-        "deterministic other_parameters horizon_decides_fit",
-        "True or False",
-        lambda value: isinstance(value, bool),
-    ),
-    (
-        "requires",
-        "names of modules",
-        lambda value: isinstance(value, tuple | list) and all(map(_is_line, value)),
-    ),
-    ("version", "a version such as 1.2", lambda value: _matches("[A-Za-z0-9.+!_-]{0,64}", value)),
+    ("deterministic other_parameters horizon_decides_fit", "True or False", _is_truth),
+    ("requires", "names of modules", _are_lines),
+    ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),
     ("parameters", "a dataclass with fields of ASCII names, or None", _declares),
 )
 """Fields of a spec, what is expected of them, and whether a value is."""
@@ -410,16 +408,14 @@ def _foreign(point: EntryPoint) -> bool:
 
 
 def _distribution(point: EntryPoint) -> str:
-    return _metadata(point.dist)[0] if point.dist else "unknown distribution"
-
-
-def _version(point: EntryPoint) -> str:
-    return _metadata(point.dist)[1] if point.dist else ""
+    return _metadata(point.dist)[0]
 
 
 @functools.lru_cache(maxsize=64)
-def _metadata(distribution: Distribution) -> tuple[str, str]:
+def _metadata(distribution: Distribution | None) -> tuple[str, str]:
     """Return name and version, for which a distribution reads its files anew every time."""
+    if distribution is None:
+        return "unknown distribution", ""
     return distribution.name, distribution.version
 
 

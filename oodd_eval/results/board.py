@@ -10,9 +10,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from oodd_eval.data.condition import Condition
+from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, in_order
-from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -15,16 +16,15 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
 from oodd_eval.names import check_known, select
-from oodd_eval.results import paired, plots
+from oodd_eval.results import plots
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.episode import ScoredEpisode
-from oodd_eval.results.evaluate import Rules, must_be_of, stored_scores
+from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.paired import PairedComparison, row_named
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
+from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
 from oodd_eval.results.strengths import DETECTION, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
@@ -69,10 +69,6 @@ class Results(Sequence[Record]):
         if isinstance(index, slice):
             return Results(self.records[index], self._directory, self._split)
         return self.records[index]
-
-    def __iter__(self) -> Iterator[Record]:
-        """Iterate over the records."""
-        return iter(self.records)
 
     def __repr__(self) -> str:
         """Return one line: how many cells of what, and how many failed."""
@@ -139,9 +135,9 @@ class Results(Sequence[Record]):
         Raises
         ------
         UsageError, ResultsError
-            As `oodd_eval.results.paired.compare`.
+            As `oodd_eval.results.standings.compare_rows`.
         """
-        return paired.compare(self.records, first, second, metric)
+        return compare_rows(self.records, first, second, metric)
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Return a flat mapping for each cell: its identity, its metrics, and its cost.
@@ -269,9 +265,8 @@ class Results(Sequence[Record]):
         ResultsError
             When no row has an alarm at 5 %; others as those of `plot_trajectory`.
         """
-        chosen = [self._row(name) for name in rows] or list({r.setting: 0 for r in self.records})
         curves = {}
-        for setting in chosen:
+        for setting in map(self._row, rows or self.rows):
             records = [r for r in self.records if r.setting == setting and r.ok]
             curves[str(setting)] = [e for episodes in self._episodes(records) for e in episodes]
         return plots.power(curves)
@@ -306,7 +301,9 @@ class Results(Sequence[Record]):
         over = select("environment", environments, dict.fromkeys(r.environment for r in self))
         kinds = select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self))
         chosen = [r for r in self if r.environment in over and r.anomaly in kinds]
-        settings = [self._row(name) for name in rows] or list({r.setting: 0 for r in chosen})
+        settings = [
+            self._row(name) for name in rows or dict.fromkeys(str(r.setting) for r in chosen)
+        ]
         curves: list[dict[str, list[Point]]] = [
             {str(s): curve([r for r in chosen if r.setting == s], name) for s in settings}
             for name in filter(None, (metric, info.null))
@@ -336,19 +333,17 @@ class Results(Sequence[Record]):
                 anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
                 rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
-                pairs = zip(file.parts[record.condition.part], file.parts[TWINS], strict=True)
-                yield [
-                    ScoredEpisode(
-                        record.cell,
-                        i,
-                        scores,
-                        twin,
-                        anomalous[i],
-                        data.twins[i],
-                        sensors,
-                        int(anomalous.onsets[i]),
-                        int(anomalous.effects[i]),
-                        rule,
-                    )
-                    for i, (scores, twin) in enumerate(pairs)
-                ]
+                episodes = zip(
+                    itertools.repeat(record.cell),
+                    itertools.count(),
+                    file.parts[record.condition.part],
+                    file.parts[TWINS],
+                    anomalous,
+                    data.twins,
+                    anomalous.onsets.tolist(),
+                    anomalous.effects.tolist(),
+                    itertools.repeat(sensors),
+                    itertools.repeat(rule),
+                    strict=False,  # under a limit there are scores of the first episodes only
+                )
+                yield list(itertools.starmap(ScoredEpisode, episodes))

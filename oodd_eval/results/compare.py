@@ -3,25 +3,29 @@
 A tolerance is written ``METRIC:[+-]NUMBER[%]``. The sign says which way is worse: ``auc:-0.01``
 fails where the AUC fell by more than 0.01, ``delay:+10%`` where the delay rose by more than 10 % of
 the reference. Without a sign the metric's own worse side is meant; both for one that has none.
+
+A reference is a file of records, such as ``records.jsonl``, without what no comparison needs:
+intervals, values of single trajectories and costs. So it is small, and a change of it can be read.
 """
 
 import math
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final, Literal
 
+from oodd_eval.data.condition import in_suite_order
+from oodd_eval.data.facts import ENVIRONMENTS, in_order
+from oodd_eval.data.files import packed, write_bytes
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
-from oodd_eval.names import check_known
-from oodd_eval.results.board import Conditions, grouped
+from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.names import Predicate, check_known
+from oodd_eval.results.board import Conditions
+from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Cell
-from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.reference import RecordSet
-from oodd_eval.results.report import Section
-from oodd_eval.results.tables import Table
+from oodd_eval.results.record import NAN, Metric, Record
 
 By = Literal["cell", "group", "mean"]
 Side = Literal["+", "-", "±"]
@@ -49,6 +53,35 @@ RESOLUTION: Final = 1e-6  # smaller differences are none: processors order sums 
 
 class NothingInCommonError(ResultsError):
     """Two sets of records of which no two can be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSet:
+    """Records by conditions and cell, and where they are from, as messages name it."""
+
+    where: str
+    boards: dict[Conditions, dict[Cell, Record]]
+
+    @classmethod
+    def of(cls, records: Iterable[Record], where: str = "records") -> "RecordSet":
+        """Arrange records for comparison; of several of one cell, the last one counts."""
+        boards: dict[Conditions, dict[Cell, Record]] = {}
+        for r in records:
+            boards.setdefault(Conditions.of(r), {})[r.cell] = r
+        return cls(where, boards)
+
+    @property
+    def records(self) -> list[Record]:
+        """All records."""
+        return [record for cells in self.boards.values() for record in cells.values()]
+
+    def selected(self, passes: Predicate) -> "RecordSet":
+        """Return the records of those cells only whose text passes."""
+        return RecordSet.of((r for r in self.records if passes(str(r.cell))), self.where)
+
+    def metrics(self) -> list[str]:
+        """Return the names of all metrics that occur, in their order."""
+        return list(dict.fromkeys(name for r in self.records for name in r.metrics))
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,103 +330,51 @@ def _compare_metric(
     return Difference(*figure, "worse" if worse else "better", worse or two_sided)
 
 
-_COLOURS: Final = {"better": "green", "recovered": "green", "within": "yellow"}
+def read_record_set(path: Path | str) -> RecordSet:
+    """Read the records of a results directory or of a file, such as a reference."""
+    path = Path(path)
+    if not path.exists():
+        raise ResultsError(
+            f"no results or reference at {str(path)!r}: expected a results directory, or a file of "
+            "records (*.jsonl) such as oodd-eval compare --write-reference writes"
+        )
+    records = ResultsDirectory(path).records() if path.is_dir() else read_records(path)
+    return RecordSet.of(records, str(path))
 
-_WHOLE: Final = ("failed", "missing", "recovered", "new")  # of cells, for every metric
 
+def write_reference(
+    records: Iterable[Record], path: Path | str, *, keep: Collection[str] = ()
+) -> None:
+    """Write a file of records to compare with later: values, without intervals and costs.
 
-def section(comparison: Comparison, *, everything: bool = False) -> Section:
-    """Return a comparison as part of a report, with its verdict as title.
-
-    Its tables have the differences beyond the tolerance, or `everything`. Cells that are missing
-    with their whole environment or detector are in the notes.
+    Records stand in the order of the benchmark, whatever the order in which cells ran. Metrics to
+    `keep` are the only ones then, with their terms, from which intervals can be made again. A name
+    that ends in ``.gz`` gets a compressed file.
     """
-    listed = comparison.differences
-    if not everything:
-        listed = [d for d in listed if d.verdict not in ("same", "within", "new") and not d.outside]
-    within = [d for d in comparison.differences if d.verdict == "within"]
-    return Section(
-        verdict(comparison),
-        [summary(comparison)],
-        tables=_tables(listed, comparison.by),
-        fold="Differences within the tolerance",
-        folded=_tables(within, comparison.by),
-        notes=[*map(str, comparison.conditions), *comparison.notes],
-    )
+    records = list(records)
+    environments = in_order((r.environment for r in records), ENVIRONMENTS)
+    conditions = in_suite_order(r.condition for r in records)
 
+    def order(r: Record) -> tuple[str, str, int, int, str]:
+        position = environments.index(r.environment), conditions.index(r.condition)
+        return r.split, r.split_digest, *position, str(r.cell)
 
-def _tables(differences: Iterable[Difference], by: By) -> list[Table]:
-    """Return a table for each split and detector; a whole cell takes one row."""
-    header = [by, "metric", "reference", "now", "difference", "tolerance", "verdict"]
-    tables = []
-    for (split, detector), group in by_suite(differences).items():
-        several = Counter((d.scope, d.verdict) for d in group)
-        rows: dict[tuple[str, str], list[str]] = {}
-        colours = []
-        for d in group:
-            metric = d.tolerance.metric
-            row = [metric, _figure(d.reference, metric), _figure(d.now, metric)]
-            row += [change(d), d.tolerance.text]
-            if d.verdict in _WHOLE and several[d.scope, d.verdict] > 1:
-                row = ["all", "", "", change(d), ""]
-            if (d.scope, row[0]) not in rows:
-                colours.append("red" if d.fails else _COLOURS.get(d.verdict, ""))
-                rows[d.scope, row[0]] = [d.scope, *row, d.verdict]
-        title = f"{detector} on {split}"
-        tables.append(Table(title, header, list(rows.values()), labels=2, colours=colours))
-    return tables
-
-
-def by_suite(differences: Iterable[Difference]) -> dict[tuple[str, str], list[Difference]]:
-    """Return differences by split and detector."""
-    return grouped(differences, lambda d: (d.split, d.detector))
-
-
-def change(d: Difference) -> str:
-    """Return the change as printed: an arrow, its size, and percent where those are tolerated."""
-    if d.verdict in ("failed", "missing", "undefined"):
-        return d.reason
-    by = d.now - d.reference
-    if math.isnan(by):
-        return d.reason or UNDEFINED
-    if d.verdict == "same":
-        return "="
-    relative = f" ({by / abs(d.reference):+.1%})" if d.tolerance.percent and d.reference else ""
-    return f"{'↑' if by > 0 else '↓'} {abs(by):.3g}{relative}"
-
-
-def summary(comparison: Comparison) -> str:
-    """Return one sentence: how much was compared, and what came of it."""
-    compared = [d for d in comparison.differences if d.verdict != "new"]
-    units = {"cell": "cells", "group": "group means", "mean": "means"}[comparison.by]
-    metrics = list(dict.fromkeys(d.tolerance.metric for d in compared))
-    counts = Counter(d.verdict for d in compared)
-    verdicts = ", ".join(f"{counts[v]} {v}" for v in MEANINGS if counts[v])
-    new = len({str(d) for d in comparison.differences if d.verdict == "new"})
-    more = f"; {new} new cells are not in the reference" if new else ""
-    name = metrics[0] if len(metrics) == 1 else f"{len(metrics)} metrics"
-    return f"{len(set(map(str, compared)))} {units} compared in {name}: {verdicts}{more}."
-
-
-def verdict(comparison: Comparison) -> str:
-    """Return in a few words whether the comparison fails."""
-    if not comparison.failures:
-        return "Regression check passed"
-    figures = sum(d.verdict != "new" for d in comparison.differences)
-    return f"Regression check failed: {len(comparison.failures)} of {figures} figures"
-
-
-def message(d: Difference) -> str:
-    """Return one line about a difference: figures, change, tolerance and verdict."""
-    ends = d.reference, d.now
-    reference, now = ("undefined" if math.isnan(v) else f"{v:.6g}" for v in ends)
-    figures = f"{d.tolerance.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
-    return f"{figures}, tolerance {d.tolerance.text}"
-
-
-def _figure(value: float, metric: str) -> str:
-    """Return a figure with as many digits as a tolerance may need."""
-    if math.isnan(value):
-        return UNDEFINED
-    steps = metric in NAMES and metric_info(metric).unit == "steps"
-    return f"{value:.2f}" if steps else f"{value:.4f}"
+    versions, lines = ("oodd_eval", "python", "numpy"), []
+    for r in sorted(records, key=order):
+        chosen = {name: m for name, m in r.metrics.items() if name in keep or not keep}
+        metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
+        terms = {name: r.per_trajectory[name] for name in keep if r.ok}
+        kept = replace(
+            r,
+            metrics=metrics,
+            per_trajectory=terms,
+            scores="",
+            seconds_fit=NAN,
+            seconds_score=NAN,
+            steps_scored=None,
+            peak_rss_mb=NAN,
+            provenance={k: v for k, v in r.provenance.items() if k in versions},
+        )
+        lines.append(kept.to_json() + "\n")
+    content = "".join(lines).encode()
+    write_bytes(Path(path), packed(Path(path), content))

@@ -5,7 +5,7 @@
     records.jsonl      one record a line
     scores/<key>.h5    all scores of one unit; also the cache from which a later run resumes
     scores/<key>.sha256  SHA-256 and size of that file, and of the one before it
-    fitted/<key>/      a fitted detector that could save itself, see `oodd_eval.results.fits`
+    fitted/<key>/      a fitted detector that could save itself, see `FitStore`
     logs/<key>.txt     the end of the output of a failing detector, with its traceback
     report.md
 
@@ -13,13 +13,16 @@ Every file is whole or absent, see `oodd_eval.data.files`. A score file that is 
 written is not read; one of an earlier version, without a digest beside it, is.
 """
 
-import gc
+import contextlib
 import hashlib
 import io
+import json
+import math
+import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -30,9 +33,9 @@ from numpy.typing import NDArray
 
 from oodd_eval.data import files
 from oodd_eval.data.bounded import SCORES
+from oodd_eval.data.files import digests
 from oodd_eval.data.stored import child
 from oodd_eval.errors import OutputError, ResultsError
-from oodd_eval.results.fits import FitStore
 from oodd_eval.results.record import Record
 
 RECORDS: Final = "records.jsonl"
@@ -82,7 +85,6 @@ class ResultsDirectory:
         self.path = Path(path)
         self.fits = FitStore(self.path / "fitted")
         self.notes: list[str] = []
-        self._has_records = False
 
     def prepare(self) -> None:
         """Make the directory, and find out before any work is done whether it can be used.
@@ -100,8 +102,7 @@ class ResultsDirectory:
                 f"results directory {str(self.path)!r} cannot be written to: {error.strerror}; "
                 "name another with --output"
             ) from None
-        self._has_records = (self.path / RECORDS).exists()
-        if self._has_records:
+        if (self.path / RECORDS).exists():
             self.records()
         for name in (RECORDS, REPORT):  # users may choose a directory that holds files of theirs
             files.remove_abandoned(self.path, name)
@@ -127,25 +128,16 @@ class ResultsDirectory:
         Newer records replace those of the same cell. A failed one is also replaced by one of the
         same cell with other parameters. Earlier records keep their places and new cells follow.
         Places of replaced cells are filled in the order of `records`, so that the end is the same
-        whether records come at once or one by one. `OutputError`: they cannot be written, or those
-        that were there were removed meanwhile; then the given ones are in a new file.
+        whether records come at once or one by one. `OutputError`: they cannot be written.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
         with files.lock(self.path):
-            existed = (self.path / RECORDS).exists()
-            earlier = self.records() if existed else []
+            earlier = self.records() if (self.path / RECORDS).exists() else []
             merged = _merged(earlier, records)
-            text = "".join(record.to_json() + "\n" for record in merged)
-            files.write_text(self.path / RECORDS, text)
-        removed, self._has_records = self._has_records and not existed, True
-        if removed:
-            raise OutputError(
-                f"{RECORDS} of results directory {str(self.path)!r} was removed while the run went "
-                "on: a new one holds what was scored since; run again for the rest"
-            )
+            self._write(merged)
         return merged
 
     def forget(self, records: Iterable[Record]) -> None:
@@ -153,11 +145,14 @@ class ResultsDirectory:
         gone = {record.identity: record for record in records}
         with files.lock(self.path):
             kept = [r for r in self.records() if r.identity not in gone]
-            text = "".join(record.to_json() + "\n" for record in kept)
-            files.write_text(self.path / RECORDS, text)
+            self._write(kept)
             for key in {r.scores for r in gone.values()} - {r.scores for r in kept} - {""}:
                 for file in (*self._score_paths(key), self.log_path(key)):
                     file.unlink(missing_ok=True)
+
+    def _write(self, records: Iterable[Record]) -> None:
+        text = "".join(record.to_json() + "\n" for record in records)
+        files.write_text(self.path / RECORDS, text)
 
     def log_path(self, key: str) -> Path:
         """Return the place of the log of a failed unit."""
@@ -219,12 +214,12 @@ class ResultsDirectory:
                 for part, expected in lengths.items():
                     if file[part]["offsets"].shape != (len(expected) + 1,):
                         return None
-                    flat, offsets = _rows(file[part]), file[part]["offsets"][:]
-                    if np.diff(offsets).tolist() != list(expected) or len(flat) != offsets[-1]:
+                    stored = _stored_part(file[part])
+                    if list(map(len, stored.sequences)) != list(expected):
                         return None
-                    parts[part] = np.split(flat.astype(np.float64, copy=False), offsets[1:-1])
-                    if columns := _explained(file[part]):
-                        explained[part] = columns
+                    parts[part] = stored.sequences
+                    if stored.explained:
+                        explained[part] = stored.explained
                 cost = {name: float(value) for name, value in file.attrs.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
@@ -237,10 +232,7 @@ class ResultsDirectory:
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Group) and "scores" in item:
-                sequences = np.split(_rows(item), item["offsets"][1:-1])
-                # Files of earlier versions have one order for all parts.
-                order = item.attrs.get("order", item.file.attrs.get("order"))
-                parts[name] = _StoredPart(sequences, order, _explained(item))
+                parts[name] = _stored_part(item)
 
         try:
             with self._opened(key) as file:
@@ -250,13 +242,16 @@ class ResultsDirectory:
         return parts
 
 
-def _rows(part: h5py.Group) -> NDArray[np.float64]:
-    """Return all scores of a part; `ResultsError` when there can be no such number of them."""
+def _stored_part(part: h5py.Group) -> _StoredPart:
+    """Read a part of a score file; `ResultsError` when there can be no such number of scores."""
     stored = child(part, "scores", SCORES.error)
     SCORES.check("scores", stored.dtype, stored.nbytes)
     if stored.ndim != 1:
         raise SCORES.error(f"scores have shape {stored.shape}, expected one column")
-    return np.asarray(stored[:], np.float64)
+    sequences = np.split(np.asarray(stored[:], np.float64), part["offsets"][1:-1])
+    # Files of earlier versions have one order for all parts.
+    order = part.attrs.get("order", part.file.attrs.get("order"))
+    return _StoredPart(sequences, order, _explained(part))
 
 
 def _lines(digests: Path) -> list[str]:
@@ -314,19 +309,6 @@ class RecordWriter:
         return [record for index in sorted(self._finished) for record in self._finished[index]]
 
 
-@contextmanager
-def without_collector() -> Iterator[None]:
-    """Switch Python's garbage collector off: records have no cycles, and it visits all of them."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-@without_collector()
 def read_records(
     file: Path, notes: list[str] | None = None, *, matches: Callable[[str], bool] = bool
 ) -> list[Record]:
@@ -364,10 +346,7 @@ def read_records(
     records: list[Record] = []
     for number, line in enumerate(lines, start=1):
         if line.strip() and matches(line):
-            record = Record.from_json(line, f"{file}:{number}")
-            if records:
-                record.share(records[-1])
-            records.append(record)
+            records.append(Record.from_json(line, f"{file}:{number}"))
     return records
 
 
@@ -387,3 +366,86 @@ def _attempt(record: Record) -> tuple[object, ...]:
     """Return the identity of a cell without parameters: a later attempt replaces a failed one."""
     cell = replace(record.cell, setting=replace(record.cell.setting, parameters=()))
     return cell, record.split_digest, record.limit
+
+
+INDEX: Final = "fitted.json"
+
+MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
+_MAX_INDEX: Final = 10**7
+
+
+class KeptFit(NamedTuple):
+    """A fitted detector that can be loaded: its directory, and the seconds that its fit took."""
+
+    path: Path
+    seconds_fit: float
+
+
+class FitStore:
+    """Fitted detectors below one directory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._kept: set[str] = set()
+
+    def has(self, key: str, *, fresh: bool = False) -> bool:
+        """Tell whether a fit is kept under a key; when `fresh`, only one that this object kept."""
+        return (key in self._kept or not fresh) and (self.path / key / INDEX).is_file()
+
+    def find(self, key: str, *, fresh: bool = False) -> KeptFit | None:
+        """Return the fit kept under a key; None when there is none, or its files were damaged."""
+        if not self.has(key, fresh=fresh):
+            return None
+        path = self.path / key
+        try:
+            if _size(path) > MAX_BYTES or (path / INDEX).stat().st_size > _MAX_INDEX:
+                return None
+            index = json.loads((path / INDEX).read_text(encoding="utf-8"))
+            seconds = float(index["seconds_fit"])
+            if digests(path, without=INDEX) != index["files"] or not 0 <= seconds < math.inf:
+                return None
+            return KeptFit(path, seconds)
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            return None
+
+    @contextlib.contextmanager
+    def filling(self) -> Iterator[Path]:
+        """Yield an empty directory for a detector to save itself in; remove it afterwards.
+
+        `OutputError`: it cannot be made.
+        """
+        suffix = f".{os.getpid()}"
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            path = Path(tempfile.mkdtemp(prefix=".", suffix=suffix, dir=self.path))
+        except OSError as error:
+            raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
+        try:
+            yield path
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
+        """Move a filled directory to its key; do nothing when it is empty or too large.
+
+        Nor where it cannot be written: without it, another run fits again.
+        """
+        # Another process may have been quicker; then its result, the same, stays.
+        with contextlib.suppress(OSError):
+            # Sizes first: a file may be said to hold more than there is room for.
+            if _size(directory) > MAX_BYTES or not (files := digests(directory, without=INDEX)):
+                return
+            index = {"files": files, "seconds_fit": seconds_fit}
+            (directory / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")
+            shutil.rmtree(self.path / key, ignore_errors=True)
+            directory.rename(self.path / key)
+            self._kept.add(key)
+
+    def distrust(self, key: str) -> None:
+        """Treat the fit under a key as an earlier run's: it could not be loaded."""
+        self._kept.discard(key)
+
+
+def _size(directory: Path) -> int:
+    """Return the bytes of all files below a directory."""
+    return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())

@@ -1,6 +1,5 @@
 """From the scores of a cell to its metrics with intervals, and to its record."""
 
-import functools
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +9,17 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
 from oodd_eval.data.split import Split
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import alarms
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import HEADLINE, IntervalKind, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, Metric, Record
 
 
@@ -72,18 +73,9 @@ def cell_metrics(
 
 def metric_of(name: str, contribution: Contribution, environment: str) -> Metric:
     """Return a metric of a cell with its interval, from its terms."""
-    terms = contribution.numerator.tobytes(), contribution.denominator.tobytes()
-    ends = _interval(metric_info(name).interval, environment, contribution.median, *terms)
+    cell = drawn_cell(environment, 0, contribution)
+    ends = mean_interval([cell], kind=metric_info(name).interval)
     return Metric(contribution.value, *ends, n=contribution.n)
-
-
-@functools.lru_cache(maxsize=4096)
-def _interval(
-    kind: IntervalKind, environment: str, median: bool, numerator: bytes, denominator: bytes
-) -> tuple[float, float]:
-    """Return the interval of a metric. Many metrics of a detector have the same terms."""
-    terms = Contribution(np.frombuffer(numerator), np.frombuffer(denominator), median)
-    return mean_interval([drawn_cell(environment, 0, terms)], kind=kind)
 
 
 def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
@@ -159,3 +151,71 @@ def stored_scores(
             "--stored"
         )
     return scores
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredEpisode:
+    """An anomalous episode beside its nominal twin, with the scores of both.
+
+    Attributes
+    ----------
+    cell, index
+        The cell, and the index of the episode among the cell's.
+    scores, twin_scores
+        One for each observation, NaN where undefined.
+    trajectory, twin
+        The episodes, of T + 1 observations each.
+    onset, effect
+        The row from which the anomaly is in force, and the first that differs from the twin's.
+    sensors
+        Names of the sensors, in the order of columns.
+    rule
+        The guaranteed alarm at 5 %; None where there are too few calibration episodes for it.
+    """
+
+    cell: Cell
+    index: int
+    scores: Floats
+    twin_scores: Floats
+    trajectory: Trajectory
+    twin: Trajectory
+    onset: int
+    effect: int
+    sensors: tuple[str, ...]
+    rule: GuaranteedAlarm | None
+
+    @property
+    def alarm(self) -> int | None:
+        """The row of the first alarm; None without one."""
+        return self.rule.first(self.scores) if self.rule else None
+
+    def delay(self, *, of_twin: bool = False) -> float:
+        """Return the number of rows from the effect to the first alarm.
+
+        Parameters
+        ----------
+        of_twin
+            Whether the alarm is one of the twin, which is a false one.
+
+        Returns
+        -------
+        float
+            Infinite without an alarm; NaN where that precedes the effect, or no row follows it.
+        """
+        scores = self.twin_scores if of_twin else self.scores
+        first = self.rule.first(scores) if self.rule else None
+        if self.rule is None or len(scores) <= self.effect:
+            return math.nan
+        if first is None:
+            return math.inf
+        return first - self.effect if first >= self.effect else math.nan
+
+    def __repr__(self) -> str:
+        """Return what happened when: the arrays would fill screens."""
+        return (
+            f"ScoredEpisode({self.cell}, index={self.index}, rows={len(self.scores)}, "
+            f"onset={self.onset}, effect={self.effect}, alarm={self.alarm})"
+        )

@@ -1,16 +1,15 @@
 """The identity of results: which detector setting was evaluated, and on which cell.
 
 A `Setting` is a row of a board. A `Cell` is one evaluation: split x environment x anomaly x setting
-x seed. Both are written and read as text here and nowhere else. The device that computed a result
+x seed. Their texts are written here and nowhere else. The device that computed a result
 is no part of its identity.
 """
 
-import functools
 import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import UsageError
@@ -62,10 +61,8 @@ class Setting:
         -------
         Setting
         """
-        if not overrides:  # as in most of the tens of thousands of records that a board reads
-            return _plain(detector, horizon)
-        names = sorted(overrides)
-        texts = ((k, json.dumps(overrides[k], sort_keys=True, default=str)) for k in names)
+        items = sorted((overrides or {}).items())
+        texts = ((k, json.dumps(value, sort_keys=True, default=str)) for k, value in items)
         return cls(detector, horizon, tuple(texts))
 
     @property
@@ -101,9 +98,6 @@ class Setting:
         return _bracketed(self.detector, {"h": self.horizon, "seed": seed, **self.overrides})
 
 
-_plain: Final = functools.lru_cache(maxsize=1024)(Setting)
-
-
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One evaluation.
@@ -124,8 +118,6 @@ class Cell:
     >>> cell = Cell("mini", "hopper", Condition("iid"), Setting("riqn"), seed=0)
     >>> str(cell)
     'mini/hopper/iid::riqn[h=1,seed=0]'
-    >>> Cell.parse(str(cell)) == cell
-    True
     """
 
     split: str
@@ -142,20 +134,6 @@ class Cell:
     def label(self) -> str:
         """Setting and seed, such as ``riqn[h=1,seed=0]``."""
         return self.setting.label(self.seed)
-
-    @classmethod
-    def parse(cls, text: str) -> "Cell":
-        """Read what `str` writes; a text of another form raises `UsageError`."""
-        match = re.fullmatch(r"([^/:]+)/([^/:]+)/([^/:@]+(?:@[^/:]+)?)::([^\[]+)\[(.*)\]", text)
-        settings = _read_settings(match[5]) if match else None
-        if match is None or settings is None or not {"h", "seed"} <= settings.keys():
-            raise UsageError(
-                f"{text!r} is no cell: expected SPLIT/ENVIRONMENT/ANOMALY::DETECTOR[h=N,seed=N]"
-            )
-        split, environment, condition, detector, _ = match.groups()
-        horizon, seed = settings.pop("h"), settings.pop("seed")
-        setting = Setting.of(detector, horizon, settings)
-        return cls(split, environment, Condition.parse(condition), setting, seed)
 
 
 def _bracketed(detector: str, settings: Mapping[str, Any]) -> str:

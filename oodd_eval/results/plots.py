@@ -9,7 +9,7 @@ import numpy as np
 
 from oodd_eval.errors import MissingExtraError, ResultsError
 from oodd_eval.metrics.catalogue import MetricInfo
-from oodd_eval.results.episode import ScoredEpisode
+from oodd_eval.results.evaluate import ScoredEpisode
 from oodd_eval.results.strengths import Point
 
 if TYPE_CHECKING:
@@ -44,11 +44,9 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     spread = np.maximum(twin.std(axis=0), 1e-6)
     apart = np.abs(rows[:common] - twin[:common]).mean(axis=0) / spread
     for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
-        mean = twin[:, d].mean()
-        upper.plot((twin[:, d] - mean) / spread[d], "--", color=colour, linewidth=0.8, alpha=0.5)
-        upper.plot(
-            (rows[:, d] - mean) / spread[d], color=colour, linewidth=0.8, label=episode.sensors[d]
-        )
+        nominal, anomalous = ((part[:, d] - twin[:, d].mean()) / spread[d] for part in (twin, rows))
+        upper.plot(nominal, "--", color=colour, linewidth=0.8, alpha=0.5)
+        upper.plot(anomalous, color=colour, linewidth=0.8, label=episode.sensors[d])
     upper.set_ylabel("sensor (std. of twin)")
     upper.axvline(episode.onset, color="0.5", linewidth=1)
     _beside(upper)
@@ -64,21 +62,11 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     lower.axvline(episode.onset, color="0.5", linewidth=1, label="onset")
     if rule is not None and np.isfinite(rule.threshold):
         lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label="threshold at 5 %")
-        anomalous = rule.statistic(episode.scores)
         # The first rows beyond the threshold matter, not how far it goes.
-        nominal = max(*rule.statistic(episode.twin_scores), rule.threshold)
-        top = max(1.2 * nominal, min(1.1 * anomalous.max(), 4 * nominal))
-        if top > 0:
-            least = np.nanmin([np.nanmin(line.get_ydata()) for line in lower.lines[:2]])
-            lower.set_ylim(min(0.0, least) - 0.05 * top, top)
+        lower.set_yscale("symlog", linthresh=abs(rule.threshold) or 1.0)
         if (alarm := episode.alarm) is not None:
-            lower.plot(
-                alarm,
-                min(anomalous[alarm], 0.95 * top),
-                "v",
-                color=COLOURS[1],
-                label=f"alarm at row {alarm}",
-            )
+            height = rule.statistic(episode.scores)[alarm]
+            lower.plot(alarm, height, "v", color=COLOURS[1], label=f"alarm at row {alarm}")
     _beside(lower)
     return figure
 
@@ -101,14 +89,8 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
         for twins, style in ((False, "-"), (True, ":")):
             delays = np.array([e.delay(of_twin=twins) for e in episodes])
             share = (delays[~np.isnan(delays), None] <= rows).mean(axis=0)
-            axis.step(
-                rows + 1,
-                100 * share,
-                style,
-                where="post",
-                color=colour,
-                label=None if twins else name,
-            )
+            label = None if twins else name
+            axis.step(rows + 1, 100 * share, style, where="post", color=colour, label=label)
     axis.set_xscale("log")
     axis.set_xlabel("rows from the effect on (dotted: alarms of the nominal twins)")
     axis.set_ylabel("episodes with an alarm (%)")
@@ -130,21 +112,12 @@ def ladder(
     left = axes[0]
     percent = 100 if metric.unit == "percent" else 1
     for (name, points), colour in zip(curves.items(), COLOURS * 9, strict=False):
-        for drawn, style in ((points, "o-"), (nulls.get(name, ()), ":")):
-            label = name if style == "o-" else None
-            against = [p.strength for p in drawn], [100 * p.lost for p in drawn]
-            for axis, x in zip(axes, against, strict=False):
+        for label, drawn, style in ((name, points, "o-"), (None, nulls.get(name, ()), ":")):
+            strength, lost, value = np.array(drawn).reshape(-1, 3).T * ([1], [100], [percent])
+            look = {"color": colour, "markersize": 3, "linewidth": 1.2 if label else 0.8}
+            for axis, x in zip(axes, (strength, lost), strict=False):
                 known = ~np.isnan(x)
-                y = percent * np.array([p.value for p in drawn])
-                axis.plot(
-                    np.array(x)[known],
-                    y[known],
-                    style,
-                    color=colour,
-                    markersize=3,
-                    linewidth=1.2 if label else 0.8,
-                    label=label,
-                )
+                axis.plot(x[known], value[known], style, label=label, **look)
     left.set_xscale("log")
     left.set_xlabel("strength (1: costs 1 % of the return)" if costs else "strength")
     axes[-1].set_xlabel("return lost (%)" if costs else "strength")

@@ -8,14 +8,27 @@ import functools
 import itertools
 import json
 import math
+import platform
+import subprocess
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, GetPydanticSchema, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    GetPydanticSchema,
+    TypeAdapter,
+    ValidationError,
+)
 
+from oodd_eval._version import __version__
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
@@ -31,15 +44,18 @@ STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 
 NAN: Final = float("nan")
 
-_COSTS: Final = ("seconds_fit", "seconds_score", "peak_rss_mb")
-
 Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None else value)]
 """A number that is read from null where it is NaN."""
 
 
-Terms = Annotated[
-    NDArray[np.float64], GetPydanticSchema(lambda _, read: read(tuple[list[float], list[float]]))
-]
+def _as_many(terms: tuple[list[float], list[float]]) -> tuple[list[float], list[float]]:
+    if len(terms[0]) != len(terms[1]):
+        raise ValueError(f"{len(terms[0])} numerators and {len(terms[1])} denominators")
+    return terms
+
+
+_Pair = Annotated[tuple[list[float], list[float]], AfterValidator(_as_many)]
+Terms = Annotated[NDArray[np.float64], GetPydanticSchema(lambda _, read: read(_Pair))]
 """Numerators and denominators of a ratio of sums: shape (2, n)."""
 
 
@@ -204,16 +220,13 @@ class Record:
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         if self.magnitude is None:
             del plain["magnitude"]
-        plain |= {name: _finite(plain[name]) for name in _COSTS}
-        plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
         plain["metrics"] = {
-            name: {e: _finite(getattr(m, e)) for e in ("value", "low", "high")} | {"n": m.n}
+            name: {"value": m.value, "low": m.low, "high": m.high, "n": m.n}
             for name, m in self.metrics.items()
         }
-        try:
-            return json.dumps(plain, allow_nan=False)
-        except (TypeError, ValueError):  # A NaN in a parameter, say, which is rare.
-            return json.dumps(_without_nan(plain), allow_nan=False)
+        plain = _without_nan(plain | {"per_trajectory": {}})  # terms are finite, and many
+        plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
+        return json.dumps(plain, allow_nan=False)
 
     @classmethod
     def from_json(cls, line: str, where: str = "record") -> "Record":
@@ -227,36 +240,13 @@ class Record:
             raise ResultsError(f"{where} {_problem(line, error)}") from None
         if record.schema != SCHEMA:
             raise ResultsError(f"{where} {_other_schema(record.schema)}")
-        for name, (tops, bottoms) in record.per_trajectory.items():
-            if len(tops) != len(bottoms):
-                raise ResultsError(
-                    f"{where} is no record: per_trajectory.{name}: {len(tops)} numerators and "
-                    f"{len(bottoms)} denominators, expected as many of both"
-                )
         # Safe though frozen: the record has not been returned yet.
         object.__setattr__(record, "per_trajectory", _compact(record.per_trajectory))
         return record
 
-    def share(self, other: "Record") -> None:
-        """Hold equal values that take much memory once; the records of a fit have the same."""
-        for name in _SHARED:
-            if getattr(self, name) == (value := getattr(other, name)):
-                object.__setattr__(self, name, value)
-
 
 _READER: Final = TypeAdapter(Record)
 _PLAIN: Final = tuple(f.name for f in fields(Record) if f.name != "per_trajectory")
-
-
-_SHARED: Final = (
-    "parameters",
-    "overrides",
-    "counts",
-    "provenance",
-    "plugin_source",
-    "split_digest",
-    "scores",
-)
 
 
 class CompactTerms(Mapping[str, Terms]):
@@ -339,17 +329,67 @@ def _other_schema(schema: object) -> str:
     )
 
 
-def _finite(value: float) -> float | None:
-    """Return a number, or None where it is NaN or infinite."""
-    return value if math.isfinite(value) else None
-
-
 def _without_nan(value: Any) -> Any:
     """Replace numbers that JSON does not know by None, at any depth."""
     if isinstance(value, float):
-        return _finite(value)
+        return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(k): _without_nan(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_without_nan(v) for v in value]
     return value
+
+
+PACKAGES: Final = ("h5py", "numpy", "scikit-learn", "scipy", "torch")  # scores depend on them
+
+_HOME: Final = Path(__file__).parents[1]
+
+
+def gather(command: str = "") -> dict[str, Any]:
+    """Return the provenance of results computed now, on this machine."""
+    return {
+        "oodd_eval": __version__,
+        **_commit(),
+        "command": command,
+        "python": platform.python_version(),
+        "packages": packages(),
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def packages() -> dict[str, str]:
+    """Return the installed versions of `PACKAGES`."""
+    versions = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
+
+
+def _commit() -> dict[str, Any]:
+    """Return commit and dirty flag when the harness runs from a checkout of its own."""
+    try:
+        _git("ls-files", "--error-unmatch", "__init__.py")
+        return {"git_commit": _git("rev-parse", "HEAD"), "git_dirty": bool(_git("status", "-s"))}
+    except (OSError, subprocess.SubprocessError):
+        return {"git_commit": None, "git_dirty": None}
+
+
+def _git(*arguments: str) -> str:
+    # Whichever git is on the path. Killed while it holds the index, it would leave a lock behind.
+    command = ["git", "--no-optional-locks", *arguments]
+    text = subprocess.check_output(  # noqa: S603  fixed arguments
+        command, cwd=_HOME, stderr=subprocess.DEVNULL, text=True, timeout=10
+    )
+    return text.strip()
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.processor() or platform.machine()

@@ -1,15 +1,19 @@
 """A report: one document of sections with tables and sentences, which renderers write as text."""
 
 import functools
-from collections.abc import Iterator, Sequence
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
-from oodd_eval.metrics.catalogue import RANKING
-from oodd_eval.results.board import Board, boards
+from oodd_eval.metrics.catalogue import NAMES, RANKING, UNDEFINED, metric_info
+from oodd_eval.results import strengths, tables
+from oodd_eval.results.board import Board, boards, grouped
+from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.strengths import thresholds
-from oodd_eval.results.tables import Table, ladder, layout
+from oodd_eval.results.tables import Table
 
 Detail = Literal["brief", "wide", "full"]
 
@@ -81,33 +85,35 @@ class Report:
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
-            layout.findings(board),
+            tables.findings(board),
             [table for table in self._tables(board) if table],
-            notes=layout.notes(board),
+            notes=tables.notes(board),
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         intervals, full = self.intervals, self.detail == "full"
-        yield layout.separability(board, intervals=intervals)
-        yield layout.guaranteed(board, intervals=intervals)
-        yield layout.attribution(board, intervals=intervals)
-        yield from ladder.tables(board, intervals=intervals, places=full)
-        yield from layout.anomaly_groups(board, intervals=intervals)
+        yield tables.separability(board, intervals=intervals)
+        yield tables.guaranteed(board, intervals=intervals)
+        yield tables.attribution(board, intervals=intervals)
+        yield from strengths.strength_tables(board, intervals=intervals, places=full)
+        yield from tables.anomaly_groups(board, intervals=intervals)
         if self.detail != "brief":
-            yield layout.all_metrics(board, intervals=intervals)
-            yield from layout.all_alarms(board, intervals=intervals)
+            yield tables.all_metrics(board, intervals=intervals)
+            yield from tables.all_alarms(board, intervals=intervals)
         if full:
-            yield from (layout.by_anomaly(board, e, intervals=intervals) for e in board.entries)
-            yield layout.failures(board)
+            yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
+            yield tables.failures(board)
 
     def _of_detector(self, board: Board) -> Section:
-        tables = []
+        title = f"{self.detector} on split {board.split}"
+        return Section(title, tables=list(self._tables_of_detector(board)))
+
+    def _tables_of_detector(self, board: Board) -> Iterator[Table]:
         for entry in (e for e in board.entries if e.detector == self.detector):
-            tables.append(layout.by_anomaly(board, entry, self.metric, intervals=self.intervals))
-            strengths = thresholds([r for r in board.records if r.setting == entry])
-            if strengths.get(entry):
-                tables.append(ladder.by_place(board, entry, strengths, intervals=self.intervals))
-        return Section(f"{self.detector} on split {board.split}", tables=tables)
+            yield tables.by_anomaly(board, entry, self.metric, intervals=self.intervals)
+            by_row = thresholds([r for r in board.records if r.setting == entry])
+            if by_row.get(entry):
+                yield strengths.by_place(board, entry, by_row, intervals=self.intervals)
 
 
 def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
@@ -139,3 +145,95 @@ def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
         }
         for r in records
     ]
+
+
+_COLOURS: Final = {"better": "green", "recovered": "green", "within": "yellow"}
+
+_WHOLE: Final = ("failed", "missing", "recovered", "new")  # of cells, for every metric
+
+
+def comparison_section(comparison: Comparison, *, everything: bool = False) -> Section:
+    """Return a comparison as part of a report: its verdict is the title, its counts are the fact.
+
+    Its tables have the differences beyond the tolerance, or `everything`. Cells that are missing
+    with their whole environment or detector are in the notes.
+    """
+    compared = [d for d in comparison.differences if d.verdict != "new"]
+    listed = comparison.differences
+    if not everything:
+        listed = [d for d in compared if d.verdict not in ("same", "within") and not d.outside]
+    within = [d for d in compared if d.verdict == "within"]
+    title = "Regression check passed"
+    if failures := len(comparison.failures):
+        title = f"Regression check failed: {failures} of {len(compared)} figures"
+    units = {"cell": "cells", "group": "group means", "mean": "means"}[comparison.by]
+    metrics = list(dict.fromkeys(d.tolerance.metric for d in compared))
+    counts = Counter(d.verdict for d in compared)
+    verdicts = ", ".join(f"{counts[v]} {v}" for v in MEANINGS if counts[v])
+    new = len({str(d) for d in comparison.differences if d.verdict == "new"})
+    more = f"; {new} new cells are not in the reference" if new else ""
+    name = metrics[0] if len(metrics) == 1 else f"{len(metrics)} metrics"
+    return Section(
+        title,
+        [f"{len(set(map(str, compared)))} {units} compared in {name}: {verdicts}{more}."],
+        tables=_comparison_tables(listed, comparison.by),
+        fold="Differences within the tolerance",
+        folded=_comparison_tables(within, comparison.by),
+        notes=[*map(str, comparison.conditions), *comparison.notes],
+    )
+
+
+def _comparison_tables(differences: Iterable[Difference], by: By) -> list[Table]:
+    """Return a table for each split and detector; a whole cell takes one row."""
+    header = [by, "metric", "reference", "now", "difference", "tolerance", "verdict"]
+    tables = []
+    for (split, detector), group in by_suite(differences).items():
+        several = Counter((d.scope, d.verdict) for d in group)
+        rows: dict[tuple[str, str], list[str]] = {}
+        colours = []
+        for d in group:
+            metric = d.tolerance.metric
+            row = [metric, _figure(d.reference, metric), _figure(d.now, metric)]
+            row += [change(d), d.tolerance.text]
+            if d.verdict in _WHOLE and several[d.scope, d.verdict] > 1:
+                row = ["all", "", "", change(d), ""]
+            if (d.scope, row[0]) not in rows:
+                colours.append("red" if d.fails else _COLOURS.get(d.verdict, ""))
+                rows[d.scope, row[0]] = [d.scope, *row, d.verdict]
+        title = f"{detector} on {split}"
+        tables.append(Table(title, header, list(rows.values()), labels=2, colours=colours))
+    return tables
+
+
+def by_suite(differences: Iterable[Difference]) -> dict[tuple[str, str], list[Difference]]:
+    """Return differences by split and detector."""
+    return grouped(differences, lambda d: (d.split, d.detector))
+
+
+def change(d: Difference) -> str:
+    """Return the change as printed: an arrow, its size, and percent where those are tolerated."""
+    if d.verdict in ("failed", "missing", "undefined"):
+        return d.reason
+    by = d.now - d.reference
+    if math.isnan(by):
+        return d.reason or UNDEFINED
+    if d.verdict == "same":
+        return "="
+    relative = f" ({by / abs(d.reference):+.1%})" if d.tolerance.percent and d.reference else ""
+    return f"{'↑' if by > 0 else '↓'} {abs(by):.3g}{relative}"
+
+
+def message(d: Difference) -> str:
+    """Return one line about a difference: figures, change, tolerance and verdict."""
+    ends = d.reference, d.now
+    reference, now = ("undefined" if math.isnan(v) else f"{v:.6g}" for v in ends)
+    figures = f"{d.tolerance.metric} {d.verdict}: reference {reference}, now {now}, {change(d)}"
+    return f"{figures}, tolerance {d.tolerance.text}"
+
+
+def _figure(value: float, metric: str) -> str:
+    """Return a figure with as many digits as a tolerance may need."""
+    if math.isnan(value):
+        return UNDEFINED
+    steps = metric in NAMES and metric_info(metric).unit == "steps"
+    return f"{value:.2f}" if steps else f"{value:.4f}"

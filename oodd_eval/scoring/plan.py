@@ -1,10 +1,18 @@
 """A plan: the units of a run (one fit each) and their cells (one condition each). Data only.
 
-From names to a plan: settings are resolved and keys are made here, once.
+From names to a plan: settings are resolved and content keys are made here, once. Equal keys mean
+equal scores, or an equal fit. A key covers the plug-in's code and version, the contract's version,
+the detector's parameters, the data and the protocol. Moving a file of the harness changes no key.
 """
 
-from collections.abc import Mapping, Sequence
+import functools
+import hashlib
+import importlib.util
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, Literal
 
 from oodd_eval.data.condition import Condition
@@ -12,13 +20,14 @@ from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
+from oodd_eval.plugins.contract import CONTRACT
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
 from oodd_eval.results.identity import Cell, Setting
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.keys import fit_key, scores_key, source_digest
 
 DEVICES: Final = ("auto", "cpu", "cuda")
+_IMPORT = re.compile(rb"^\s*(?:from|import)\s+(oodd_\w+)", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +208,9 @@ def make_unit(
         "split_digest": split.digest,
         "limit": limit,
     }
-    scores = scores_key(spec.name, environment, {**identity, "protocol": PROTOCOL})
+    # Some file systems take no colons, and some do not tell capitals.
+    name = spec.name.lower().replace(":", "-")
+    scores = f"{name}-{environment}-{_digest(identity | {'protocol': PROTOCOL})[:20]}"
     fit = ""
     if offer.plugin:
         deciding = {name: value for name, value in recorded.items() if kinds[name] == "fit"}
@@ -211,7 +222,8 @@ def make_unit(
         }
         if not spec.horizon_decides_fit:
             same["horizon"] = None
-        fit = fit_key(identity | same)
+        # It tells nothing of the environment, since the worker sees it.
+        fit = _digest(identity | same)[:32]
     return Unit(
         environment=environment,
         setting=Setting.of(spec.name, horizon, overrides),
@@ -229,3 +241,47 @@ def make_unit(
         scores_key=scores,
         fit_key=fit,
     )
+
+
+@functools.cache
+def source_digest(module: str) -> str:
+    """Return the SHA-256 of a plug-in's own packages and of the contract's version.
+
+    These are the package that the entry point names and all packages ``oodd_*`` that it imports.
+    The harness is covered by `CONTRACT`, third-party libraries by the versions in a record's
+    provenance.
+    """
+    content = hashlib.sha256(f"contract {CONTRACT}\0".encode())
+    pending, seen = [module], {"oodd_eval"}
+    files: dict[str, bytes] = {}
+    while pending:
+        top = pending.pop().partition(".")[0]
+        if top in seen:
+            continue
+        seen.add(top)
+        for name, path in _files(top):
+            files[name] = path.read_bytes()
+            if path.suffix == ".py":
+                pending += [package.decode() for package in _IMPORT.findall(files[name])]
+    for name, code in sorted(files.items()):
+        content.update(f"{name}\0{hashlib.sha256(code).hexdigest()}\0".encode())
+    return content.hexdigest()
+
+
+def _files(top: str) -> Iterator[tuple[str, Path]]:
+    """Yield the files of a package, or of a single module, by names free of installation paths."""
+    spec = importlib.util.find_spec(top)
+    if spec is None or spec.origin is None:
+        return
+    origin = Path(spec.origin)
+    if not spec.submodule_search_locations:
+        yield origin.name, origin
+        return
+    for path in origin.parent.rglob("*"):
+        if path.is_file() and path.suffix != ".pyc":
+            yield str(Path(top) / path.relative_to(origin.parent)), path
+
+
+def _digest(identity: Mapping[str, Any]) -> str:
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()

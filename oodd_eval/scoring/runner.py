@@ -4,12 +4,14 @@ The runner prints nothing. Observers (`oodd_eval.scoring.observers`) are called 
 results are the same bytes for any number of jobs.
 """
 
+import math
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
+from queue import SimpleQueue
 from typing import Any
 
 from oodd_eval.data.files import write_text
@@ -17,8 +19,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
 from oodd_eval.results.evaluate import evaluated
-from oodd_eval.results.provenance import gather
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan
@@ -102,23 +103,18 @@ def _as_they_finish(
 
     Only a few more units are begun than are taken, so that few scores are in memory.
     """
-    end = None if settings.deadline is None else time.monotonic() + settings.deadline
+    end = math.inf if settings.deadline is None else time.monotonic() + settings.deadline
     # With twice as many, no thread is idle while records are made. What waits in the pool begins
     # later, however, which a deadline forbids.
-    most = executor.jobs * (2 if end is None else 1)
+    most = executor.jobs * (2 if end == math.inf else 1)
     waiting = _in_dependence(jobs, executor, settings, results)
     waiting.prepare()
     ready: list[int] = []
-    running: dict[Future[Scored], int] = {}
-    announced: set[int] = set()
+    events: SimpleQueue[int | Future[tuple[int, Scored]]] = SimpleQueue()
+    running = 0
 
-    def begun() -> list[int]:
-        """Return the jobs at work that are not announced: the pool takes them in their order."""
-        new = [index for index in [*running.values()][: executor.jobs] if index not in announced]
-        announced.update(new)
-        return new
-
-    def score(job: UnitJob) -> Scored:
+    def score(index: int) -> Scored:
+        job = jobs[index]
         scored = executor(job)
         if results:
             if scored.status == "ok" and not scored.resumed:
@@ -127,33 +123,34 @@ def _as_they_finish(
                 write_text(results.log_path(job.unit.scores_key), scored.log)
         return scored
 
+    def begin(index: int) -> tuple[int, Scored]:
+        events.put(index)
+        return index, score(index)
+
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
     try:
         while waiting.is_active():
             ready = sorted([*ready, *waiting.get_ready()])
-            while ready and len(running) < most:
-                if end is not None and time.monotonic() >= end:
-                    ready.clear()
-                    break
+            while ready and running < most and time.monotonic() < end:
                 index = ready.pop(0)
                 if jobs[index].unit.local:
                     yield index, None
-                    yield index, score(jobs[index])  # in this thread, where it can be interrupted
+                    yield index, score(index)  # in this thread, where it can be interrupted
                     waiting.done(index)
                     ready = sorted([*ready, *waiting.get_ready()])
                 else:
-                    running[pool.submit(score, jobs[index])] = index
-            yield from ((index, None) for index in begun())
+                    pool.submit(begin, index).add_done_callback(events.put)
+                    running += 1
             if not running:
                 return
-            finished = wait(running, return_when=FIRST_COMPLETED).done
-            for future in [f for f in running if f in finished]:
-                index = running.pop(future)
-                waiting.done(index)
-                if index not in announced:  # it began and finished since jobs were last announced
-                    announced.add(index)
-                    yield index, None
-                yield index, future.result()
+            event = events.get()
+            if isinstance(event, int):
+                yield event, None
+                continue
+            running -= 1
+            index, scored = event.result()
+            waiting.done(index)
+            yield index, scored
     finally:
         executor.stop()
         pool.shutdown(wait=True, cancel_futures=True)

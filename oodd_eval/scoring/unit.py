@@ -26,8 +26,7 @@ from oodd_eval.plugins.discovery import Offer, printable
 from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.isolation.child import Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
-from oodd_eval.results.directory import ORDER_BITS, ResultsDirectory, ScoreFile
-from oodd_eval.results.fits import FitStore
+from oodd_eval.results.directory import ORDER_BITS, FitStore, ResultsDirectory, ScoreFile
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 

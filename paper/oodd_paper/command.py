@@ -11,7 +11,7 @@ from oodd_eval.names import check_known, select
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.terminal import print_table
+from oodd_eval.results.render.text import print_table
 from oodd_eval.scoring.executors import RunSettings, available_cores
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.runner import RunOutcome, run

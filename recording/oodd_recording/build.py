@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.condition import Condition
+from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
 from oodd_eval.data.files import remove_abandoned, replacing
-from oodd_eval.data.ladder import conditions_of
 from oodd_eval.data.layout import Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
@@ -299,8 +298,9 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
             for future in as_completed(running):
                 future.result()
                 yield running[future]
-        finally:
+        except BaseException:  # an interrupt, too, does not wait for what is recorded now
             pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 @contextlib.contextmanager

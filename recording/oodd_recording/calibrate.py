@@ -21,10 +21,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.condition import FRACTIONS, LEVELS, PAPER
+from oodd_eval.data.condition import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
 from oodd_eval.data.files import write_text
-from oodd_eval.data.ladder import ROBOTS_CAP, WHOLE
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
 from oodd_recording.policies import load_policy

@@ -296,14 +296,20 @@ def _mass(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> F
     return _setting(["body_mass"], 1 + strength)
 
 
-def _components(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
-    """Scale a random non-empty subset: lengths and masses grow, powers shrink."""
+def choose_attributes(environment: str, rng: np.random.Generator) -> list[str]:
+    """Draw a non-empty subset of an environment's components, each subset as likely."""
     known = sorted(VALUES["components"][environment])
     names: list[str] = []
     while not names:
         chosen = rng.random(len(known)) < 0.5
         names = [name for name, use in zip(known, chosen, strict=True) if use]
-    weaker = any("power" in name for name in known)
+    return names
+
+
+def _components(environment: str, strength: float, _: Simulator, rng: Any) -> Fault:
+    """Scale a random non-empty subset: lengths and masses grow, powers shrink."""
+    names = choose_attributes(environment, rng)
+    weaker = any("power" in name for name in VALUES["components"][environment])
     return _setting(names, 1 - strength if weaker else 1 + strength, attributes=names)
 
 

@@ -40,8 +40,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.keys import source_digest
-from oodd_eval.scoring.plan import Plan, make_plan
+from oodd_eval.scoring.plan import Plan, make_plan, source_digest
 from oodd_eval.scoring.runner import run
 from oodd_recording.commands import record_split
 

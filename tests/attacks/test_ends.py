@@ -150,21 +150,6 @@ def test_what_a_plugin_leaves_at_import_holds_nothing_up(monkeypatch, tmp_path, 
     assert time.monotonic() - start < 60
 
 
-MOVES = {
-    "at import": "os.chdir('/')\n@hookimpl\ndef oodd_detectors(): return offer(moves=Good)",
-    "when asked": "@hookimpl\ndef oodd_detectors(): os.chdir('/'); return offer(moves=Good)",
-    "and fails": "@hookimpl\ndef oodd_detectors(): os.chdir('/'); raise ValueError",
-}
-
-
-@pytest.mark.parametrize("code", MOVES.values(), ids=MOVES)
-def test_a_plugin_that_leaves_the_directory_moves_nothing(monkeypatch, tmp_path, code):
-    install(monkeypatch, tmp_path, "moves", code)
-    monkeypatch.chdir(tmp_path)
-    assert discover(only=["moves"]).offers
-    assert Path.cwd() == tmp_path
-
-
 @pytest.mark.parametrize("made", ["None", "1 / 0"])
 def test_a_maker_of_detectors_that_leaves_the_directory(monkeypatch, tmp_path, made):
     code = f"@hookimpl\ndef oodd_detector_from_spec(spec): os.chdir('/'); return {made}"

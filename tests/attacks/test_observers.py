@@ -105,7 +105,8 @@ def test_each_observer_gets_a_copy_of_its_own(tiny_split, monkeypatch, tmp_path)
 
 
 HOOKS = ("oodd_run_started", "oodd_unit_started", "oodd_cell_finished", "oodd_run_finished")
-ENDS = ("sys.exit(0)", "sys.exit()", "raise GeneratorExit", "raise BaseException('x')")
+ENDS = ("sys.exit(0)", "sys.exit()", "raise GeneratorExit", "raise BaseException('x')",
+        "raise ValueError('x')")  # fmt: skip
 
 
 @pytest.mark.parametrize("hook", HOOKS)

@@ -12,7 +12,7 @@ from oodd_adapters.detectors import AdapterParameters, ForecastDetector, Outlier
 from oodd_adapters.names import Signature, forecaster_class, pyod_class, sklearn_class
 from oodd_eval import Detector, DetectorSpec
 from oodd_eval.plugins.parameters import checked, declared_by
-from oodd_eval.scoring.keys import source_digest
+from oodd_eval.scoring.plan import source_digest
 
 _WINDOW_PARAMETERS = frozenset(f.name for f in fields(AdapterParameters))
 

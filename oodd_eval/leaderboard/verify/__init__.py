@@ -51,7 +51,7 @@ from oodd_eval.leaderboard.verify.recompute import (
 )
 from oodd_eval.leaderboard.verify.rerun import Rerun, RerunOrder, compare_rerun
 from oodd_eval.metrics.catalogue import RANKING
-from oodd_eval.results.directory import RECORDS, without_collector
+from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
@@ -95,7 +95,6 @@ class EntryVerdict:
         return "re-scored" if self.rescored else "reported"
 
 
-@without_collector()
 def verify_entry(
     directory: Path,
     *,

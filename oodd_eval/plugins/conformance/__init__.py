@@ -1,6 +1,6 @@
 """Tests that a detector honours the contract, in pytest, and what they came to.
 
-Modules ``test_*.py`` of this package hold the tests; `oodd_eval.testing` is their public face.
+The module `test_detector` holds the tests; `oodd_eval.testing` is their public face.
 """
 
 import textwrap
@@ -72,7 +72,13 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """Results of the checks of one detector; printing it gives a line per check and a summary."""
+    """Results of the checks of one detector; printing it gives a line per check and a summary.
+
+    Parameters
+    ----------
+    results
+        The result of every check, in the order in which they ran.
+    """
 
     results: Sequence[Result] = ()
 
@@ -87,7 +93,13 @@ class CheckReport:
         return [result for result in self.results if not result.ok]
 
     def summary(self) -> str:
-        """Return one line: how many checks there were, and how many came to what."""
+        """Return one line: how many checks there were, and how many came to what.
+
+        Returns
+        -------
+        str
+            Such as ``"32 checks: 29 passed, 3 skipped in 0.4 s"``.
+        """
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[s]} {meaning}" for s, meaning in STATUSES.items() if counts[s]]
         seconds = sum(result.seconds for result in self.results)

@@ -17,19 +17,17 @@ from unittest.mock import patch
 
 import pytest
 
-from oodd_eval.errors import UsageError
-from oodd_eval.plugins.conformance import Result, test_contract, test_effects, test_scores
+from oodd_eval.errors import ContractError, UsageError
+from oodd_eval.plugins.conformance import Result, test_detector
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Offer, offer_of, printable
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
 from oodd_eval.plugins.isolation.worker import connect, reason_of
 
-MODULES: Final = (test_contract, test_scores, test_effects)
 CHECKS: Final[dict[str, Callable[[Trial], None]]] = {
     name.removeprefix("test_").replace("_", "-"): function
-    for module in MODULES
-    for name, function in vars(module).items()
+    for name, function in vars(test_detector).items()
     if name.startswith("test_")
 }
 """The tests by name, in the order in which they run; a docstring says what holds."""
@@ -76,7 +74,7 @@ class _Session:
         if report.skipped:
             message = str(error)
         elif error:
-            failed = isinstance(error, AssertionError)
+            failed = isinstance(error, AssertionError | ContractError)
             message = printable(str(error) if failed else f"the detector raised {reason_of(error)}")
             if cause := error.__cause__ if failed else error:
                 lines = "".join(traceback.format_exception(cause)).splitlines()
@@ -95,9 +93,10 @@ def run_tests(
     """Run tests in this process and call `listener` with each result."""
     if not __debug__:
         raise UsageError("checks of detectors are assertions: run them without python -O")
-    paths = [str(module.__file__) for module in MODULES]
     with patch.dict(os.environ, _VARIABLES):
-        code = pytest.main([*_OPTIONS, *paths], [_Session(trial, checks, listener)])
+        code = pytest.main(
+            [*_OPTIONS, str(test_detector.__file__)], [_Session(trial, checks, listener)]
+        )
     if code == pytest.ExitCode.INTERRUPTED:
         raise KeyboardInterrupt
     if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):

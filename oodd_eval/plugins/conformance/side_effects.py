@@ -13,7 +13,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -25,7 +24,6 @@ import numpy as np
 import psutil
 
 from oodd_eval.data.files import redirected
-from oodd_eval.plugins.isolation.worker import peak_rss_mb
 
 _THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
 
@@ -35,26 +33,16 @@ _UNUSUAL_SEED: Final = 0x0DD
 
 _CALLS: Final = "connect getaddrinfo gethostbyaddr gethostbyname sendmsg sendto"
 _NETWORK: Final = frozenset(f"socket.{call}" for call in _CALLS.split())
-
-# The second argument is the open directory, seen as a whole, that the path is relative to.
-_RELATIVE: Final = frozenset({"os.remove", "os.rmdir", "shutil.rmtree"})
-
-_CHANGES: Final = {
-    **dict.fromkeys((*_RELATIVE, "os.mkdir", "os.truncate", "sqlite3.connect"), (0,)),
-    **dict.fromkeys(("os.link", "os.symlink"), (1,)),
-    "os.rename": (0, 1),
-}
-"""Events that change what is on disk, and which of their arguments are the paths that change."""
-
 _WRITING: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
 @dataclass(slots=True)
 class Events:
-    """Addresses that were asked for, and paths that were written to."""
+    """Addresses that were asked for, paths that were written to, and names that were unpickled."""
 
     network: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
+    unpickled: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -62,13 +50,10 @@ class Effects(Events):
     """The side effects of one piece of work, up to its error; paths are those of `outside`."""
 
     error: BaseException | None = None
-    seconds: float = 0.0
-    megabytes: float = 0.0  # growth of the resident memory, at its largest
     printed: str = ""  # by Python and by libraries beneath it
     warnings: list[str] = field(default_factory=list)  # "Category: message"
     random: list[str] = field(default_factory=list)  # global generators whose state changed
-    threads: list[str] = field(default_factory=list)  # "thread setting: before -> after"
-    settings: list[str] = field(default_factory=list)  # "other setting: before -> after"
+    settings: list[str] = field(default_factory=list)  # "setting: before -> after"
     running: list[str] = field(default_factory=list)  # threads and child processes left
 
 
@@ -92,20 +77,16 @@ def auditing(events: Events) -> Iterator[None]:
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if not _recording:
         return
-    paths: list[object] = []
-    if event == "open":
-        path, _, flags = arguments
-        paths = [path] if flags is not None and flags & _WRITING else []
-    elif event in _NETWORK and (address := _address(event, arguments)):
+    if event in _NETWORK and (address := _address(event, arguments)):
         _recording[-1].network.append(address)
         raise ConnectionRefusedError(f"no network during a check: {event} {address}")
-    elif event in _CHANGES and (event not in _RELATIVE or arguments[1] in (None, -1)):
-        paths = [arguments[index] for index in _CHANGES[event]]
-    for path in paths:
-        # Descriptors are of files that were opened before, and seen then.
-        if isinstance(path, str | bytes | os.PathLike):
-            absolute = os.path.abspath(os.fsdecode(path))  # noqa: PTH100  keeps links
-            _recording[-1].written.append(absolute)
+    if event == "pickle.find_class":
+        _recording[-1].unpickled.append(".".join(map(str, arguments)))
+    # Descriptors are of files that were opened before, and seen then.
+    path = arguments[0] if event == "open" and (arguments[2] or 0) & _WRITING else None
+    if isinstance(path, str | bytes | os.PathLike):
+        absolute = os.path.abspath(os.fsdecode(path))  # noqa: PTH100  keeps links
+        _recording[-1].written.append(absolute)
 
 
 def _address(event: str, arguments: tuple[Any, ...]) -> str:
@@ -125,23 +106,18 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
     with contextlib.ExitStack() as stack:
         here = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="oodd-check-")))
         stack.enter_context(_set_apart(here))
-        generators, threads = _generators(), _thread_settings()
-        settings_before = {**settings_before, "working directory": str(Path.cwd())}
+        generators, before = _generators(), settings_before | _set_here()
         printed = stack.enter_context(_captured())
         caught = stack.enter_context(warnings.catch_warnings(record=True, action="always"))
-        with contextlib.suppress(OSError):  # Linux then forgets the peak so far.
-            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        start, memory = time.perf_counter(), peak_rss_mb()
         with auditing(seen):
             try:
                 work()
             except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
                 seen.error = error
-        seen.seconds = time.perf_counter() - start
-        seen.megabytes = peak_rss_mb() - memory
         seen.random = [name for name, state in _generators().items() if generators[name] != state]
-        seen.threads = _changes(threads, _thread_settings())
-        seen.settings = _changes(settings_before, settings())
+        after = settings() | _set_here()
+        pairs = [(n, before.get(n, "unset"), after[n]) for n in sorted(after)]
+        seen.settings = [f"{name}: {old} -> {new}" for name, old, new in pairs if old != new]
         seen.warnings = [
             f"{w.category.__name__}: {' '.join(str(w.message).split())}" for w in caught or []
         ]
@@ -157,26 +133,24 @@ def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
 def settings() -> dict[str, str]:
     """Return settings of the process that are the user's; a missing library has its defaults."""
     torch = sys.modules.get("torch")
-    deterministic = bool(torch and torch.are_deterministic_algorithms_enabled())
-    handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
-    mask = os.umask(0o077)  # it can only be read by setting it
-    os.umask(mask)
-    directory = "removed"
-    with contextlib.suppress(FileNotFoundError):
-        directory = str(Path.cwd())
     values: dict[str, object] = {
         "numpy error handling": np.geterr(),
-        "numpy print options": np.get_printoptions(),
         "recursion limit": sys.getrecursionlimit(),
         "locale": locale.setlocale(locale.LC_ALL),
-        "signal handlers": {s.name: repr(h) for s, h in handlers.items()},
-        "umask": mask,
-        "working directory": directory,
+        "interrupts": signal.getsignal(signal.SIGINT),
         "torch default dtype": torch.get_default_dtype() if torch else "torch.float32",
         "torch gradients enabled": torch.is_grad_enabled() if torch else True,
-        "torch deterministic algorithms": deterministic,
+        "torch deterministic": bool(torch and torch.are_deterministic_algorithms_enabled()),
     }
     return {name: str(value) for name, value in values.items()}
+
+
+def _set_here() -> dict[str, str]:
+    """Return the settings that are set to unusual values before code is watched."""
+    values = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
+    if torch := sys.modules.get("torch"):
+        values["torch.get_num_threads()"] = str(torch.get_num_threads())
+    return {**values, "working directory": os.path.realpath(os.curdir)}
 
 
 def outside(written: Iterable[str], here: Path) -> list[str]:
@@ -235,18 +209,6 @@ def _generators() -> dict[str, object]:
     if torch := sys.modules.get("torch"):
         states["torch"] = torch.get_rng_state().numpy().tobytes()
     return states
-
-
-def _thread_settings() -> dict[str, str]:
-    values = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
-    if torch := sys.modules.get("torch"):
-        values["torch.get_num_threads()"] = str(torch.get_num_threads())
-    return values
-
-
-def _changes(before: dict[str, str], after: dict[str, str]) -> list[str]:
-    both = [(n, before.get(n, "unset"), after.get(n, "unset")) for n in sorted(before | after)]
-    return [f"{name}: {old} -> {new}" for name, old, new in both if old != new]
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ PYTEST_DONT_REWRITE: messages are whole sentences.
 import contextlib
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -45,9 +45,19 @@ class RaisedError(AssertionError):
 class Trial:
     """All that the checks of one detector share.
 
-    The factory is called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec`
-    tells what the detector declares too. Episodes have actions where the spec declares them, and
-    for a factory, which declares nothing.
+    Episodes have actions where the spec declares them, and for a factory, which declares nothing.
+
+    Parameters
+    ----------
+    factory
+        Called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec` tells what the
+        detector declares too.
+    horizon
+        Prediction horizon in steps.
+    seed
+        Seed of the detector.
+    parameters
+        Further arguments of the factory.
     """
 
     def __init__(
@@ -116,19 +126,6 @@ class Trial:
         except AssertionError as error:
             return error
         return detector
-
-    def needs_actions(self) -> bool:
-        """Tell whether a detector that declares observations works with actions only."""
-        if self.actions or not isinstance(self.first_fit, AssertionError):
-            return False
-        self.actions = True
-        try:
-            self.fit().score(self.nominal(1)[0])
-        except Exception:  # noqa: BLE001  whatever it is: actions do not help
-            return False
-        finally:
-            self.actions = False
-        return True
 
     def fitted(self) -> Detector:
         """Return the shared fitted detector, for checks about something else: only to score."""
@@ -233,11 +230,11 @@ def doing(what: str) -> Iterator[None]:
 def as_scores(returned: object, trajectory: Trajectory) -> Scores:
     """Return scores as float64; skip when their form, which another check is about, is wrong."""
     if not isinstance(returned, np.ndarray) or returned.shape != (len(trajectory),):
-        pytest.skip("needs one score per observation: see checks 'shape' and 'dtype'")
+        pytest.skip("needs one score per observation: see check 'scores'")
     try:
         return returned.astype(np.float64)
     except (TypeError, ValueError):
-        pytest.skip("needs scores that are numbers: see check 'dtype'")
+        pytest.skip("needs scores that are numbers: see check 'scores'")
 
 
 def assert_equal(
@@ -255,6 +252,13 @@ def offered(detector: Detector, first: str, second: str) -> Any:
         pytest.skip(f"has no {first} and {second}")
     assert all(has), f"has only one of {first} and {second}: expected both, or none"
     return detector
+
+
+def fail_for(effects: Iterable[str], what: str, advice: str) -> None:
+    """Fail when there are effects, with the first one and the number of others."""
+    different = list(dict.fromkeys(effects))
+    more = f" and {len(different) - 1} more" if len(different) > 1 else ""
+    assert not different, f"{what} {different[0]}{more}: {advice}"
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import math
 import signal
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -17,7 +17,6 @@ from oodd_eval.plugins.isolation import (
     CHUNK,
     CLOSED_SECONDS,
     ROW_BYTES,
-    Channel,
     ChannelClosedError,
     ChannelGarbledError,
 )
@@ -83,8 +82,7 @@ def run_isolated(
         # From another thread, so that neither side can deadlock on a full socket.
         pool = stack.enter_context(ThreadPoolExecutor(1))
         explains: Future[bool] = Future()
-        parts = _noted("array", groups, expected), _noted("explanation", explained, expected)
-        sent = pool.submit(_send, child, inside, train, *parts, explains)
+        sent = pool.submit(_send, child, inside, train, groups, explained, explains, expected)
         try:
             _converse(child, outcome, explains, expected)
         except GivenUpError as error:
@@ -163,18 +161,6 @@ def _number(message: Mapping[str, Any], name: str, most: float) -> float:
     return float(min(value, most))
 
 
-def _noted(
-    kind: str, groups: Iterable[Iterable[Trajectory]], expected: "_Expected"
-) -> Iterator[Iterator[Trajectory]]:
-    """Yield groups; what has to come back of a trajectory is noted when it is read, to be sent."""
-
-    def noted(trajectory: Trajectory) -> Trajectory:
-        expected.append((kind, len(trajectory)))
-        return trajectory
-
-    return (map(noted, group) for group in groups)
-
-
 def _send(
     child: Child,
     request: Mapping[str, Any],
@@ -182,34 +168,32 @@ def _send(
     groups: Iterable[Iterable[Trajectory]],
     explained: Iterable[Iterable[Trajectory]],
     explains: "Future[bool]",
+    expected: "_Expected",
 ) -> None:
-    channel = child.channel
+    """Send all; what has to come back of a trajectory is noted before it is sent."""
+    send = child.channel.send
+
+    def send_group(group: Iterable[Trajectory], kind: str) -> None:
+        send({"group": True})
+        rest = iter(group)
+        while chunk := list(islice(rest, CHUNK)):
+            send({"score": len(chunk), "explain": kind == "explanation"})
+            for trajectory in chunk:
+                expected.append((kind, len(trajectory)))
+                child.channel.send_trajectory(trajectory)
+        send({"score": 0})
+
     try:
-        channel.send({**request})
+        send({**request})
         for trajectory in train:
-            channel.send_trajectory(trajectory)
+            child.channel.send_trajectory(trajectory)
         for group in groups:
-            _send_group(channel, group, explain=False)
+            send_group(group, "array")
         # Last, as only what comes again is anomalous: no process that scores is told so.
         for group in explained if explains.result() else ():
-            _send_group(channel, group, explain=True)
-        channel.send({"group": False})
+            send_group(group, "explanation")
+        send({"group": False})
     except ConnectionError:
         pass  # The worker ended; the receiving side finds out why.
     finally:
         child.hang_up()
-
-
-def _send_group(channel: Channel, group: Iterable[Trajectory], *, explain: bool) -> None:
-    channel.send({"group": True})
-    for chunk in _chunks(group):
-        channel.send({"score": len(chunk), "explain": explain})
-        for trajectory in chunk:
-            channel.send_trajectory(trajectory)
-    channel.send({"score": 0})
-
-
-def _chunks(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
-    rest = iter(trajectories)
-    while chunk := list(islice(rest, CHUNK)):
-        yield chunk

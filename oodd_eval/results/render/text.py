@@ -1,9 +1,11 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from html import escape as escape_html
 from typing import Final
 
+from rich.console import Console
+from rich.text import Text
 from tabulate import tabulate
 
 from oodd_eval.results.render import renders
@@ -85,31 +87,89 @@ def escape(text: str) -> str:
 @renders("html", "HTML")
 def html(report: Report) -> str:
     """Return a report as HTML, without a page around it."""
-    parts = []
-    for section in report.sections:
-        parts += [f"<h3>{escape_html(section.title)}</h3>"]
-        parts += [f"<p>{escape_html(line)}</p>" for line in (*section.facts, *section.findings)]
-        for table in section.tables:
-            # tabulate's layout escapes the cells.
-            parts += [f"<h4>{escape_html(table.title)}</h4>", grid(table, "html")]
-            parts += [f"<p>{escape_html(table.note)}</p>"] if table.note else []
-        parts += [f"<p>{escape_html(line)}</p>" for line in section.notes]
+    marks = {"title": "<h3>{}</h3>", "sentence": "<p>{}</p>", "table": "<h4>{}</h4>"}
+    # tabulate's layout escapes the cells.
+    parts = (
+        grid(part, "html") if isinstance(part, Table) else marks[kind].format(escape_html(part))
+        for kind, part in _parts(report)
+    )
     return "\n".join(parts) + "\n"
 
 
 @renders("latex", "LaTeX, a tabular for each table")
 def latex(report: Report) -> str:
     """Return a report as LaTeX, to be copied or included; it needs no package."""
-    parts = []
-    for section in report.sections:
-        parts.append(f"\\section*{{{_latex(section.title)}}}")
-        parts += [_latex(line) for line in (*section.facts, *section.findings)]
-        for table in section.tables:
-            parts.append(f"\\subsection*{{{_latex(table.title)}}}")
-            parts += [grid(table, "latex_raw", _latex), *([_latex(table.note)] * bool(table.note))]
-        parts += [_latex(line) for line in section.notes]
+    marks = {"title": r"\section*{{{}}}", "sentence": "{}", "table": r"\subsection*{{{}}}"}
+    parts = (
+        grid(part, "latex_raw", _latex)
+        if isinstance(part, Table)
+        else marks[kind].format(_latex(part))
+        for kind, part in _parts(report)
+    )
     return "\n\n".join(parts) + "\n"
+
+
+def _parts(report: Report) -> Iterator[tuple[str, str | Table]]:
+    """Yield titles, sentences, and tables after their titles, in the order of a report."""
+    for section in report.sections:
+        yield "title", section.title
+        yield from (("sentence", line) for line in (*section.facts, *section.findings))
+        for table in section.tables:
+            yield from (("table", table.title), ("", table))
+            yield from [("sentence", table.note)] * bool(table.note)
+        yield from (("sentence", line) for line in section.notes)
 
 
 def _latex(text: str) -> str:
     return " ".join(text.split()).translate(_LATEX)
+
+
+def print_sections(sections: Sequence[Section], console: Console) -> None:
+    """Print tables, findings and notes of sections: what is read last stands last."""
+    for section in sections:
+        for table in section.tables:
+            print_table(table, console)
+        for sentence in section.findings:
+            print_prose(sentence, console, "yellow")
+        for line in section.notes:
+            print_prose(line, console, "dim")
+        if section.notes:
+            console.print("")
+
+
+def print_table(table: Table, console: Console, width: int = 0) -> None:
+    """Print one table within a width, by default the console's: as it is, turned, or in parts."""
+    console.print(Text(table.title, "bold"))
+    for part in _fitting(table, width or console.width):
+        lines = grid(part, "simple").splitlines()
+        colours = ["", "", *(part.colours or [""] * (len(lines) - 2))]
+        for line, colour in zip(lines, colours, strict=True):
+            console.print(Text(line, colour))
+        console.print("")
+    if table.note:
+        print_prose(table.note + "\n", console, "dim")
+
+
+def print_prose(text: str, console: Console, style: str = "") -> None:
+    """Print a sentence, wrapped between words."""
+    console.print(Text(text, style), soft_wrap=False)
+
+
+def _fitting(table: Table, width: int) -> list[Table]:
+    """Return the table, the table turned, or parts of its columns, whichever first fits."""
+    for whole in (table, table.transposed()):
+        if _width(whole) <= width:
+            return [whole]
+    labels = list(range(table.labels))
+    parts = [labels]
+    for column in range(table.labels, len(table.header)):
+        wider = [*parts[-1], column]
+        if parts[-1] == labels or _width(table.columns(wider)) <= width:
+            parts[-1] = wider
+        else:
+            parts.append([*labels, column])
+    return [table.columns(part) for part in parts]
+
+
+def _width(table: Table) -> int:
+    return max(map(len, grid(table, "simple").splitlines()), default=0)

@@ -70,7 +70,6 @@ def open_executor(
     settings: RunSettings, split: Split, results: ResultsDirectory | None
 ) -> Executor:
     """Return the executor that the settings name."""
-    check_executor(settings.executor)
     if settings.executor == LOCAL:
         return Executor(settings, results, threading.Event())
     from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra

@@ -28,8 +28,7 @@ from oodd_eval.plugins.discovery import offer_of
 from oodd_eval.plugins.isolation.child import Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.scoring.executors import Executor, RunSettings
-from oodd_eval.scoring.keys import source_digest
-from oodd_eval.scoring.plan import Plan, Unit
+from oodd_eval.scoring.plan import Plan, Unit, source_digest
 from oodd_eval.scoring.unit import Scored, UnitJob
 
 try:

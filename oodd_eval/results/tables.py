@@ -3,8 +3,8 @@
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
@@ -13,7 +13,72 @@ from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.results.board import Board, Value
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.standings import RankedBoard, Standing
-from oodd_eval.results.tables import BRIEF, Mean, Table, show_value, texts
+
+BRIEF: Final = "\N{DAGGER}"
+"""Marks the figures of brief cells."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A titled table of texts, the first `labels` columns set to the left, with a note below it.
+
+    On a terminal each row has the colour of its position in `colours`, if there are any.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    labels: int = 1
+    note: str = ""
+    colours: Sequence[str] = ()
+
+    @property
+    def alignment(self) -> tuple[str, ...]:
+        """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
+        return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
+
+    def columns(self, indices: Sequence[int]) -> "Table":
+        """Return the table with these columns only."""
+        rows = [[row[i] for i in indices] for row in self.rows]
+        return replace(self, header=[self.header[i] for i in indices], rows=rows)
+
+    def transposed(self) -> "Table":
+        """Return the table with rows and columns exchanged."""
+        whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
+        return replace(self, header=whole[0], rows=whole[1:], labels=1, colours=())
+
+
+def show_value(value: Value, metric: str) -> str:
+    """Return a mean as printed: a number, a dash where undefined, a failure's state, or nothing.
+
+    A star marks a mean in which expected cells are missing, a dagger one of brief cells only.
+    """
+    if not value.cells:
+        return ""
+    number = metric_info(metric).text
+    text = value.state or number(value.value)
+    if not math.isnan(value.low):
+        text += f" [{number(value.low)}, {number(value.high)}]"
+    return text + "*" * value.partial + BRIEF * value.brief
+
+
+class Mean(NamedTuple):
+    """A column: the mean of a metric over some of a board's cells."""
+
+    title: str
+    metric: str
+    environments: Sequence[str]
+    anomalies: Sequence[str]
+    intervals: bool = False
+
+
+def texts(board: Board, entry: Setting, columns: Iterable[Mean]) -> list[str]:
+    """Return a row's means as printed, one a column."""
+    return [
+        show_value(board.mean(entry, environments, anomalies, metric, intervals=intervals), metric)
+        for _, metric, environments, anomalies, intervals in columns
+    ]
+
 
 _BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
@@ -98,7 +163,7 @@ def guaranteed(
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
         "is the share of this split's nominal twins that raised one."
     )
-    return replace(_by_metric(board, title, columns, standings), note=note)
+    return _by_metric(board, title, columns, standings, note)
 
 
 def attribution(
@@ -119,7 +184,7 @@ def attribution(
         "onset that they name is from the effect, the median of a cell."
     )
     ranks = [standing for standing in standings if standing.entry in explaining]
-    return replace(_by_metric(board, title, columns, ranks), note=note)
+    return _by_metric(board, title, columns, ranks, note)
 
 
 def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -127,7 +192,7 @@ def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
 
     There is a table for each horizon and group of anomalies.
     """
-    groups = [group for group in GROUPS if board.in_group(group)]
+    groups = filter(board.in_group, GROUPS)
     everything = itertools.product(board.horizons, groups)
     return [_anomaly_group(board, h, group, intervals=intervals) for h, group in everything]
 
@@ -310,13 +375,17 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
 
 
 def _by_metric(
-    board: Board, title: str, columns: Sequence[Mean], standings: Sequence[Standing] = ()
+    board: Board,
+    title: str,
+    columns: Sequence[Mean],
+    standings: Sequence[Standing] = (),
+    note: str = "",
 ) -> Table:
     """Return columns with a row per detector, or per standing with its place."""
     labels = {row.entry: _labels(row) for row in standings} or {e: [str(e)] for e in board.entries}
     rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
     first = _LABELS if standings else ("detector",)
-    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first))
+    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first), note=note)
 
 
 def _labels(row: Standing) -> list[str]:
