@@ -17,7 +17,7 @@ from oodd_eval.data import bounded, layout, stored
 from oodd_eval.plugins import contract, discovery, explanations
 from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring import keys
+from oodd_eval.scoring import plan
 
 MOST = 0.05
 CHECKS = {
@@ -25,7 +25,7 @@ CHECKS = {
     stored: ["check_plain"],
     bounded: ["read_npz"],
     discovery: ["check_detector_spec"],
-    keys: ["source_digest"],
+    plan: ["source_digest"],
     supervisor: ["_typed", "_number"],
     contract: ["check_scores", "check_prefix"],
     explanations: ["checked_explanation", "check_named"],

@@ -26,7 +26,7 @@ def parameter(
     high: float | None = None,
     choices: tuple[Any, ...] = (),
     decides: Decides = "fit",
-    help: str = "",  # noqa: A002  argparse's word
+    help: str = "",  # noqa: A002  click's word, too
 ) -> Any:
     """Declare one parameter in a frozen dataclass of parameters.
 
