@@ -22,18 +22,18 @@ def together(work):
     everything = [probe for group in unit.groups(work._lengths) for probe in group]
     work._ordered = work._groups = [everything]
     work._probes, work._drawn = [], [0]
-    work._shown = lambda trajectory: trajectory
+    work._visible = lambda trajectory: trajectory
 
 
 def timed(detector, *, guarded):
-    made = unit._Work.__init__
+    initial = unit.GroupedScoring.__init__
 
     def unguarded(work, *arguments):
-        made(work, *arguments)
+        initial(work, *arguments)
         together(work)
 
     start = time.perf_counter()
-    with patch.object(unit._Work, "__init__", made if guarded else unguarded):
+    with patch.object(unit.GroupedScoring, "__init__", initial if guarded else unguarded):
         records = evaluate(detector, environments="hopper")
     assert all(r.ok for r in records), records[0].reason
     return time.perf_counter() - start
