@@ -64,7 +64,7 @@ class Standing:
 
     @property
     def marks(self) -> str:
-        """Whether the row is trivial, and whether it is a variant, as printed behind its name."""
+        """The marks printed behind a row's name: trivial, variant, or both."""
         return " (trivial)" * self.trivial + " (variant)" * (not self.primary)
 
 

@@ -24,7 +24,7 @@ from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
 from oodd_eval.plugins.isolation.sandbox import Sandbox
 
 _FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
-"""What a worker may say of itself."""
+"""The values that a worker reports of itself."""
 
 _T = TypeVar("_T")
 _Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
