@@ -18,7 +18,7 @@ from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.text import print_table
+from oodd_eval.results.render.text import print_prose, print_table
 from oodd_eval.results.report import Report
 from oodd_eval.results.tables import Table
 
@@ -129,6 +129,15 @@ def test_show_prints_every_format(name, tmp_path, capsys):
     assert capsys.readouterr().out == rendered(example(), name)
     assert main(["show", str(tmp_path), "--stored", "--detector", "rf", f"--{name}"]) == 1
     assert name in ("csv", "json") or "Separability" not in capsys.readouterr().out
+
+
+def test_sentences_on_the_terminal_are_wrapped_without_spaces_at_their_ends(capsys):
+    sentence = "A mean over fewer cells than the split has there is marked."
+    for width in (20, 40):
+        print_prose(sentence, Console(width=width))
+        lines = capsys.readouterr().out.splitlines()
+        assert " ".join(lines) == sentence
+        assert all(len(line) <= width and line == line.rstrip() for line in lines)
 
 
 def test_a_format_is_one_function(monkeypatch):

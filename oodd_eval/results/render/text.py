@@ -151,8 +151,10 @@ def print_table(table: Table, console: Console, width: int = 0) -> None:
 
 
 def print_prose(text: str, console: Console, style: str = "") -> None:
-    """Print a sentence, wrapped between words."""
-    console.print(Text(text, style), soft_wrap=False)
+    """Print a sentence, wrapped between words; no line ends with a space."""
+    for line in Text(text, style).wrap(console, console.width):
+        line.rstrip()
+        console.print(line)
 
 
 def _fitting(table: Table, width: int) -> list[Table]:
