@@ -15,6 +15,9 @@ class UsageError(OoddError, ValueError):
     """The request itself is wrong: an unknown name, a bad value, nothing selected."""
 
 
+_LISTED = 60  # known names in a message: logs may have thousands of columns
+
+
 class UnknownNameError(UsageError, LookupError):
     """A name that is not among the known ones.
 
@@ -37,7 +40,10 @@ class UnknownNameError(UsageError, LookupError):
         names = sorted(known)
         close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]!r}? " if close else ""
-        super().__init__(f"unknown {kind} {name!r}: {hint}Known: {', '.join(names) or 'none'}")
+        further = len(names) - _LISTED
+        more = f" and {further} more" if further > 0 else ""
+        listed = f"{', '.join(names[:_LISTED]) or 'none'}{more}"
+        super().__init__(f"unknown {kind} {name!r}: {hint}Known: {listed}")
         self.kind, self.name, self.known = kind, name, names
 
 
@@ -71,6 +77,10 @@ class FittedStateError(OoddError, ValueError):
 
 class PluginError(OoddError, ImportError):
     """A plug-in that cannot be loaded, or two that offer the same name."""
+
+
+class PromiseWarning(UserWarning):
+    """Something puts a promise on false alarms in doubt."""
 
 
 class MissingExtraError(OoddError, ImportError):

@@ -32,6 +32,15 @@ def check_known(kind: str, known: Collection[str], *names: str) -> None:
             raise UnknownNameError(kind, name, known)
 
 
+def counted(n: int, noun: str) -> str:
+    """Return a number with a noun in singular or plural, whose ending is ``(s)``.
+
+    >>> counted(1, "row(s) left out"), counted(3, "episode(s)")
+    ('1 row left out', '3 episodes')
+    """
+    return f"{n} {noun.replace('(s)', 's' * (n != 1))}"
+
+
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     """Return the known names that a comma list of names and globs, or ``"all"``, selects, in order.
 

@@ -75,3 +75,9 @@ def test_unknown_name_suggests_the_nearest():
 
 def test_unknown_name_far_from_all_lists_them():
     assert "did you mean" not in str(UnknownNameError("detector", "zzz", ["rf", "npn"]))
+
+
+def test_of_a_thousand_names_a_message_lists_some():
+    message = str(UnknownNameError("column", "zzz", [f"topic.{i}" for i in range(1000)]))
+    assert len(message) < 1000
+    assert "and 940 more" in message

@@ -113,6 +113,10 @@ def _rank(strength: str) -> tuple[int, float, str]:
         return len(rungs) + 1, 0.0, strength
 
 
+NOMINAL: Final = Condition("nominal")
+"""Stands for the test part of a split that has nominal episodes alone."""
+
+
 @dataclass(frozen=True, slots=True)
 class Rung:
     """One strength of a kind of anomaly in one environment.

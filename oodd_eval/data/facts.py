@@ -181,6 +181,43 @@ TABLE1: Final = tuple(ANOMALIES)[:8]
 
 GROUPS: Final[tuple[Group, ...]] = ("sensor", "dynamics")
 
+Order = Literal["recorded", "shuffled"]
+
+
+@dataclass(frozen=True, slots=True)
+class LogFacts:
+    """Facts of an environment that was imported from logs, as a split's manifest keeps them.
+
+    Parameters
+    ----------
+    paired
+        Whether each anomalous episode has a nominal twin. Without twins there is any number of
+        nominal test episodes and of episodes of each anomaly.
+    clock
+        Whether row t of one episode may be compared with row t of another.
+    baseline
+        Number of rows at the start of every episode that are nominal and not judged.
+    rate
+        Rows in a second; None where it is not known.
+    order
+        Whether training, calibration and test follow one another as they were recorded.
+    offsets
+        Subtracted from each sensor in float64, in its unit; empty where nothing was.
+    source, licence, citation
+        Where the logs are from; empty where the recipe does not say it.
+    """
+
+    paired: bool = True
+    clock: bool = True
+    baseline: int = 0
+    rate: float | None = None
+    order: Order = "recorded"
+    offsets: tuple[float, ...] = ()
+    source: str = ""
+    licence: str = ""
+    citation: str = ""
+
+
 _SPLITS: Final = (
     # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
     SplitDefinition("mini", 40, 40, 10, 300, 4),
@@ -202,7 +239,7 @@ SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 CUSTOM_SEED_BASES: Final = range(10, 900)
 """Seed bases of custom splits: published splits have those below, policies those above."""
 
-NAME_PATTERN: Final = "[a-z0-9][a-z0-9-]{0,63}"
+NAME_PATTERN: Final = "[a-z0-9][a-z0-9_-]{0,63}"
 """Names of environments and anomalies: they become names of files and groups."""
 
 FIRST_ONSET: Final = 30

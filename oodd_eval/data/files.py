@@ -3,6 +3,7 @@
 import contextlib
 import gzip
 import hashlib
+import io
 import lzma
 import os
 import re
@@ -40,6 +41,42 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             temporary.unlink()
+
+
+class Unfailing(io.FileIO):
+    """A file that drops what a full disk does not take, and tells the first error when closed.
+
+    HDF5 cannot bear an error: it raises at every later call, or ends the process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self._error: OSError | None = None
+
+    def write(self, content: Any, /) -> int:
+        """Write all of some bytes."""
+        left = memoryview(content).cast("B")
+        try:
+            while left and self._error is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self._error = error
+        return memoryview(content).nbytes
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the size of the file."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size or 0
+
+    def close(self) -> None:
+        """Close the file; `OSError` where it lacks something that was written."""
+        super().close()
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
 
 
 def write_bytes(path: Path, content: bytes) -> None:

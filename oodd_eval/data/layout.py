@@ -11,6 +11,7 @@ nothing of chunks or compression.
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,15 +28,21 @@ from oodd_eval.data.facts import (
     GROUPS,
     NAME_PATTERN,
     Group,
+    LogFacts,
     Quantity,
     SplitDefinition,
 )
-from oodd_eval.data.files import replacing, write_text
+from oodd_eval.data.files import Unfailing, remove_abandoned, replacing, write_text
 from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
+LOGS_SCHEMA: Final = 3
+"""Of a manifest with facts of logs, which versions that know no others would misread."""
 MANIFEST: Final = "manifest.json"
+
+IMPORTED: Final = "imported"
+"""Word that a manifest has in place of the recipe and of the policy's digest."""
 
 NOMINAL_DTYPES: Final = {
     **dict.fromkeys(("observations", "actions", "rewards"), "<f4"),
@@ -46,7 +53,13 @@ ANOMALOUS_DTYPES: Final = NOMINAL_DTYPES | {
     **dict.fromkeys(("onsets", "effects", "redraws"), "<i8"),
     "parameters": "|S",
 }
-"""Datasets of a group and their types; ``parameters`` are JSON texts of any width."""
+UNPAIRED_DTYPES: Final = NOMINAL_DTYPES | {"names": "|S", "tasks": "|S"}
+LABELLED_DTYPES: Final = UNPAIRED_DTYPES | {"interval_offsets": "<i8", "intervals": "<i8"}
+"""Datasets of a group and their types; ``parameters`` are JSON texts of any width.
+
+Without twins, episode i of an anomaly is anomalous in the rows [start, stop) that
+``intervals[interval_offsets[i] : interval_offsets[i + 1]]`` name.
+"""
 
 _BLOCK: Final = 1 << 21  # bytes that are held at once while content is digested
 _LONGEST: Final = 1 << 26  # bytes of one block where chunks are longer
@@ -78,14 +91,16 @@ class GroupCheck:
         return self.expected == self.actual
 
 
-def dtypes_of(group: str) -> dict[str, str]:
+def dtypes_of(group: str, *, paired: bool = True) -> dict[str, str]:
     """Return names and dtypes of the datasets a group must have."""
-    return dict(NOMINAL_DTYPES if group in NOMINAL else ANOMALOUS_DTYPES)
+    if paired:
+        return dict(NOMINAL_DTYPES if group in NOMINAL else ANOMALOUS_DTYPES)
+    return dict(UNPAIRED_DTYPES if group in NOMINAL else LABELLED_DTYPES)
 
 
-def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
+def check_layout(file: str, name: str, group: Mapping[str, Any], *, paired: bool = True) -> None:
     """Raise `SplitError` unless a group has the datasets, dtypes and lengths it must have."""
-    source, dtypes = f"{file}, group {name}", dtypes_of(name)
+    source, dtypes = f"{file}, group {name}", dtypes_of(name, paired=paired)
     if unknown := sorted({*group} - {*dtypes}):
         raise SplitError(f"{source} holds {unknown[0]!r}, expected {', '.join(dtypes)} alone")
     for dataset, dtype in dtypes.items():
@@ -94,7 +109,7 @@ def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
         actual, shape = group[dataset].dtype, group[dataset].shape
         if actual.hasobject or not actual.str.startswith(dtype):
             raise SplitError(f"{source}, {dataset} has dtype {actual.str}, expected {dtype}")
-        dimensions = 2 if dataset in {"observations", "actions"} else 1
+        dimensions = 2 if dataset in {"observations", "actions", "intervals"} else 1
         if len(shape) != dimensions:
             raise SplitError(f"{source}, {dataset} has shape {shape}, expected {dimensions} axes")
     offsets = group["offsets"][:]
@@ -105,12 +120,16 @@ def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
     total = int(offsets[-1])
     lengths = dict.fromkeys(dtypes, n)
     lengths |= {"observations": total + n, "actions": total, "rewards": total, "offsets": n + 1}
+    if "intervals" in lengths:
+        lengths |= {"interval_offsets": n + 1, "intervals": len(group["intervals"])}
     for dataset, expected in lengths.items():
         if len(group[dataset]) != expected:
             raise SplitError(
                 f"{source}, {dataset} has {len(group[dataset])} rows, expected {expected} "
                 f"for {n} trajectories with {total} transitions"
             )
+    if "intervals" in lengths:
+        _check_intervals(source, group, np.diff(offsets) + 1)
     if "effects" in lengths:
         onsets, effects = group["onsets"][:], group["effects"][:]
         wrong = (onsets < 0) | (effects < onsets) | (effects > np.diff(offsets))
@@ -120,6 +139,27 @@ def check_layout(file: str, name: str, group: Mapping[str, Any]) -> None:
                 f"{effects[i]}, expected 0 <= onset <= effect <= {offsets[i + 1] - offsets[i]}, "
                 "the last row"
             )
+
+
+def _check_intervals(source: str, group: Mapping[str, Any], rows: NDArray[np.int64]) -> None:
+    """Raise `SplitError` unless each episode has its intervals in order and inside its rows."""
+    offsets, intervals = group["interval_offsets"][:], group["intervals"][:]
+    if intervals.shape[1:] != (2,) or offsets[0] != 0 or offsets[-1] != len(intervals):
+        raise SplitError(
+            f"{source}: intervals have shape {intervals.shape} and offsets from {offsets[0]} to "
+            f"{offsets[-1]}, expected (k, 2) and offsets from 0 to k"
+        )
+    if (np.diff(offsets) < 0).any():
+        raise SplitError(f"{source}: offsets of intervals fall, expected them to rise")
+    for i, (first, last) in enumerate(itertools.pairwise(offsets.tolist())):
+        end = 0
+        for start, stop in intervals[first:last].tolist():
+            if not (max(start, 0) >= end and max(start, 0) < stop <= rows[i] and start >= -1):
+                raise SplitError(
+                    f"{source}: trajectory {i} is anomalous in rows [{start}, {stop}), expected "
+                    f"intervals in order within its {rows[i]} rows, or a start of -1"
+                )
+            end = stop
 
 
 def check_names(file: str, parts: Mapping[str, Mapping[str, Any]]) -> None:
@@ -165,7 +205,7 @@ def environment_digest(entry: Mapping[str, Any]) -> str:
     What is said of an environment or of anomalies of one's own counts, too.
     """
     digests = {name: group["sha256"] for name, group in entry["groups"].items()}
-    custom = {"own": entry["own"]} if "own" in entry else {}
+    custom = {key: entry[key] for key in ("own", "logs") if key in entry}
     return _canonical_digest(digests | {NAMES: names_digest(entry)} | custom)
 
 
@@ -190,6 +230,19 @@ def groups_of(entry: Mapping[str, Any]) -> dict[str, Group]:
     custom = entry["own"]["anomalies"] if "own" in entry else {}
     kinds = (condition.anomaly for condition in conditions_in(entry["groups"]))
     return {kind: ANOMALIES[kind].group if kind in ANOMALIES else custom[kind] for kind in kinds}
+
+
+def log_facts(entry: Mapping[str, Any]) -> LogFacts | None:
+    """Return the facts of logs in a manifest entry; None for an environment of a simulator."""
+    if "logs" not in entry:
+        return LogFacts() if entry["policy"] == IMPORTED else None
+    facts = entry["logs"] | {"offsets": tuple(entry["logs"]["offsets"])}
+    return LogFacts(**facts)
+
+
+def is_paired(entry: Mapping[str, Any]) -> bool:
+    """Tell whether each anomalous episode of an environment has a nominal twin."""
+    return "logs" not in entry or bool(entry["logs"]["paired"])
 
 
 def names_digest(entry: Mapping[str, Any]) -> str:
@@ -222,32 +275,40 @@ def write_environment(
     sensors: Sequence[Quantity],
     actions: Sequence[Quantity],
     custom: Mapping[str, Any] | None = None,
+    logs: LogFacts | None = None,
 ) -> dict[str, Any]:
     """Write an environment's groups, one at a time, in one step; return its manifest entry.
 
-    `custom` is what `own_facts` returns.
+    `custom` is what `own_facts` returns. `logs` are the facts of an imported environment.
     """
+    described = {"logs": dataclasses.asdict(logs)} if logs else {}
+    paired = is_paired(described)
     names = {
         "sensors": [dataclasses.asdict(q) for q in sensors],
         "actions": [dataclasses.asdict(q) for q in actions],
     }
     entries: dict[str, dict[str, Any]] = {}
-    with replacing(path) as partial, h5py.File(partial, "w", libver="v110") as file:
+    remove_abandoned(path.parent, path.name)
+    with (
+        replacing(path) as partial,
+        Unfailing(partial) as disk,
+        h5py.File(disk, "w", libver="v110") as file,
+    ):
         file.attrs["schema"] = SCHEMA
         written = {NAMES: file.create_group(NAMES)}
         for kind, quantities in names.items():
             _write(written[NAMES], kind, pack_parameters(quantities), "|S")
         for name, arrays in groups:
             group = file.create_group(name)
-            for dataset, dtype in dtypes_of(name).items():
+            for dataset, dtype in dtypes_of(name, paired=paired).items():
                 _write(group, dataset, arrays[dataset], dtype)
             written[name] = group
-            check_layout(path.name, name, group)
+            check_layout(path.name, name, group, paired=paired)
             n, total = len(group["seeds"]), int(group["offsets"][-1])
             digest = content_digest(group)
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
         check_names(path.name, written)
-    entry = {"groups": entries, **names, **(custom or {})}
+    entry = {"groups": entries, **names, **(custom or {}), **described}
     return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
 
 
@@ -298,9 +359,25 @@ def _manifest_schema() -> Any:
     )
     strengths = by_name(text, core_schema.float_schema(ge=0, allow_inf_nan=False))
     units = by_name(text, text)
-    for key, optional in (("own", custom), ("strengths", strengths), ("units", units)):
+    number = core_schema.float_schema(allow_inf_nan=False)
+    flag = core_schema.bool_schema()
+    logs = record(
+        paired=flag,
+        clock=flag,
+        baseline=count,
+        rate=core_schema.nullable_schema(number),
+        order=core_schema.literal_schema(["recorded", "shuffled"]),
+        offsets=core_schema.list_schema(number),
+        source=text,
+        licence=text,
+        citation=text,
+    )
+    logs["extra_behavior"] = "forbid"
+    optional_fields = {"own": custom, "strengths": strengths, "units": units, "logs": logs}
+    for key, optional in optional_fields.items():
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)
-    environments, schema = by_name(name, environment), core_schema.literal_schema([SCHEMA])
+    schema = core_schema.literal_schema([SCHEMA, LOGS_SCHEMA])
+    environments = by_name(name, environment)
     recipe = record()
     recipe["fields"]["strengths"] = core_schema.typed_dict_field(strengths, required=False)
     named = {"name": text, "definition": recipe, "generator": core_schema.int_schema()}
@@ -330,8 +407,9 @@ def write_manifest(
     A split that was not recorded has no definition, but a mapping with its name.
     """
     recipe = definition.recipe if isinstance(definition, SplitDefinition) else dict(definition)
+    imported = any("logs" in entry for entry in environments.values())
     manifest = {
-        "schema": SCHEMA,
+        "schema": LOGS_SCHEMA if imported else SCHEMA,
         "name": recipe["name"],
         "definition": recipe,
         "generator": generator,

@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.condition import NOMINAL as NOMINAL_TEST
 from oodd_eval.data.condition import Condition, in_suite_order
-from oodd_eval.data.facts import BRIEF_TAIL, FIRST_ONSET, Quantity
+from oodd_eval.data.facts import BRIEF_TAIL, FIRST_ONSET, LogFacts, Quantity
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import SplitError
@@ -108,6 +109,42 @@ class TrajectorySet(TrajectorySequence):
     def terminated(self) -> NDArray[np.bool_]:
         """True for each episode that the simulator ended, False for one that the cap ended."""
         return np.asarray(self._data["terminated"][:], dtype=bool)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Name of each episode in its logs; empty texts where the split keeps none."""
+        return self._texts("names")
+
+    @functools.cached_property
+    def tasks(self) -> tuple[str, ...]:
+        """Task, or set point, of each episode; empty texts where there is only one."""
+        return self._texts("tasks")
+
+    def _texts(self, dataset: str) -> tuple[str, ...]:
+        if dataset not in self._data:
+            return ("",) * len(self)
+        return tuple(text.decode("utf-8", "replace") for text in self._data[dataset][:])
+
+
+Interval = tuple[int, int]
+"""First row of an anomaly, -1 where it is not known, and the row after its last."""
+
+
+class LabelledSet(TrajectorySet):
+    """Anomalous episodes without twins, and the rows in which they are anomalous.
+
+    Attributes
+    ----------
+    intervals
+        Of each episode the rows [start, stop) that are anomalous, in order. A start of -1 is not
+        known. An episode without intervals is known by its outcome alone.
+    """
+
+    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
+        super().__init__(parts, group)
+        bounds = itertools.pairwise(self._data["interval_offsets"][:].tolist())
+        rows = list(map(tuple, self._data["intervals"][:].tolist()))
+        self.intervals: list[tuple[Interval, ...]] = [tuple(rows[a:b]) for a, b in bounds]
 
 
 class AnomalousSet(TrajectorySet):
@@ -225,6 +262,8 @@ class EnvironmentData:
         Names and units of the columns of observations and actions.
     discrete
         True when an action is a one-hot row.
+    logs
+        Facts of an environment that was imported; None for one that was recorded.
     """
 
     def __init__(
@@ -235,8 +274,9 @@ class EnvironmentData:
         digest: str,
         *,
         discrete: bool = False,
+        logs: LogFacts | None = None,
     ) -> None:
-        self.id, self.digest, self.discrete = environment, digest, discrete
+        self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
         self._file, self._parts = file, parts
         nominal = (TrajectorySet(parts, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
@@ -245,6 +285,59 @@ class EnvironmentData:
             tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, names[:]))
             for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
         )
+
+    @property
+    def baseline(self) -> int:
+        """Number of rows at the start of every episode that are nominal and not judged."""
+        return 0 if self.logs is None else self.logs.baseline
+
+    @property
+    def paired(self) -> bool:
+        """Whether each anomalous episode has a nominal twin."""
+        return self.logs is None or self.logs.paired
+
+    def test_set(self, condition: str | Condition) -> TrajectorySet:
+        """Return test episodes: of an anomaly, with twins or without, or ``"nominal"`` ones.
+
+        Parameters
+        ----------
+        condition
+            One of `anomalies`, or ``"nominal"``.
+
+        Returns
+        -------
+        TrajectorySet
+            An `AnomalousSet` where episodes are paired, else a `LabelledSet`.
+
+        Raises
+        ------
+        UnknownNameError
+            When this split has no such anomaly.
+        """
+        if str(condition) == str(NOMINAL_TEST):
+            return self.twins
+        return self.anomalous(condition) if self.paired else self.labelled(condition)
+
+    def labelled(self, anomaly: str | Condition) -> LabelledSet:
+        """Return the test episodes with one anomaly of an environment without twins.
+
+        Parameters
+        ----------
+        anomaly
+            One of `anomalies`, or the condition that it names.
+
+        Returns
+        -------
+        LabelledSet
+            In the order of the logs.
+
+        Raises
+        ------
+        UnknownNameError
+            When this split has no such anomaly.
+        """
+        check_known(f"anomaly of {self._file.name}", self.anomalies, str(anomaly))
+        return LabelledSet(self._parts, f"test/{anomaly}")
 
     def anomalous(self, anomaly: str | Condition) -> AnomalousSet:
         """Return the test trajectories with one anomaly, in the order of their twins.
@@ -291,7 +384,7 @@ def parts_of(
     data: EnvironmentData, anomalies: Iterable[str | Condition]
 ) -> dict[str, TrajectorySet]:
     """Return the parts to score by name: calibration, the twins and the anomalies."""
-    anomalous = {f"test/{a}": data.anomalous(a) for a in anomalies}
+    anomalous = {f"test/{a}": data.test_set(a) for a in anomalies}
     return {CALIBRATION: data.calibration, TWINS: data.twins, **anomalous}
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data import layout
-from oodd_eval.data.condition import Condition, in_suite_order
+from oodd_eval.data.condition import NOMINAL, Condition, in_suite_order
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twins, conditions_in
@@ -55,6 +55,22 @@ def split_directories() -> dict[str, Path]:
         for manifest in sorted(home.glob(f"*/{MANIFEST}")):
             directories.setdefault(manifest.parent.name, manifest.parent)
     return directories
+
+
+def imported_environments() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield environments of logs in the splits of `split_directories`.
+
+    Yields
+    ------
+    tuple
+        Name of the environment, name of the split, and the environment's entry in its manifest.
+        Splits that cannot be read are passed over.
+    """
+    for name, directory in split_directories().items():
+        with contextlib.suppress(SplitError):
+            for environment, entry in Split(directory).manifest["environments"].items():
+                if "logs" in entry:
+                    yield environment, name, entry
 
 
 def load_split(name: str | Path) -> "Split":
@@ -140,9 +156,11 @@ class Split:
         Returns
         -------
         tuple of Condition
-            In the benchmark's order.
+            In the benchmark's order; `NOMINAL` alone where there are nominal test episodes only.
         """
-        return conditions_in(self.manifest["environments"][environment]["groups"])
+        groups = self.manifest["environments"][environment]["groups"]
+        tests = conditions_in(groups)
+        return tests or ((NOMINAL,) if groups[TWINS]["trajectories"] else ())
 
     def strengths(self, environment: str) -> dict[Condition, float]:
         """Return the strengths of an environment's conditions as numbers, as far as it has any.
@@ -162,6 +180,15 @@ class Split:
         numbers = entry.get("strengths", definition.get("strengths", {}))
         conditions = {str(condition): condition for condition in self.conditions(environment)}
         return {conditions[name]: float(n) for name, n in numbers.items() if name in conditions}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of strengths by kind of anomaly, where the manifest has one for each."""
+        units: dict[str, set[str]] = {}
+        for entry in self.manifest["environments"].values():
+            for kind, unit in entry.get("units", {}).items():
+                units.setdefault(kind, set()).add(unit)
+        return {kind: several.pop() for kind, several in units.items() if len(several) == 1}
 
     @property
     def anomalies(self) -> tuple[str, ...]:
@@ -205,6 +232,22 @@ class Split:
     def _names(self, *environments: str) -> tuple[str, ...]:
         conditions = in_suite_order(c for e in environments for c in self.conditions(e))
         return tuple(dict.fromkeys((*(c.anomaly for c in conditions), *map(str, conditions))))
+
+    def baseline(self, environment: str) -> int:
+        """Return the number of baseline rows of an environment's episodes.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+
+        Returns
+        -------
+        int
+            0 where none are declared.
+        """
+        facts = layout.log_facts(self.manifest["environments"][environment])
+        return 0 if facts is None else facts.baseline
 
     def train_digest(self, environment: str) -> str:
         """Return the digest of an environment's training part: what a fit depends on.
@@ -255,8 +298,8 @@ class Split:
             stack.pop_all()
         entry = self.manifest["environments"][name]
         digest = layout.environment_digest(entry)
-        discrete = layout.discrete_actions(name, entry)
-        return EnvironmentData(name, file, parts, digest, discrete=discrete)
+        discrete, logs = layout.discrete_actions(name, entry), layout.log_facts(entry)
+        return EnvironmentData(name, file, parts, digest, discrete=discrete, logs=logs)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:
@@ -317,7 +360,7 @@ class Split:
             if group == NAMES:
                 layout.check_names(file.name, parts)
                 break
-            layout.check_layout(file.name, group, part)
+            layout.check_layout(file.name, group, part, paired=layout.is_paired(entry))
             sizes, named = (len(part["seeds"]), len(part["actions"])), entry["groups"][group]
             if sizes != (named["trajectories"], named["transitions"]):
                 raise SplitError(

@@ -139,9 +139,34 @@ class StoredFile:
                     raise self.bounds.error(f"{self.name}, group {name}: {key} is no single value")
             return {key: attributes[key] for key in present}
 
+    def members(self, name: str) -> dict[str, StoredRows | None]:
+        """Return what a group holds by name: datasets, and None for each group."""
+        with self.reading(name):
+            group = self._group(name)
+            items = {key: child(group, key, self.bounds.error) for key in group}
+            return {
+                key: StoredRows(self, item) if isinstance(item, h5py.Dataset) else None
+                for key, item in items.items()
+                if isinstance(item, h5py.Dataset | h5py.Group)
+            }
+
+    def single_values(self, name: str) -> dict[str, Any]:
+        """Return the attributes of a group that are one number or text."""
+        with self.reading(name):
+            attributes = self._group(name).attrs
+            single = [
+                key for key in attributes if math.prod(attributes.get_id(key).shape or ()) == 1
+            ]
+            values = {key: attributes[key] for key in single}
+        return {
+            key: value.item() if isinstance(value, np.generic) else value
+            for key, value in values.items()
+            if isinstance(value, str | np.number | np.bool_)
+        }
+
     def _group(self, path: str) -> h5py.Group:
         group: Any = self._file
-        for name in path.split("/"):
+        for name in filter(None, path.split("/")):
             if name not in group:
                 raise self.bounds.failure(f"{self.name} lacks the group {path}")
             group = child(group, name, self.bounds.error)
