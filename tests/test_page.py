@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers_docs import ROOT
 from oodd_recording.environments import make
-from oodd_recording.record import Episode
+from oodd_recording.record import RecordedEpisode
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 from oodd_eval.data.trajectory import Trajectory
@@ -62,7 +62,7 @@ def episodes(changed, rows=200, onset=60, sensors=None):
     broken = twin.copy()
     for sensor, value in changed.items():
         broken[onset:, sensor] = value
-    nothing = Episode(Trajectory(twin), np.zeros(rows - 1, np.float32), False, 1)
+    nothing = RecordedEpisode(Trajectory(twin), np.zeros(rows - 1, np.float32), False, 1)
     parameters = {} if sensors is None else {"sensors": sensors}
     told = {"onset": onset, "effect": onset, "parameters": parameters}
     return replace(nothing, trajectory=Trajectory(broken), **told), nothing

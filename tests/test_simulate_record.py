@@ -83,7 +83,7 @@ def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeyp
 
 def scripted(monkeypatch, script):
     """Let attempts have given onsets, lengths and first differing rows; None: equal to the twin."""
-    twin = recording.Episode(
+    twin = recording.RecordedEpisode(
         Trajectory(np.zeros((101, 4)), np.eye(2)[[0] * 100]), np.zeros(100, "f4"), False, 7
     )
     attempts = []

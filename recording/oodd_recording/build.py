@@ -38,7 +38,7 @@ from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
     GENERATOR_VERSION,
-    Episode,
+    RecordedEpisode,
     TwinTooShortError,
     measure,
     record_seed,
@@ -338,7 +338,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
     policy = load_policy(chunk.environment, chunk.policy or None)
     conditions = dict(chunk.conditions)
     environment, cap = chunk.environment, chunk.episode_cap
-    recorded: list[dict[Condition | None, Episode]] = []
+    recorded: list[dict[Condition | None, RecordedEpisode]] = []
     for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
@@ -356,7 +356,7 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
         np.savez(out, allow_pickle=False, **arrays)
 
 
-def _stack(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
+def _stack(episodes: list[RecordedEpisode]) -> dict[str, NDArray[Any]]:
     """Return the datasets of a part as a chunk holds them: with lengths instead of offsets."""
     arrays: dict[str, NDArray[Any]] = {
         "observations": np.concatenate([e.trajectory.observations for e in episodes]),

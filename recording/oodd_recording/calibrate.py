@@ -27,7 +27,13 @@ from oodd_eval.data.files import write_text
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
 from oodd_recording.policies import load_policy
-from oodd_recording.record import GENERATOR_VERSION, Episode, Setup, record_anomalous, return_of
+from oodd_recording.record import (
+    GENERATOR_VERSION,
+    RecordedEpisode,
+    Setup,
+    record_anomalous,
+    return_of,
+)
 from oodd_recording.values import bound_of, unit_of
 
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
@@ -57,7 +63,7 @@ def episodes_of(environment: str) -> int:
 @functools.cache
 def twins_of(
     environment: str, first: int = FIRST_SEED, count: int = 0, *, whole: bool = False
-) -> list[Episode]:
+) -> list[RecordedEpisode]:
     """Return the nominal episodes of some seeds, by default of all that are measured on."""
     setup, count = setup_of(environment, whole=whole), count or episodes_of(environment)
     return [setup.record(first + i) for i in range(count)]

@@ -12,7 +12,7 @@ from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.errors import OoddError, SimulationError
 from oodd_recording.info import info_of
 from oodd_recording.policies import Policy, load_policy
-from oodd_recording.record import SHORTEST_TWIN, Episode, Setup, measure, record_anomalous
+from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, Setup, measure, record_anomalous
 from oodd_recording.values import bound_of
 
 SEEDS: Final = range(960_000_000, 960_000_008)  # outside every split and training
@@ -39,7 +39,7 @@ class Subject:
         return Setup(self.environment, self.policy)
 
     @functools.cached_property
-    def twins(self) -> list[Episode]:
+    def twins(self) -> list[RecordedEpisode]:
         """Nominal episodes that are long enough for an onset."""
         episodes = (Setup(self.environment, self.policy).record(seed) for seed in SEEDS)
         long = [e for e in episodes if e.trajectory.transitions >= SHORTEST_TWIN]
@@ -50,13 +50,13 @@ class Subject:
             )
         return long
 
-    def anomalous(self, part: float) -> list[Episode]:
+    def anomalous(self, part: float) -> list[RecordedEpisode]:
         """Return an episode for each twin, at a part of the largest strength."""
         strength = part * bound_of(self.environment, self.kind)
         return [record_anomalous(self.setup, self.kind, strength, t, redraws=0) for t in self.twins]
 
 
-def _content(episode: Episode) -> bytes:
+def _content(episode: RecordedEpisode) -> bytes:
     arrays = episode.trajectory.observations, episode.trajectory.actions, episode.rewards
     return b"".join(array.tobytes() for array in arrays)
 

@@ -54,12 +54,12 @@ class Setup:
     episode_cap: int | None = None
     noise: float = 0.0
 
-    def record(self, seed: int) -> "Episode":
+    def record(self, seed: int) -> "RecordedEpisode":
         """Record the nominal episode of a seed; `SimulationError` for a negative one."""
         if seed < 0:
             raise SimulationError(f"seed is {seed}, expected a whole number from 0")
         rows, actions, rewards, over, _ = _run(self, seed)
-        return Episode(Trajectory(rows, actions), rewards, over, seed)
+        return RecordedEpisode(Trajectory(rows, actions), rewards, over, seed)
 
 
 class TwinTooShortError(SimulationError):
@@ -67,7 +67,7 @@ class TwinTooShortError(SimulationError):
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
+class RecordedEpisode:
     """One recorded episode; `terminated` is True when the simulator, not the cap, ended it.
 
     `onset` is the index of the first observation that may differ from the twin's, `effect` of the
@@ -93,7 +93,7 @@ def record_seed(
     policy: Policy,
     episode_cap: int | None = None,
     noise: float = 0.0,
-) -> dict[Condition | None, Episode]:
+) -> dict[Condition | None, RecordedEpisode]:
     """Record the nominal twin of a seed (key None) and one episode per condition.
 
     Parameters
@@ -127,7 +127,7 @@ def record_seed(
             f"the nominal episode of {environment} with seed {seed} has "
             f"{twin.trajectory.transitions} transitions, expected at least {SHORTEST_TWIN}"
         )
-    episodes: dict[Condition | None, Episode] = {None: twin}
+    episodes: dict[Condition | None, RecordedEpisode] = {None: twin}
     episodes |= {c: record_anomalous(setup, c.anomaly, strengths[c], twin) for c in strengths}
     return episodes
 
@@ -139,7 +139,7 @@ def record_nominal(
     policy: Policy,
     episode_cap: int | None = None,
     noise: float = 0.0,
-) -> Episode:
+) -> RecordedEpisode:
     """Record the nominal episode of a seed, a whole number from 0; see `record_seed`."""
     return Setup(environment, policy, episode_cap, noise).record(seed)
 
@@ -180,7 +180,7 @@ def measure(environment: str, policy: Policy) -> None:
     MEASURED[environment] = Measured(tuple(rows.std(axis=0).tolist()), tuple(may_break))
 
 
-def return_of(episode: Episode) -> float:
+def return_of(episode: RecordedEpisode) -> float:
     """Return the sum of an episode's rewards."""
     return float(episode.rewards.sum(dtype=np.float64))
 
@@ -192,8 +192,13 @@ def generator(environment: str, anomaly: str, seed: int, attempt: int) -> np.ran
 
 
 def record_anomalous(
-    setup: Setup, kind: str, strength: float | None, twin: Episode, *, redraws: int = MAX_REDRAWS
-) -> Episode:
+    setup: Setup,
+    kind: str,
+    strength: float | None,
+    twin: RecordedEpisode,
+    *,
+    redraws: int = MAX_REDRAWS,
+) -> RecordedEpisode:
     """Record the episode of a twin's seed under one kind of anomaly; see `record_seed`.
 
     After so many `redraws` the longest episode is taken.
@@ -206,7 +211,7 @@ def record_anomalous(
     if info_of(environment).discrete:
         commands = [int(row.argmax()) for row in commands]
     last = int(LAST_ONSET_SHARE * len(commands))
-    longest: Episode | None = None
+    longest: RecordedEpisode | None = None
     tail = -1
     for attempt in range(redraws + 1):
         rng = generator(environment, kind, twin.seed, attempt)
@@ -218,13 +223,13 @@ def record_anomalous(
         if effect is None or len(rewards) - onset <= tail:
             continue
         tail, drawn = len(rewards) - onset, (onset, effect, parameters, attempt)
-        longest = Episode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
+        longest = RecordedEpisode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
         if tail > SHORTEST_TAIL:
             return longest
     if longest is None and strength is not None:
         # Too weak to be felt: the episode stays, and counts from its onset on.
         drawn = (onset, onset, parameters, redraws)
-        return Episode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
+        return RecordedEpisode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
     if longest is None:
         raise SimulationError(
             f"no {kind} episode of {environment} with seed {twin.seed} differs from its twin "

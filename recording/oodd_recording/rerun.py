@@ -75,6 +75,11 @@ def rerun(options: Options) -> int:
     if len(verdicts) != 1 or not verdicts[0].ok:
         raise UsageError(f"{str(path)!r}: expected one valid entry, see leaderboard verify")
     entry, plugins = read_entry(path), discovered(options)
+    if not all(record.paired for record in entry.records):
+        raise UsageError(
+            f"{entry.meta.id} is of logs, which cannot be recorded again: without a re-run its "
+            "trust is at most re-scored, by leaderboard verify from its scores"
+        )
     names = select("environment", options.env, environments_of(entry))
     check_installed(entry, plugins)
     boxed = not options.no_sandbox and _sandboxed()

@@ -26,7 +26,7 @@ def pyod(name: str) -> DetectorSpec:
         library_class = pyod_class(name)
     except ModuleNotFoundError as error:
         return _absent(f"pyod:{name}", summary, str(error.name), "")
-    recipe = Recipe(library_class, f"pyod:{name}", outlier=("decision_function", 1))
+    recipe = _Recipe(library_class, f"pyod:{name}", outlier=("decision_function", 1))
     return recipe.spec(summary, f"pyod.{version('pyod')}")
 
 
@@ -36,10 +36,10 @@ def sklearn(name: str) -> DetectorSpec:
         summary = f"scikit-learn's {name} on a window of observations"
         return _absent(f"sklearn:{name}", summary, "sklearn", "oodd-eval[reference]")
     name, library_class = sklearn_class(name)
-    recipe = Recipe(library_class, f"sklearn:{name}", outlier=("score_samples", -1))
+    recipe = _Recipe(library_class, f"sklearn:{name}", outlier=("score_samples", -1))
     if "novelty" in recipe.signature:
         # Without it the class judges its training rows and no others.
-        recipe = Recipe(library_class, recipe.name, recipe.outlier, {"novelty": True})
+        recipe = _Recipe(library_class, recipe.name, recipe.outlier, {"novelty": True})
     summary = f"scikit-learn's {name} on a window of observations"
     return recipe.spec(summary, _sklearn_version())
 
@@ -54,11 +54,11 @@ def forecast(path: str) -> DetectorSpec:
     library_class = forecaster_class(path)
     # Code of one's own changes without a new version; its digest tells.
     label = _sklearn_version() if top == "sklearn" else f"{top}.{source_digest(top)[:12]}"
-    return Recipe(library_class, name, outlier=None).spec(summary, label)
+    return _Recipe(library_class, name, outlier=None).spec(summary, label)
 
 
 @dataclass(frozen=True)
-class Recipe:
+class _Recipe:
     """Make detectors of a class: the factory of a spec.
 
     Attributes
