@@ -12,11 +12,21 @@ from typing import TYPE_CHECKING, Final
 import pluggy
 
 if TYPE_CHECKING:
+    from oodd_eval.data.logs import Reader
     from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
     from oodd_eval.plugins.contract import DetectorSpec
 
 PROJECT: Final = "oodd_eval"
 """Name of the pluggy project and of the entry-point group."""
+
+OFFER_HOOKS: Final = (
+    "oodd_detectors",
+    "oodd_environments",
+    "oodd_anomalies",
+    "oodd_readers",
+    "oodd_detector_from_spec",
+)
+"""Hooks of this module."""
 
 OBSERVER_HOOKS: Final = (
     "oodd_run_started",
@@ -67,6 +77,20 @@ def oodd_anomalies() -> list[AnomalySpec] | None:
     Returns
     -------
     list of AnomalySpec
+        None stands for an empty list.
+    """
+
+
+@hookspec
+def oodd_readers() -> list[Reader] | None:
+    """Offer formats of logs, which recipes name and ``oodd-eval data inspect`` recognises.
+
+    Called once, when logs are inspected or imported. It has to be quick: import the library of a
+    format inside the function that opens its files.
+
+    Returns
+    -------
+    list of Reader
         None stands for an empty list.
     """
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
 
 import pluggy
 
@@ -28,9 +28,18 @@ from oodd_eval.plugins.contract import DetectorSpec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
+    from oodd_eval.data.logs import Reader
     from oodd_eval.data.registry import Spec
 
-_Spec = TypeVar("_Spec")
+
+class _Named(Protocol):
+    """What plug-ins offer under a name."""
+
+    @property
+    def name(self) -> str: ...
+
+
+_Spec = TypeVar("_Spec", bound=_Named)
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -109,6 +118,17 @@ class Plugin:
             check_spec(spec)
         return specs
 
+    def readers(self) -> list[Reader]:
+        """Return its readers of logs, checked."""
+        from oodd_eval.data.logs import Reader, check_reader  # noqa: PLC0415
+
+        readers: list[Reader] = []
+        for returned in self.hook.oodd_readers():
+            readers += _list_of(returned, Reader, f"oodd_readers of {self}")
+        for reader in readers:
+            check_reader(reader)
+        return readers
+
     def offer(self, spec: DetectorSpec) -> Offer:
         """Return a spec as an offer; its version names the library that does the work, too."""
         version = "+".join(filter(None, (_metadata(self.point.dist)[1], spec.version)))
@@ -138,19 +158,12 @@ class Plugins:
     @property
     def custom_specs(self) -> dict[str, tuple[Spec, str]]:
         """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
-        for point in list(self._waiting):
-            self._load(point)
-        offered: dict[str, tuple[Spec, str]] = {}
-        for plugin in list(self.loaded.values()):
-            with self.blaming(plugin.point):
-                of_plugin: dict[str, tuple[Spec, str]] = {}
-                for spec in plugin.custom_specs():
-                    if previous := offered.get(spec.name) or of_plugin.get(spec.name):
-                        by = f"{previous[1]} and by {plugin}"
-                        raise PluginError(f"{spec.name!r} is offered twice, by {by}")
-                    of_plugin[spec.name] = (spec, str(plugin))
-                offered |= of_plugin
-        return offered
+        return self._offered(Plugin.custom_specs)
+
+    @property
+    def readers(self) -> dict[str, tuple[Reader, str]]:
+        """Readers of logs of plug-ins by name, with their origin; all are loaded."""
+        return self._offered(Plugin.readers)
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -219,6 +232,23 @@ class Plugins:
             self.broken.append(Broken(point.name, _distribution(point), reason))
             if self._listener:
                 self._listener(self.broken[-1])
+
+    def _offered(self, of: Callable[[Plugin], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
+        """Return what all plug-ins offer by name, with its origin; no name is offered twice."""
+        for point in list(self._waiting):
+            self._load(point)
+        offered: dict[str, tuple[_Spec, str]] = {}
+        for plugin in list(self.loaded.values()):
+            with self.blaming(plugin.point):
+                of_plugin: dict[str, tuple[_Spec, str]] = {}
+                for spec in of(plugin):
+                    name = spec.name
+                    if previous := offered.get(name) or of_plugin.get(name):
+                        by = f"{previous[1]} and by {plugin}"
+                        raise PluginError(f"{name!r} is offered twice, by {by}")
+                    of_plugin[name] = (spec, str(plugin))
+                offered |= of_plugin
+        return offered
 
     def _load(self, point: EntryPoint) -> None:
         """Load an entry point: afterwards all that it offers is there, or it is broken."""
@@ -308,8 +338,7 @@ def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
     for specification in (hooks, *specifications):
         manager.add_hookspecs(specification)
     manager.register(plugin)
-    known = {"oodd_detectors", "oodd_detector_from_spec", "oodd_environments", "oodd_anomalies"}
-    known |= {*hooks.OBSERVER_HOOKS}
+    known = {*hooks.OFFER_HOOKS, *hooks.OBSERVER_HOOKS}
     check_known("hook", known, *(caller.name for caller in manager.get_hookcallers(plugin) or ()))
     return manager.hook
 
@@ -395,6 +424,7 @@ _FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("summary reference extra fit_name", "a printable line of at most 1000 characters", _is_line),
     ("inputs", " or ".join(_INPUTS), _INPUTS.__contains__),
     ("alarm", "cusum or score", ("cusum", "score").__contains__),
+    ("adapts", "'' or baseline", ("", "baseline").__contains__),
     ("deterministic other_parameters horizon_decides_fit", "True or False", _is_truth),
     ("requires", "names of modules", _are_lines),
     ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),

@@ -1,93 +1,42 @@
-"""Logs of users: episodes as other programs wrote them, read without running anything.
+"""Logs of users: recordings as other programs wrote them, read without running anything.
 
-A part of a data set (training, say) is a folder with a file for each episode, a file with a group
-for each, or the directory of a Minari dataset. Every module of this package that has a `Reader`
-named ``READER`` adds a format; nothing else lists them.
+Every module of this package that has a `Reader` named ``READER`` adds a format; plug-ins add
+others by the hook ``oodd_readers``. A reader opens one file (or the directory of a data set) and
+yields recordings, whose rows are read when they are asked for.
 """
 
-import csv
+import contextlib
+import dataclasses
+import fnmatch
+import functools
 import importlib
-import io
 import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from oodd_eval.data.bounded import EPISODE, read_bytes
-from oodd_eval.data.facts import Quantity
-from oodd_eval.errors import TrajectoryError, UsageError
+from oodd_eval.data.facts import NAME_PATTERN, Quantity
+from oodd_eval.data.recording import Column, Recording, Topic
+from oodd_eval.errors import (
+    MissingExtraError,
+    OoddError,
+    PluginError,
+    TrajectoryError,
+    UnknownNameError,
+    UsageError,
+)
 from oodd_eval.names import check_known
 
-ONSETS: Final = "onsets.csv"
-ARRAYS: Final = ("observations", "actions", "rewards", "onset")
-"""Arrays that an episode may have in formats that name them."""
+Options = Mapping[str, Any]
+"""Values of a recipe's ``[read]`` table by name, without the format."""
 
-Array = NDArray[Any]
+NO_OPTIONS: Final[Options] = MappingProxyType({})
 
-
-@dataclass(frozen=True, slots=True)
-class Log:
-    """One episode as it was logged.
-
-    Parameters
-    ----------
-    name
-        That of its file or group, and of its twin's.
-    source
-        File, and group if there are several, as messages name it.
-    observations
-        Array of shape (T + 1, D).
-    actions
-        Array of shape (T, A), or of shape (T,); None where they are not known.
-    rewards
-        Array of shape (T,); None where they are not known.
-    onset
-        Number of the first row that may differ from the twin's; None for nominal episodes.
-    seed
-        Seed of the environment, if any.
-    terminated
-        True when the task ended the episode, False when a time limit did.
-    parameters
-        Values that the anomaly drew.
-    """
-
-    name: str
-    source: str
-    observations: Array
-    actions: Array | None = None
-    rewards: Array | None = None
-    onset: int | None = None
-    seed: int | None = None
-    terminated: bool = False
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Logs:
-    """The episodes of one part, and what its files say of the columns.
-
-    Parameters
-    ----------
-    read
-        Yields the episodes; `TrajectoryError` when one cannot be read.
-    sensors, actions
-        Names and units of the columns; empty where the files do not name them.
-    discrete
-        Number of actions where each is a whole number; 0 where they are amounts or it is not known.
-    start
-        The lowest of these whole numbers.
-    """
-
-    read: Callable[[], Iterator[Log]]
-    sensors: tuple[Quantity, ...] = ()
-    actions: tuple[Quantity, ...] = ()
-    discrete: int = 0
-    start: int = 0
+TOPICS: Final = {"topics": "list of globs over the names of topics"}
+TRANSPOSE: Final = {"transpose": "true, or globs of the files in which a row is a sensor"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,57 +46,182 @@ class Reader:
     Parameters
     ----------
     name
-        As users choose it.
+        As recipes choose it: lower-case letters, digits and hyphens.
     part
-        What a part has to be, for messages.
-    open
-        Returns the logs of a part, of which no episode is read yet.
+        What `read` opens, for messages: ``"a CSV file"``.
     suffixes
-        Endings of a part that is one file; empty where it is a folder.
-    tests
-        Pattern of names of test parts, whose first group is the anomaly's name: where one matches,
-        only those that match count.
+        Endings of file names by which the format is recognised, in lower case and with the dot.
+    open
+        Called with the path of a file or directory and the options of the recipe; yields its
+        recordings. It may raise anything for content that is damaged.
+    extra
+        Extra of the project whose libraries the format needs; empty where it needs none.
+    options
+        Names of the options that it takes, with what they are.
+    directory_markers
+        Paths relative to a directory by which a data set in one is recognised, as globs:
+        ``"meta/info.json"``. Empty for formats that are files.
     """
 
     name: str
     part: str
-    open: Callable[[Path], Logs]
-    suffixes: tuple[str, ...] = ()
-    tests: str = "$."
+    suffixes: tuple[str, ...]
+    open: Callable[[Path, Options], Iterable[Recording]]
+    extra: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
+    directory_markers: tuple[str, ...] = ()
+
+    def fits(self, path: Path) -> int:
+        """Tell by a name whether a file or directory is of this format.
+
+        Parameters
+        ----------
+        path
+            The file or directory.
+
+        Returns
+        -------
+        int
+            Length of the ending that says so, 1 for a directory; 0 for what is of another format.
+        """
+        if path.is_dir():
+            return int(any(next(path.glob(marker), None) for marker in self.directory_markers))
+        name = path.name.lower()
+        return max((len(suffix) for suffix in self.suffixes if name.endswith(suffix)), default=0)
+
+    def read(self, path: Path, options: Options = NO_OPTIONS) -> Iterator[Recording]:
+        """Yield the recordings of a file, or of the directory of a data set.
+
+        Parameters
+        ----------
+        path
+            The file or directory.
+        options
+            Those of `options` that a recipe sets.
+
+        Yields
+        ------
+        Recording
+            In the order of the file; numbers in names count as numbers.
+
+        Raises
+        ------
+        UsageError
+            When an option is unknown or wrong, or there is nothing at the path.
+        MissingExtraError
+            When a library is not installed.
+        TrajectoryError
+            When the content cannot be read. Reading rows raises it, too.
+        """
+        check_known(f"option of the format {self.name}", self.options, *options)
+        if not path.exists():
+            raise UsageError(f"{str(path)!r} does not exist, expected {self.part}")
+        if path.is_dir() and not self.directory_markers:
+            raise UsageError(f"{str(path)!r} is a directory, expected {self.part}")
+        if not path.is_dir() and not path.is_file():
+            raise TrajectoryError(f"{path} is no plain file")
+        with readable(path):
+            for recording in self.open(path, options):
+                topics = {name: _guarded(t, recording) for name, t in recording.topics.items()}
+                yield dataclasses.replace(recording, topics=topics)
 
 
-def open_logs(form: str, part: Path) -> Logs:
-    """Return the episodes of a part in one of `FORMATS`; nothing but names is read so far.
+def readers() -> Mapping[str, Reader]:
+    """Return the readers by name: the project's, and those of plug-ins that were registered."""
+    return MappingProxyType({**_ours(), **_registered})
+
+
+def reader_for(path: Path, form: str = "") -> Reader:
+    """Return the reader of a format by name, or that of a file or directory.
 
     Raises
     ------
+    UnknownNameError
+        When there is no such format.
     UsageError
-        When the format is unknown, or there is nothing to read.
+        When the path is of none.
     TrajectoryError
-        When what is there cannot be read; reading the episodes raises it, too.
+        When it is neither a plain file nor a directory.
     """
-    check_known("format", FORMATS, form)
-    if not part.exists():
-        raise UsageError(f"{str(part)!r} does not exist, expected {FORMATS[form].part}")
-    return FORMATS[form].open(part)
+    if not path.is_file() and not path.is_dir():
+        raise TrajectoryError(
+            f"{path} is no plain file, but a broken link, a pipe or a device: remove it"
+        )
+    offered = readers()
+    if form:
+        check_known("format", offered, form)
+        return offered[form]
+    reader = max(offered.values(), key=lambda reader: reader.fits(path))
+    if not reader.fits(path):
+        raise UsageError(
+            f"{path} has no ending of a known format: name it, [read] format = one of "
+            f"{', '.join(offered)}"
+        )
+    return reader
 
 
-def test_parts(form: str, folder: Path) -> dict[str, Path]:
-    """Return the parts with test episodes by name, ``nominal`` and the anomalies."""
-    check_known("format", FORMATS, form)
-    reader = FORMATS[form]
-    if not folder.is_dir():
-        raise UsageError(f"{str(folder)!r} is no folder, expected one with the test episodes")
-    parts = {
-        path.stem if reader.suffixes else path.name: path
-        for path in sorted(folder.iterdir())
-        if not path.name.startswith(".")
-        and (path.suffix in reader.suffixes if reader.suffixes else path.is_dir())
-    }
-    matches = {name: re.fullmatch(reader.tests, name) for name in parts}
-    if any(matches.values()):
-        return {match[1]: parts[name] for name, match in matches.items() if match}
-    return parts
+def register_readers(offered: Iterable[Reader]) -> None:
+    """Make readers of plug-ins known in this process; `check_reader` says which may be."""
+    for reader in offered:
+        check_reader(reader)
+        _registered[reader.name] = reader
+
+
+def check_reader(reader: Reader) -> None:
+    """Raise `PluginError` for a reader with a wrong name, or one that the project has."""
+    if not re.fullmatch(NAME_PATTERN, str(reader.name)) or reader.name in _ours():
+        raise PluginError(
+            f"{reader.name!r} cannot be the name of a reader, expected lower-case letters, digits "
+            f"and hyphens, and none of {', '.join(_ours())}"
+        )
+    wrong = [s for s in reader.suffixes if s != s.lower() or not s.startswith(".")]
+    if isinstance(reader.suffixes, str) or wrong or not callable(reader.open):
+        raise PluginError(
+            f"reader {reader.name!r} has the suffixes {reader.suffixes!r:.80}, expected a tuple of "
+            "lower-case endings such as '.log', and a function to open files with"
+        )
+
+
+def library(module: str, extra: str = "logs") -> Any:
+    """Return a module of a library that an extra installs.
+
+    Raises
+    ------
+    MissingExtraError
+        When it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith(package):
+            advice = f"pip install 'oodd-eval[{extra}]'"
+            raise MissingExtraError(f"these logs need {package}: {advice}") from None
+        raise
+
+
+@contextlib.contextmanager
+def readable(source: object) -> Iterator[None]:
+    """Raise `TrajectoryError`, with the source, for whatever a library raises in the block."""
+    try:
+        yield
+    except OoddError:
+        raise
+    except Exception as error:
+        raise unreadable(source, error) from error
+
+
+def unreadable(source: object, error: BaseException) -> TrajectoryError:
+    """Return the error for a file that a library cannot read."""
+    said = " ".join(str(error).split())[:300]
+    if isinstance(error, UnicodeDecodeError):
+        said += "; if it is text, [read] encoding = 'cp1252', or another, may be that of the file"
+    return TrajectoryError(f"{source} cannot be read: {type(error).__name__}: {said}")
+
+
+def in_order(name: str) -> list[Any]:
+    """Return what sorts ``episode_10`` behind ``episode_9``."""
+    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in re.split(r"([0-9]+)", name)]
 
 
 def quantity(text: str) -> Quantity:
@@ -162,58 +236,56 @@ def quantity(text: str) -> Quantity:
     return Quantity(match[1], match[2] or "1")
 
 
-def unreadable(source: object, error: BaseException) -> TrajectoryError:
-    """Return the error for a file that a library cannot read."""
-    return TrajectoryError(f"{source} cannot be read: {type(error).__name__}: {error}")
+def is_transposed(path: Path, options: Options) -> bool:
+    """Tell whether a recipe says that rows and columns of a file are exchanged.
+
+    The option ``transpose`` is true, or a list of globs over the names of files.
+    """
+    value = options.get("transpose", False)
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, list) and all(isinstance(glob, str) for glob in value):
+        return any(fnmatch.fnmatch(path.name, glob) or path.match(glob) for glob in value)
+    raise UsageError(f"transpose is {value!r}, expected true, false or a list of globs")
 
 
-def in_order(name: str) -> list[Any]:
-    """Return what sorts ``episode_10`` behind ``episode_9``."""
-    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in re.split(r"([0-9]+)", name)]
+def chosen(names: Iterable[str], options: Options, option: str = "topics") -> list[str]:
+    """Return the names that an option selects, a glob or a list of globs; all without it.
+
+    Raises
+    ------
+    UsageError
+        When a glob fits none.
+    """
+    known, globs = [*names], options.get(option)
+    if globs is None:
+        return known
+    globs = [globs] if isinstance(globs, str) else globs
+    if not isinstance(globs, list) or not all(isinstance(glob, str) for glob in globs):
+        raise UsageError(f"{option}={globs!r:.80}, expected a list of globs")
+    for glob in globs:
+        if not fnmatch.filter(known, glob):
+            raise UnknownNameError(option.removesuffix("s"), glob, known)
+    return [name for name in known if any(fnmatch.fnmatch(name, glob) for glob in globs)]
 
 
-def episode_files(folder: Path, suffix: str) -> list[Path]:
-    """Return the files of a folder with an ending, in the order of the episodes."""
-    files = sorted(path for path in folder.glob(f"*{suffix}") if path.name != ONSETS)
-    if not files:
-        raise UsageError(f"{str(folder)!r} has no files *{suffix}, expected one an episode")
-    return sorted(files, key=lambda path: in_order(path.stem))
+def _guarded(topic: Topic, recording: Recording) -> Topic:
+    def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        check_known(f"column of {recording.source}", topic.names, *names)
+        if not names:
+            return {}
+        with readable(recording.source):
+            return topic.read(names, max(0, start), min(stop, topic.rows))
+
+    return dataclasses.replace(topic, read=read)
 
 
-def read_onsets(folder: Path) -> dict[str, int]:
-    """Return the onsets of episodes by name from ``onsets.csv``; none where it is absent."""
-    path, onsets = folder / ONSETS, {}
-    if not path.exists():
-        return {}
-    text = read_bytes(path, EPISODE.most, TrajectoryError).decode("utf-8-sig", errors="replace")
-    rows = csv.DictReader(io.StringIO(text, newline=""))
-    try:
-        for row in rows:
-            onsets[Path(row["file"]).stem] = int(row["onset"])
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        expected = "the columns file and onset, a whole number"
-        raise TrajectoryError(
-            f"{path}, line {rows.line_num}: {error!r}, expected {expected}"
-        ) from None
-    return onsets
+@functools.cache
+def _ours() -> dict[str, Reader]:
+    modules = [
+        importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
+    ]
+    return {module.READER.name: module.READER for module in modules if hasattr(module, "READER")}
 
 
-def whole_number(source: str, name: str, value: Any) -> int | None:
-    """Return a number that a file gives as an array or scalar, if it does; one value, no text."""
-    if value is None:
-        return None
-    array = np.asarray(value)
-    if array.size == 1 and array.dtype.kind in "iuf" and float(array.item()).is_integer():
-        number = int(array.item())
-        if abs(number) < 2**63:
-            return number
-    raise TrajectoryError(f"{source}: {name} is {value!r:.80}, expected one whole number")
-
-
-def _formats() -> Iterator[Reader]:
-    for module in pkgutil.iter_modules(__path__, f"{__name__}."):
-        yield importlib.import_module(module.name).READER
-
-
-FORMATS: Final[Mapping[str, Reader]] = {reader.name: reader for reader in _formats()}
-"""Readers by the names of their formats."""
+_registered: Final[dict[str, Reader]] = {}

@@ -9,7 +9,7 @@ import dataclasses
 import json
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,9 +19,10 @@ import numpy as np
 from oodd_eval._version import __version__
 from oodd_eval.data.bounded import EPISODE, read_bytes
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity, title_of
-from oodd_eval.data.logs import Logs, Reader, unreadable
+from oodd_eval.data.logs import Options, Reader, unreadable
 from oodd_eval.data.logs.hdf5 import read_groups
-from oodd_eval.data.parts import AnomalousSet, EnvironmentData, TrajectorySet, parts_of
+from oodd_eval.data.parts import AnomalousSet, EnvironmentData, LabelledSet, TrajectorySet, parts_of
+from oodd_eval.data.recording import Recording
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OutputError, TrajectoryError, UsageError
@@ -29,7 +30,7 @@ from oodd_eval.errors import OutputError, TrajectoryError, UsageError
 NAMESPACE: Final = "oodd"
 
 
-def _open(directory: Path) -> Logs:
+def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     data, metadata = directory / "data" / "main_data.hdf5", directory / "data" / "metadata.json"
     if not data.exists() or not metadata.exists():
         raise UsageError(
@@ -46,8 +47,11 @@ def _open(directory: Path) -> Logs:
             tuple(Quantity(str(row["name"]), str(row["unit"])) for row in facts.get(columns, ()))
             for columns in ("sensors", "actions")
         )
-        is_discrete = kinds[1] == "Discrete"
-        discrete, start = (int(is_discrete and actions.get(k, 0)) for k in ("n", "start"))
+        further: dict[str, Any] = {}
+        if kinds[1] == "Discrete":
+            further = {"discrete": int(actions.get("n", 0)), "start": int(actions.get("start", 0))}
+            if len(commands) == further["discrete"]:
+                further["choices"] = [quantity.name for quantity in commands]
     except TrajectoryError:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -57,14 +61,15 @@ def _open(directory: Path) -> Logs:
             f"{metadata}: observations are {kinds[0]} and actions {kinds[1]}, expected a Box of "
             "observations and a Box of actions or Discrete ones: flatten them first"
         )
-    return Logs(lambda: read_groups(data), sensors, commands, discrete, start)
+    yield from read_groups(data, sensors=sensors, actions=commands, further=further)
 
 
 READER: Final = Reader(
     "minari",
     "the directory of a Minari dataset",
+    (),
     _open,
-    tests=r"test-(.+)-v\d+",  # as an export names them
+    directory_markers=("data/main_data.hdf5",),
 )
 
 
@@ -143,9 +148,17 @@ def _write(
                 group = stored.create_group(f"episode_{i}")
                 _episode(group, i, trajectories, trajectory, data.discrete, ended[i])
         what, further = f"nominal, {trajectories.group}", ""
+        anomalies = f"{trajectories.group.removeprefix('test/')} anomalies"
         if isinstance(trajectories, AnomalousSet):
-            what = f"{trajectories.group.removeprefix('test/')} anomalies from an onset on"
+            what = f"{anomalies} from an onset on"
             further = ", anomaly, onset, effect, redraws, parameters as JSON"
+        elif isinstance(trajectories, LabelledSet):
+            what = f"{anomalies} in intervals of rows"
+            further = ", anomaly, intervals as JSON (a start of -1 is unknown, none: outcome alone)"
+        source = f"trajectories of a fixed policy ({policy}), from"
+        if data.logs:
+            source = "episodes of logs, as imported into"
+            further = f", name, task{further}"
         infinity = float("inf")
         # Commands of the benchmark's robots are shares of a motor's power; others may be anything.
         bound = 1.0 if data.id in ENVIRONMENTS else infinity
@@ -163,13 +176,16 @@ def _write(
             "action_space": json.dumps(action),
             "algorithm_name": policy,
             "author": ["The oodd-eval developers"],
-            "description": f"{title_of(data.id)}, {what}: trajectories of a fixed policy "
-            f"({policy}), from split {split.name} of oodd-eval. Episode metadata: seed{further}.",
+            "description": f"{title_of(data.id)}, {what}: {source} split {split.name} of "
+            f"oodd-eval. Episode metadata: seed{further}.",
             "oodd_eval_version": __version__,
             "split_digest": split.digest,
             "sensors": [dataclasses.asdict(quantity) for quantity in data.sensors],
             "actions": [dataclasses.asdict(quantity) for quantity in data.actions],
         }
+        if data.logs:
+            # Offsets have been subtracted from observations, as float32 has no room for them.
+            metadata |= {"author": [], "logs": dataclasses.asdict(data.logs)}
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
         partial.chmod(0o755)  # temporary directories are their maker's alone
         partial.rename(target)
@@ -191,8 +207,13 @@ def _episode(
         group.create_dataset(name, data=array, chunks=True, compression="gzip", shuffle=True)
     group.create_group("infos")
     group.attrs.update({"id": i, "seed": int(data.seeds[i]), "total_steps": steps})
-    if isinstance(data, AnomalousSet):
-        group.attrs["anomaly"] = data.group.removeprefix("test/")
+    described = {"name": data.names[i], "task": data.tasks[i]}
+    if isinstance(data, LabelledSet | AnomalousSet):
+        described["anomaly"] = data.group.removeprefix("test/")
+    group.attrs.update({key: text for key, text in described.items() if text})
+    if isinstance(data, LabelledSet):
+        group.attrs["intervals"] = json.dumps(data.intervals[i])
+    elif isinstance(data, AnomalousSet):
         drawn = {"onset": data.onsets, "effect": data.effects, "redraws": data.redraws}
         group.attrs.update({name: int(values[i]) for name, values in drawn.items()})
         group.attrs["parameters"] = json.dumps(data.parameters[i], sort_keys=True)

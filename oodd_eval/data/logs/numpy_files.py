@@ -1,27 +1,40 @@
-"""Episodes as ``.npz`` files with the arrays observations, actions, rewards and onset."""
+"""Episodes as ``.npz`` files of named arrays, or an ``.npy`` file with one array."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
-from oodd_eval.data.bounded import EPISODE, read_npz
-from oodd_eval.data.logs import ARRAYS, Log, Logs, Reader, episode_files, read_onsets, whole_number
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE, Bounds, npy_header, read_npz
+from oodd_eval.data.logs import TRANSPOSE, Options, Reader, is_transposed
+from oodd_eval.data.logs.matrices import MatrixRows, episode_of, whole_number
+from oodd_eval.data.recording import Recording
 from oodd_eval.errors import TrajectoryError
 
-
-def _episodes(folder: Path) -> Iterator[Log]:
-    onsets = read_onsets(folder)
-    for path in episode_files(folder, ".npz"):
-        arrays = read_npz(path, EPISODE, ARRAYS)
-        if "observations" not in arrays:
-            raise TrajectoryError(f"{path} lacks the array observations")
-        onset = whole_number(str(path), "onset", arrays.get("onset", onsets.get(path.stem)))
-        rows = arrays["observations"], arrays.get("actions"), arrays.get("rewards")
-        yield Log(path.stem, str(path), *rows, onset)
+_BOUNDS: Final = Bounds(EPISODE.most, TrajectoryError, EPISODE.advice, kinds="fiubU")
 
 
-READER: Final = Reader(
-    "numpy",
-    "a folder with a file *.npz for each episode",
-    lambda folder: Logs(lambda: _episodes(folder)),
-)
+def _open(path: Path, options: Options) -> Iterator[Recording]:
+    arrays: dict[str, Any]
+    arrays = {"observations": _array(path)} if path.suffix == ".npy" else read_npz(path, _BOUNDS)
+    if is_transposed(path, options):
+        arrays = {name: a.T if a.ndim == 2 else a for name, a in arrays.items()}
+    topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), str(path))
+    for name in ("onset", "seed"):
+        if name in fields:
+            fields[name] = whole_number(str(path), name, fields[name])
+    yield Recording(path.stem, str(path), {"": topic}, fields)
+
+
+def _array(path: Path) -> Any:
+    """Return the array of an ``.npy`` file, whose rows are read when asked for."""
+    with path.open("rb") as file:
+        dtype, size = npy_header(file)
+        EPISODE.check(str(path), dtype, 0)
+        if size > path.stat().st_size - file.tell():
+            raise TrajectoryError(f"{path} announces {size} bytes of numbers and is shorter")
+    return np.load(path, mmap_mode="r" if size else None, allow_pickle=False)
+
+
+READER: Final = Reader("numpy", "a NumPy file", (".npz", ".npy"), _open, options=TRANSPOSE)
