@@ -12,9 +12,13 @@ from oodd_eval._version import __version__
 if TYPE_CHECKING:
     from oodd_eval.api import evaluate, load_results
     from oodd_eval.data.facts import Quantity
+    from oodd_eval.data.importing import import_frames
+    from oodd_eval.data.logs import Reader
+    from oodd_eval.data.recording import Recording, Topic
     from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
+    from oodd_eval.live.scan import scan_episodes
     from oodd_eval.plugins import hookimpl
     from oodd_eval.plugins.contract import Detector, DetectorSpec
     from oodd_eval.plugins.explanations import Explanation
@@ -28,21 +32,30 @@ __all__ = [
     "EnvironmentSpec",
     "Explanation",
     "Quantity",
+    "Reader",
+    "Recording",
+    "Topic",
     "Trajectory",
     "__version__",
     "check_detector",
     "evaluate",
     "hookimpl",
+    "import_frames",
     "load_results",
     "load_split",
+    "scan_episodes",
 ]
 
 _NAMES = {
     "api": ("evaluate", "load_results"),
     "data.facts": ("Quantity",),
+    "data.importing": ("import_frames",),
+    "data.logs": ("Reader",),
+    "data.recording": ("Recording", "Topic"),
     "data.registry": ("AnomalySpec", "Attribute", "EnvironmentSpec"),
     "data.split": ("load_split",),
     "data.trajectory": ("Trajectory",),
+    "live.scan": ("scan_episodes",),
     "plugins": ("hookimpl",),
     "plugins.contract": ("Detector", "DetectorSpec"),
     "plugins.explanations": ("Explanation",),

@@ -1,19 +1,28 @@
 """``oodd-eval data``: import, describe, verify, fetch and export splits."""
 
-from typing import Final
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
 
 import click
 
 from oodd_eval.cli import COUNT, DIRECTORY, Converted, Name, Names, Options, command
-from oodd_eval.cli.terminal import make_console
+from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.fetch import fetch as fetch_split
-from oodd_eval.data.importing import import_data
+from oodd_eval.data.importing import import_data, import_recipe
 from oodd_eval.data.info import describe
-from oodd_eval.data.logs import FORMATS, quantity
+from oodd_eval.data.logs import quantity
 from oodd_eval.data.logs.minari import export as export_split
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.recipe import Recipe
+from oodd_eval.data.shipped_recipes import shipped_recipes
 from oodd_eval.data.split import load_split
+from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment, select
+from oodd_eval.results.render.text import print_prose
+from oodd_eval.scoring.doubts import promises_of
 
 
 def _quantities(text: str) -> tuple[Quantity, ...]:
@@ -31,16 +40,38 @@ _split_argument: Final = click.argument(
 )
 
 
-@command("data import plant --env pump --format csv --train logs/a --calibration logs/b")
+_SHORT: Final = [
+    "env",
+    "format",
+    "train",
+    "calibration",
+    "test",
+    "sensors",
+    "actions",
+    "discrete",
+    "group",
+]
+"""Options that stand for a recipe."""
+
+_DETECTORS: Final = "mewma,mahalanobis,range,clock"  # fitted in seconds, without an extra
+
+
+@command(
+    "data import arm.toml --root logs",
+    "data import plant --env pump --format csv --train logs/a --calibration logs/b",
+    plugins=True,
+)
 @click.argument(
-    "name", help="of a split of your own; one that was imported gets a further environment"
+    "name",
+    metavar="FILE.toml|NAME",
+    help="a recipe, or the name of a shipped one; "
+    "or the name of a split of your own, with the options below for paired parts",
 )
-@click.option("--env", required=True, metavar="NAME", help="name of the environment")
-@click.option("--format", required=True, type=click.Choice([*FORMATS]), help="of the files")
-@click.option("--train", required=True, type=DIRECTORY, help="nominal episodes to fit on")
-@click.option(
-    "--calibration", required=True, type=DIRECTORY, help="nominal episodes for alarm thresholds"
-)
+@click.option("--root", type=DIRECTORY, help="folder of the recipe's files (default: its own)")
+@click.option("--env", metavar="NAME", help="name of the environment")
+@click.option("--format", metavar="NAME", help="of the files")
+@click.option("--train", type=DIRECTORY, help="nominal episodes to fit on")
+@click.option("--calibration", type=DIRECTORY, help="nominal episodes for alarm thresholds")
 @click.option(
     "--test", type=DIRECTORY, help="DIR/nominal has twins, DIR/ANOMALY the anomalous episodes"
 )
@@ -48,25 +79,56 @@ _split_argument: Final = click.argument(
 @click.option("--actions", type=_QUANTITIES, help="actions, if the files do not name them")
 @click.option("--discrete", type=COUNT, help="actions are whole numbers from 0 to N - 1")
 @click.option("--group", multiple=True, type=_GROUP, help="group of an anomaly (default: dynamics)")
+@click.option("--replace", is_flag=True, help="import anew what the split has by that name")
 @_output_option
 def import_logs(options: Options) -> int:
     """Import logs of your own as an environment of a split."""
-    notes = make_console(quiet=options.verbosity < 0)
-    split = import_data(
-        options.name,
-        options.env,
-        form=options.format,
-        train=options.train,
-        calibration=options.calibration,
-        test=options.test,
-        sensors=options.sensors or (),
-        actions=options.actions or (),
-        discrete=options.discrete or 0,
-        groups=dict(options.group),
-        output=options.output,
-        progress=lambda part: notes.print(f"{options.env} {part}"),
-    )
-    make_console().print(f"split {split.name}, digest {split.digest}, in {split.path}")
+    register_formats(options)
+    notes, console = make_console(quiet=options.verbosity < 0), make_console()
+    say: dict[str, Any] = {
+        "output": options.output,
+        "replace": options.replace,
+        "progress": lambda part: notes.print(f"writing {part}"),
+        "report": lambda line: print_prose(line, console),
+    }
+    chosen = {name: value for name in _SHORT if (value := getattr(options, name))}
+    shipped = None if chosen else shipped_recipes().get(options.name)
+    if options.name.endswith(".toml") or shipped:
+        if chosen:
+            raise UsageError(
+                f"--{next(iter(chosen))} is said by the recipe {options.name}: write it there"
+            )
+        if shipped and not options.root:
+            raise UsageError(f"--root is missing: the folder with the files of {options.name}")
+        path = shipped or Path(options.name)
+        recipe = Recipe.load(path)
+        environment = recipe.environment
+        split = import_recipe(recipe, options.root or path.parent, **say)
+    else:
+        required = ("env", "format", "train", "calibration")
+        if lacking := [name for name in required if name not in chosen]:
+            raise UsageError(
+                f"{options.name!r} is no recipe (FILE.toml, or {', '.join(shipped_recipes())}), "
+                f"and --{lacking[0]} is missing: expected "
+                f"{', '.join(f'--{name}' for name in required)} without one"
+            )
+        if options.root:
+            raise UsageError("--root is the folder of a recipe's files, expected FILE.toml with it")
+        environment, form = chosen.pop("env"), chosen.pop("format")
+        groups = dict(chosen.pop("group", ()))
+        split = import_data(options.name, environment, form=form, groups=groups, **chosen, **say)
+    console.print(f"split {split.name}, digest {split.digest[:12]}, in {split.path}")
+    with split.opened() as opened:
+        data = opened(environment)
+        for sentence in _promises(data):
+            print_prose(sentence, notes)
+        tested = len(data.twins) + len(data.anomalies)
+    if tested:
+        name = split.path if options.output else split.name
+        arguments = ["--env", environment, "--split", str(name)]
+        notes.print(
+            f"Evaluate detectors: oodd-eval run --detector {_DETECTORS} {shlex.join(arguments)}"
+        )
     return 0
 
 
@@ -130,6 +192,10 @@ def export(options: Options) -> int:
 @command("data info mini")
 @_split_argument
 def info(options: Options) -> int:
-    """Describe a split."""
-    make_console().print(describe(load_split(options.name)))
+    """Describe a split, and what speaks for and against promises that rest on it."""
+    make_console().print(describe(load_split(options.name), _promises))
     return 0
+
+
+def _promises(data: EnvironmentData) -> Iterator[str]:
+    return (str(finding) for finding in promises_of(data))

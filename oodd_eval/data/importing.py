@@ -1,61 +1,108 @@
 """Import logs as an environment of a split of one's own, which every command then takes.
 
-Test episodes come in pairs: an anomalous episode and its nominal twin have the same name. A twin is
-an episode of the same task from the same start. Matched metrics compare the two from the onset on.
+What a recipe says is done in `oodd_eval.data.episodes`; here its episodes are written. Where test
+episodes come in pairs, an anomalous episode and its nominal twin have the same name, and metrics
+compare the two from the onset on.
 """
 
-import itertools
+import dataclasses
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval._version import __version__
 from oodd_eval.data import layout
-from oodd_eval.data.bounded import EPISODES
+from oodd_eval.data.episodes import (
+    EpisodeFacts,
+    EpisodeSource,
+    make_episodes,
+    matching_files,
+    read_episodes,
+)
 from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
     GROUPS,
-    NAME_PATTERN,
-    SPLITS,
     Group,
+    LogFacts,
     Quantity,
     in_order,
 )
-from oodd_eval.data.logs import Log, Logs, open_logs, test_parts
+from oodd_eval.data.layout import IMPORTED, Blocks
+from oodd_eval.data.logs import reader_for, readers
+from oodd_eval.data.marks import IntervalList, read_intervals
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.data.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
+from oodd_eval.data.recorded import Recorded
+from oodd_eval.data.selecting import layout_of, select_columns, unnamed_columns
 from oodd_eval.data.split import Split, data_home
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import TrajectoryError, UsageError
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import check_known
 
-IMPORTED: Final = "imported"
-"""Word that a manifest has in place of the recipe and of the policy's digest."""
+ONSETS: Final = "onsets.csv"
+"""File beside those of a part that names their onsets."""
 
-_Arrays = dict[str, NDArray[Any]]
+_ANOMALY: Final = "anomaly"  # kind of episodes in a list of which some are anomalous
+_NAME_BYTES: Final = 200
 
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """Names and units of the columns; `discrete` actions are numbered from `start` on."""
-
-    sensors: tuple[Quantity, ...]
-    actions: tuple[Quantity, ...]
-    discrete: bool = False
-    start: int = 0
+_Arrays = dict[str, NDArray[Any] | Blocks]
 
 
-class _Episode(NamedTuple):
-    """A log that is as it must be."""
+Say = Callable[[str], object]
 
-    log: Log
-    trajectory: Trajectory
-    rewards: NDArray[Any]
+
+def _quiet(_line: str) -> None:
+    pass
+
+
+def import_recipe(
+    recipe: Recipe,
+    root: Path,
+    output: Path | None = None,
+    *,
+    replace: bool = False,
+    progress: Say = _quiet,
+    report: Say = _quiet,
+) -> Split:
+    """Import logs as a recipe says, as one environment of a split.
+
+    A split of that name that was imported gets a further environment.
+
+    Parameters
+    ----------
+    recipe
+        The recipe.
+    root
+        Folder that its files are relative to.
+    output
+        Directory of the split, by default where splits are found.
+    replace
+        Whether an environment of that name that was imported earlier is imported anew.
+    progress
+        Called with the name of each part when it is written.
+    report
+        Called with each line of what was read and what was left out.
+
+    Returns
+    -------
+    Split
+        The split with the environment in it.
+
+    Raises
+    ------
+    UsageError
+        When a name is taken, or files or columns are not there.
+    TrajectoryError
+        When a recording is not as it must be; the message names file and row.
+    """
+    recipe.check()
+    target = _Target.of(recipe, output, replace=replace)
+    with read_episodes(recipe, root) as source:
+        return target.write(source, progress, report)
 
 
 def import_data(
@@ -71,9 +118,11 @@ def import_data(
     discrete: int = 0,
     groups: Mapping[str, str] | None = None,
     output: Path | None = None,
-    progress: Callable[[str], None] = lambda _part: None,
+    replace: bool = False,
+    progress: Say = _quiet,
+    report: Say = _quiet,
 ) -> Split:
-    """Import logs as one environment of a split; one of that name gets it as a further one.
+    """Import parts in one format, of which test episodes have twins: a recipe in short.
 
     Parameters
     ----------
@@ -82,9 +131,10 @@ def import_data(
     environment
         Name of the environment: none of the benchmark.
     form
-        Name of a format, one of `oodd_eval.data.logs.FORMATS`.
+        Name of a format, as `oodd_eval.data.logs.readers` has it.
     train, calibration
-        Parts with nominal episodes: to fit on, and for the thresholds of alarms.
+        Parts with nominal episodes: to fit on, and for the thresholds of alarms. A part is a folder
+        of files, one file, or the directory of a data set.
     test
         Folder with the part ``nominal`` of the twins and one part for each anomaly, under its name;
         None for a split to watch with, which cannot be evaluated.
@@ -96,8 +146,8 @@ def import_data(
         Groups of anomalies that the benchmark does not know, by default ``"dynamics"``.
     output
         Directory of the split, by default where splits are found.
-    progress
-        Called with the name of each part when it is read.
+    replace, progress, report
+        As for `import_recipe`.
 
     Returns
     -------
@@ -111,247 +161,384 @@ def import_data(
     TrajectoryError
         When an episode is not as it must be; the message names its file.
     """
-    for kind, reserved, chosen in (
-        ("split", SPLITS, name),
-        ("environment", ENVIRONMENTS, environment),
-    ):
-        if chosen in reserved:
-            raise UsageError(f"{chosen!r} is the benchmark's {kind}: choose a name of your own")
-        _check_name(kind, chosen)
-    directory = output or data_home() / name
-    recipe = {"name": name, "source": IMPORTED}
-    entries = _earlier_entries(directory, recipe, environment)
-    tests = {} if test is None else test_parts(form, test)
-    kinds = _kinds(tests, test, groups or {})
-    columns = _columns(open_logs(form, train), sensors, actions, discrete)
-
-    def episodes(source: Path) -> list[_Episode]:
-        logs = open_logs(form, source).read()
-        read = [_episode(log, columns) for log in itertools.islice(logs, EPISODES)]
-        if not read or next(logs, None):
-            raise UsageError(f"{source} has {len(read) or 'no'} episodes, expected 1 to {EPISODES}")
-        return read
-
-    def parts() -> Iterator[tuple[str, _Arrays]]:
-        for part, source in ((TRAIN, train), (CALIBRATION, calibration)):
-            yield part, _stacked(episodes(source), columns)
-            progress(part)
-        twins = episodes(tests["nominal"]) if tests else []
-        yield TWINS, _stacked(twins, columns)
-        progress(TWINS)
-        for kind in kinds:
-            yield f"test/{kind}", _anomalous(tests[kind], episodes(tests[kind]), twins, columns)
-            progress(f"test/{kind}")
-
-    facts = layout.own_facts(environment, discrete=columns.discrete, groups=kinds)
-    entries[environment] = layout.write_environment(
-        directory / f"{environment}.h5",
-        parts(),
-        IMPORTED,
-        sensors=columns.sensors,
-        actions=columns.actions,
-        custom=facts,
-    )
-    ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
-    versions = {"oodd-eval": __version__, "numpy": np.__version__}
-    layout.write_manifest(directory, recipe, ordered, 0, versions)
-    return Split(directory)
-
-
-def _check_name(kind: str, name: str) -> None:
-    if not re.fullmatch(NAME_PATTERN, name):
-        raise UsageError(
-            f"{name!r} cannot be the name of a {kind}: expected lower-case letters, digits and "
-            "hyphens, at most 64"
-        )
-
-
-def _earlier_entries(
-    directory: Path, recipe: Mapping[str, str], environment: str
-) -> dict[str, Any]:
-    """Return the entries of the environments that the split has already."""
-    if not (directory / layout.MANIFEST).exists():
-        return {}
-    manifest = layout.read_manifest(directory)
-    name = recipe["name"]
-    if manifest["definition"] != recipe:
-        raise UsageError(
-            f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported as "
-            f"{name!r}: choose another name"
-        )
-    if environment in manifest["environments"]:
-        raise UsageError(
-            f"split {name!r} has an environment {environment!r} already: choose another name, or "
-            f"remove {str(directory)!r} to import it anew"
-        )
-    return dict(manifest["environments"])
-
-
-def _kinds(
-    tests: Mapping[str, Path], test: Path | None, groups: Mapping[str, str]
-) -> dict[str, Group]:
-    """Return the anomalies of the test parts, with their groups."""
-    anomalies = [name for name in tests if name != "nominal"]
+    check_known("format", readers(), form)
+    tests = {} if test is None else _test_parts(form, test)
+    files = {kind: _files_of(form, path) for kind, path in tests.items()}
+    kinds = [kind for kind in tests if kind != "nominal"]
     if test is not None and "nominal" not in tests:
         raise UsageError(
             f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too: "
-            "each anomalous episode needs a nominal twin of the same name to be compared with"
+            "each anomalous episode needs a nominal twin of the same name to be compared with; "
+            "a recipe imports episodes without twins"
         )
-    for name in anomalies:
-        _check_name("anomaly", name)
-    check_known(f"anomaly in {test}", anomalies, *groups)
-    check_known("group", GROUPS, *groups.values())
-    if wrong := [n for n, g in groups.items() if n in ANOMALIES and ANOMALIES[n].group != g]:
-        shipped = ANOMALIES[wrong[0]].group
-        raise UsageError(f"{wrong[0]!r} is a {shipped} anomaly of the benchmark: use another name")
-    return {
-        name: ANOMALIES[name].group
-        if name in ANOMALIES
-        else cast("Group", groups.get(name, "dynamics"))
-        for name in in_order(anomalies, ANOMALIES)
+    check_known(f"anomaly in {test}", kinds, *(groups or {}))
+    check_known("group", GROUPS, *(groups or {}).values())
+    known = {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
+    group_of = known | cast("dict[str, Group]", dict(groups or {}))
+    anomalous = {
+        kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
+        for kind in in_order(kinds, ANOMALIES)
     }
-
-
-def _columns(
-    logs: Logs, sensors: Sequence[Quantity], actions: Sequence[Quantity], discrete: int
-) -> Columns:
-    """Return names and units of the columns, counted in the first episode."""
-    log = next(logs.read(), None)
-    if log is None:
-        raise UsageError("there are no training episodes, expected at least one")
-    if log.observations.ndim != 2:
-        raise TrajectoryError(
-            f"{log.source}: observations have shape {log.observations.shape}, expected "
-            "(rows, columns)"
-        )
-    width = log.observations.shape[1]
-    number = discrete or logs.discrete
-    commands = np.empty((0, 0)) if log.actions is None else log.actions
-    if not number and commands.ndim == 1 and commands.dtype.kind in "iub":
-        raise UsageError(
-            f"{log.source}: actions are whole numbers, expected the number of actions beside them: "
-            "--discrete N, or rows of shape (T, 1) where they are amounts"
-        )
-    count = number or (commands.shape[1] if commands.ndim == 2 else 1)
-    named = logs.actions if len(logs.actions) == count else ()
-    count = 0 if log.actions is None else count
-    return Columns(
-        _named("sensor", width, sensors or logs.sensors),
-        _named("action", count, actions or named),
-        bool(number),
-        logs.start,
+    nominal = NominalFiles(
+        train=_files_of(form, train),
+        calibration=_files_of(form, calibration),
+        twins=files.get("nominal", ()),
     )
+    recipe = Recipe(
+        name,
+        environment,
+        discrete=discrete,
+        paired=True,
+        format=form,
+        intervals=tuple(_onsets(tests[kind] for kind in kinds)),
+        nominal=nominal,
+        anomalous=anomalous,
+    )
+    recipe.check()
+    named = _with_names(recipe, sensors, actions)
+    return import_recipe(named, Path(), output, replace=replace, progress=progress, report=report)
 
 
-def _named(kind: str, count: int, quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
-    columns = tuple(quantities) or tuple(Quantity(f"{kind} {i}", "1") for i in range(count))
-    names = [quantity.name for quantity in columns]
-    plain = all(f"{quantity.name}{quantity.unit}".isprintable() for quantity in columns)
-    if len(columns) != count or len({*names}) < len(names) or not plain:
-        raise UsageError(
-            f"there are {count} {kind}s, named {', '.join(names)}: expected as many different "
-            f"names (--{kind}s)"
+def _files_of(form: str, part: Path) -> tuple[str, ...]:
+    """Return the files of a part as patterns that match nothing else."""
+    reader = readers()[form]
+    if not part.exists():
+        raise UsageError(f"{str(part)!r} does not exist, expected {reader.part}, or a folder of it")
+    if not part.is_dir() or reader.fits(part):
+        return (_escaped(part),)
+    files = [p for p in part.iterdir() if p.is_file() and reader.fits(p) and _is_log(p)]
+    if not files:
+        what = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
+        raise UsageError(f"{str(part)!r} has no files {what}, expected one an episode")
+    return tuple(map(_escaped, files))
+
+
+def _is_log(path: Path) -> bool:
+    return path.name != ONSETS and not path.name.startswith(".")
+
+
+def _escaped(path: Path) -> str:
+    return re.sub(r"([*?\[])", r"[\1]", str(path))
+
+
+def _test_parts(form: str, folder: Path) -> dict[str, Path]:
+    """Return the parts with test episodes by name, ``nominal`` and the anomalies."""
+    if not folder.is_dir():
+        raise UsageError(f"{str(folder)!r} is no folder, expected one with the test episodes")
+    reader = readers()[form]
+    parts = {
+        path.name if path.is_dir() else path.stem: path
+        for path in sorted(folder.iterdir())
+        if _is_log(path) and (path.is_dir() or reader.fits(path))
+    }
+    # Exports of splits lie beside their training parts.
+    exported = {name: re.fullmatch(r"test-(.+)-v\d+", name) for name in parts}
+    if any(exported.values()):
+        return {match[1]: parts[name] for name, match in exported.items() if match}
+    return parts
+
+
+def _onsets(parts: Iterable[Path]) -> Iterator[Interval]:
+    """Yield the onsets that files beside the episodes name, with the paths of these."""
+    for part in parts:
+        if not (part / ONSETS).exists():
+            continue
+        there = {path.name: path for path in part.iterdir()}
+        there |= {path.stem: path for path in there.values() if path.name != ONSETS}
+        for name, start, stop, kind in read_intervals(part / ONSETS):
+            if name not in there:
+                raise UnknownNameError(f"file of {part / ONSETS}", name, there)
+            yield str(there[name]), start, stop, kind
+
+
+def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Quantity]) -> Recipe:
+    """Return a recipe that gives the columns of the first episode some names."""
+    if not sensors and not actions:
+        return recipe
+    path = matching_files(recipe.nominal.train, Path())[0]
+    recording = next(reader_for(path, recipe.format).read(path, recipe.options), None)
+    if recording is None:
+        raise UsageError(f"{path} has no episodes, expected at least one")
+    chosen = select_columns(layout_of(recording), recipe, recording.source)
+    names: dict[str, Any] = {}
+    for kind, columns, quantities in (
+        ("sensors", chosen.sensors, sensors),
+        ("actions", chosen.actions, actions),
+    ):
+        named = [quantity.name for quantity in quantities]
+        choices = recipe.discrete or recording.fields.get("discrete", 0)
+        discrete = kind == "actions" and bool(named and choices)
+        count = int(cast("int", choices)) if discrete else len(columns)
+        if named and (len(named) != count or len({*named}) < len(named)):
+            raise UsageError(
+                f"there are {count} {kind}, named {', '.join(named)}: expected as many different "
+                f"names (--{kind})"
+            )
+        if discrete:
+            names["discrete"] = tuple(named)
+        is_new = quantities and not discrete
+        pairs = zip(quantities if is_new else [c.quantity for c in columns], columns, strict=True)
+        names[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
+    reward = chosen.reward.column if chosen.reward else ""
+    return dataclasses.replace(recipe, **names, reward=reward)
+
+
+def import_frames(
+    name: str,
+    *,
+    train: Sequence[Any],
+    calibration: Sequence[Any],
+    test: Sequence[Any] | Mapping[str, Sequence[Any]] = (),
+    labels: str | Sequence[str] = (),
+    output: Path | None = None,
+    replace: bool = False,
+    report: Say = print,
+    **keys: Any,
+) -> Split:
+    """Import episodes that are in memory: data frames, arrays or lists of mappings.
+
+    Parameters
+    ----------
+    name
+        Name of the split, and of its environment unless `keys` name that.
+    train, calibration
+        Nominal episodes. An episode is a data frame of pandas or polars with a row a step, an array
+        of shape (rows, sensors), a pair of such an array and one of actions, or a list of mappings
+        from columns to values.
+    test
+        Test episodes by the name of their anomaly, ``"nominal"`` for nominal ones; or a list, in
+        which those with anomalous labels are of the kind ``"anomaly"``.
+    labels
+        Columns that are 0 or false in nominal rows.
+    output
+        Directory of the split, by default where splits are found.
+    replace
+        Whether an environment of that name that was imported earlier is imported anew.
+    report
+        Called with each line of what was read and what was left out.
+    **keys
+        Keys of a recipe: ``sensors``, ``actions``, ``time``, ``rate``, ``baseline`` and so on. All
+        columns that none of them names are sensors by default.
+
+    Returns
+    -------
+    Split
+        As all commands take it.
+
+    Raises
+    ------
+    UsageError
+        When a key is wrong, or the recipe does not fit the episodes.
+    TrajectoryError
+        When an episode is not as it must be; the message names it and its row.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> rows = np.random.default_rng(0).normal(size=(40, 30, 2))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     split = import_frames(
+    ...         "arm", train=rows[:20], calibration=rows[20:], output=Path(folder), report=len
+    ...     )
+    ...     split.environments
+    ('arm',)
+    """
+    from oodd_eval.data.frames import recordings_of  # noqa: PLC0415  for callers in Python
+
+    tests = dict(test) if isinstance(test, Mapping) else {"": test}
+    columns = [labels] if isinstance(labels, str) and labels else [*labels]
+    content: dict[str, Any] = {"split": name, **({"labels": columns} if columns else {}), **keys}
+    content["nominal"] = {"train": TRAIN, "calibration": CALIBRATION, **keys.get("nominal", {})}
+    tables = keys.get("anomalous", {})
+    kinds = {kind: {"files": kind} for kind in tests if kind not in {"", "nominal"}}
+    content["anomalous"] = {kind: files | tables.get(kind, {}) for kind, files in kinds.items()}
+    if "" in tests:
+        content["anomalous"] = {_ANOMALY: tables.get(_ANOMALY, {})}
+    recipe = Recipe.parse(content, "import_frames")
+    parts = {TRAIN: train, CALIBRATION: calibration}
+    parts |= {f"test/{kind}" if kind else "test": episodes for kind, episodes in tests.items()}
+    either = {TWINS, f"test/{_ANOMALY}"}
+    recorded = [
+        Recorded(recording, Path(title), title, frozenset(either if part == "test" else {part}))
+        for part, episodes in parts.items()
+        for title, recording in recordings_of(part, episodes, recipe.time)
+    ]
+    if not recipe.sensors and recorded:
+        layout_ = layout_of(recorded[0].recording)
+        recipe = dataclasses.replace(recipe, sensors=unnamed_columns(layout_, recipe))
+    target = _Target.of(recipe, output, replace=replace)
+    with make_episodes(recipe, recorded, IntervalList.of(recipe, Path())) as source:
+        return target.write(source, _quiet, report)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Target:
+    """Where an environment is written: a new split, or one that was imported earlier."""
+
+    recipe: Recipe
+    directory: Path
+    entries: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, recipe: Recipe, output: Path | None, *, replace: bool) -> "_Target":
+        """Return it; `UsageError` when names are taken, by what is not to be replaced."""
+        directory = output or data_home() / recipe.split
+        if not (directory / layout.MANIFEST).exists():
+            return cls(recipe, directory, {})
+        manifest = layout.read_manifest(directory)
+        name, environment = recipe.split, recipe.environment
+        if manifest["definition"] != _definition(name):
+            raise UsageError(
+                f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported "
+                f"as {name!r}: choose another name"
+            )
+        if environment in manifest["environments"] and not replace:
+            raise UsageError(
+                f"split {name!r} has an environment {environment!r} already: choose another name, "
+                "or replace it (--replace, replace=True)"
+            )
+        return cls(recipe, directory, manifest["environments"])
+
+    def write(self, source: EpisodeSource, progress: Say, report: Say) -> Split:
+        """Write the episodes as the environment, and the manifest."""
+        recipe, environment = self.recipe, self.recipe.environment
+        facts = LogFacts(
+            paired=recipe.paired,
+            clock=recipe.clock,
+            baseline=recipe.baseline,
+            rate=source.rate,
+            order=recipe.order,
+            offsets=source.offsets,
+            source=recipe.source,
+            licence=recipe.licence,
+            citation=recipe.citation,
         )
-    return columns
-
-
-def _episode(log: Log, columns: Columns) -> _Episode:
-    """Check one episode."""
-    actions = None if log.actions is None else _commands(log, log.actions, columns)
-    try:
-        trajectory = Trajectory(log.observations, actions)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{log.source}: {error}") from None
-    widths = trajectory.observation_dim, trajectory.action_dim
-    expected = len(columns.sensors), len(columns.actions)
-    if widths != expected:
-        raise TrajectoryError(
-            f"{log.source} has {widths[0]} sensors and {widths[1]} columns of actions, expected "
-            f"{expected[0]} and {expected[1]} as in the first training episode"
+        entry = layout.write_environment(
+            self.directory / f"{environment}.h5",
+            _groups(source, progress, paired=recipe.paired),
+            IMPORTED,
+            sensors=source.sensors,
+            actions=source.actions,
+            custom=layout.own_facts(environment, discrete=source.discrete, groups=source.groups),
+            # What earlier versions could import keeps its digest.
+            logs=None if facts == LogFacts() else facts,
         )
-    steps = trajectory.transitions
-    if not steps:
-        raise TrajectoryError(f"{log.source} has 1 observation, expected at least 2")
-    rewards = np.zeros(steps) if log.rewards is None else log.rewards
-    if rewards.shape != (steps,) or not np.isfinite(rewards).all():
-        raise TrajectoryError(
-            f"{log.source}: rewards have shape {rewards.shape}, expected {steps} finite numbers, "
-            "one a transition"
-        )
-    return _Episode(log, trajectory, rewards)
+        entries = {**self.entries, environment: entry}
+        ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
+        versions = {"oodd-eval": __version__, "numpy": np.__version__}
+        layout.write_manifest(self.directory, _definition(recipe.split), ordered, 0, versions)
+        for line in source.notes:
+            report(line)
+        return Split(self.directory)
 
 
-def _commands(log: Log, actions: NDArray[Any], columns: Columns) -> NDArray[Any]:
-    """Return actions as rows; a discrete one as a one-hot row."""
-    if not columns.discrete:
-        return actions[:, None] if actions.ndim == 1 else actions
-    count, codes = len(columns.actions), actions.ravel() - columns.start
-    if codes.size != len(actions):
-        raise TrajectoryError(
-            f"{log.source}: actions have shape {actions.shape}, expected (T,) as they are discrete"
-        )
-    wrong = ~np.isin(codes, np.arange(count))
-    if wrong.any():
-        i, first = int(wrong.argmax()), columns.start
-        raise TrajectoryError(
-            f"{log.source}: action {i} is {actions.ravel()[i]}, expected a whole number from "
-            f"{first} to {first + count - 1}"
-        )
-    return np.eye(count, dtype=np.float32)[codes.astype(np.intp)]
+def _definition(name: str) -> dict[str, str]:
+    return {"name": name, "source": IMPORTED}
 
 
-def _stacked(episodes: Sequence[_Episode], columns: Columns) -> _Arrays:
-    """Return the datasets of a nominal part, empty where there are no episodes."""
-    rows, actions = (np.empty((0, len(c)), "f4") for c in (columns.sensors, columns.actions))
-    seeds = [e.log.seed for e in episodes]
+def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[tuple[str, _Arrays]]:
+    """Yield the datasets of each part."""
+    for part, episodes in source.parts.items():
+        is_anomalous = part not in {TRAIN, CALIBRATION, TWINS}
+        if paired and is_anomalous:
+            yield part, _with_twins(source, part, episodes)
+        elif paired:
+            yield part, _rows(source, episodes)
+        else:
+            arrays = _rows(source, episodes) | {
+                "names": _texts([facts.name for facts in episodes]),
+                "tasks": _texts([facts.task for facts in episodes]),
+            }
+            if is_anomalous:
+                intervals = [interval for facts in episodes for interval in facts.intervals]
+                counts = [len(facts.intervals) for facts in episodes]
+                arrays["intervals"] = np.array(intervals, np.int64).reshape(-1, 2)
+                arrays["interval_offsets"] = np.cumsum([0, *counts])
+            yield part, arrays
+        progress(part)
+
+
+def _texts(texts: Sequence[str]) -> NDArray[np.bytes_]:
+    packed = [text.encode("utf-8", "backslashreplace")[:_NAME_BYTES] for text in texts]
+    return np.array(packed, dtype=f"S{max(map(len, packed), default=0) or 1}")
+
+
+def _rows(source: EpisodeSource, episodes: Sequence[EpisodeFacts]) -> _Arrays:
+    """Return the datasets that every part has; the rows are read when they are written."""
+    width, total = len(source.sensors), sum(facts.rows for facts in episodes)
+    steps = total - len(episodes)
+
+    def blocks(columns: slice | int, behind: int) -> Callable[[], Iterator[NDArray[np.float32]]]:
+        def read() -> Iterator[NDArray[np.float32]]:
+            for facts in episodes:
+                for rows in source.blocks(facts, behind=behind):
+                    yield rows[:, columns].astype(np.float32)
+
+        return read
+
+    seeds = [facts.fields.get("seed") for facts in episodes]
+    ended = [bool(facts.fields.get("terminated", False)) for facts in episodes]
     return {
-        "observations": np.concatenate([rows, *(e.trajectory.observations for e in episodes)]),
-        "actions": np.concatenate([actions, *(e.trajectory.actions for e in episodes)]),
-        "rewards": np.concatenate([np.empty(0), *(e.rewards for e in episodes)]),
-        "offsets": np.cumsum([0, *(e.trajectory.transitions for e in episodes)]),
+        "observations": Blocks((total, width), blocks(slice(width), 0)),
+        "actions": Blocks((steps, len(source.actions)), blocks(slice(width, -1), 1)),
+        "rewards": Blocks((steps,), blocks(-1, 1)),
+        "offsets": np.cumsum([0, *(facts.rows - 1 for facts in episodes)]),
         "seeds": np.array(range(len(seeds)) if None in seeds else seeds, np.int64),
-        "terminated": np.array([e.log.terminated for e in episodes], np.uint8),
+        "terminated": np.array(ended, np.uint8),
     }
 
 
-def _anomalous(
-    source: Path, episodes: Sequence[_Episode], twins: Sequence[_Episode], columns: Columns
-) -> _Arrays:
+def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFacts]) -> _Arrays:
     """Return the datasets of an anomaly, in the order of the twins."""
-    by_name = {e.log.name: e for e in episodes}
-    names = {twin.log.name for twin in twins}
-    if unpaired := sorted(by_name.keys() ^ names):
+    by_name = _by_name(part, episodes)
+    twins = _by_name(TWINS, source.parts[TWINS])
+    if unpaired := sorted(by_name.keys() ^ twins.keys()):
         problem = "has no nominal twin" if unpaired[0] in by_name else "is missing"
         raise TrajectoryError(
-            f"{source}: episode {unpaired[0]!r} {problem}, expected the episodes of 'nominal' and "
-            "no others, each under the name of its twin"
+            f"{part}: episode {unpaired[0]!r} {problem}, expected the episodes of the twins and no "
+            "others, each under the name of its twin; episodes without twins need a recipe "
+            "without paired = true"
         )
-    ordered = [by_name[twin.log.name] for twin in twins]
-    effects = [_effect(e, twin) for e, twin in zip(ordered, twins, strict=True)]
-    return _stacked(ordered, columns) | {
-        "onsets": np.array([e.log.onset for e in ordered], np.int64),
+    ordered = [by_name[name] for name in twins]
+    pairs = zip(ordered, twins.values(), strict=True)
+    effects = [_effect(source, episode, twin) for episode, twin in pairs]
+    drawn = [dict(facts.fields.get("parameters", {})) for facts in ordered]
+    return _rows(source, ordered) | {
+        "onsets": np.array([facts.intervals[0][0] for facts in ordered], np.int64),
         "effects": np.array(effects, np.int64),
         "redraws": np.zeros(len(ordered), np.int64),
-        "parameters": layout.pack_parameters([e.log.parameters for e in ordered]),
+        "parameters": layout.pack_parameters(drawn),
     }
 
 
-def _effect(episode: _Episode, twin: _Episode) -> int:
+def _by_name(part: str, episodes: Sequence[EpisodeFacts]) -> dict[str, EpisodeFacts]:
+    by_name = {facts.name: facts for facts in episodes}
+    if len(by_name) < len(episodes):
+        names = [facts.name for facts in episodes]
+        double = next(name for name in names if names.count(name) > 1)
+        raise TrajectoryError(f"{part} has two episodes named {double!r}, expected one of each")
+    return by_name
+
+
+def _effect(source: EpisodeSource, episode: EpisodeFacts, twin: EpisodeFacts) -> int:
     """Return the first row from the onset on that differs from the twin's."""
-    source, onset = episode.log.source, episode.log.onset
-    rows, nominal = episode.trajectory.observations, twin.trajectory.observations
-    common = min(len(rows), len(nominal))
-    if onset is None:
+    common, width = min(episode.rows, twin.rows), len(source.sensors)
+    if not episode.intervals or episode.intervals[0][0] < 0:
         raise TrajectoryError(
-            f"{source} has no onset, the first row that may differ, expected 'onset' in the file "
-            "or a line of onsets.csv beside it"
+            f"{episode.source} has no onset, the first row that may differ, expected 'onset' in "
+            "the file, a line of onsets.csv beside it, or labels, intervals or onset in a recipe"
         )
-    if not 0 <= onset < common:
+    onset = episode.intervals[0][0]
+    if onset >= common:
         raise TrajectoryError(
-            f"{source}: the onset is row {onset}, expected 0 to {common - 1}, the last row that "
-            "the episode and its twin both have"
+            f"{episode.source}: the onset is row {onset}, expected 0 to {common - 1}, the last row "
+            "that the episode and its twin both have"
         )
-    differs = (rows[onset:common] != nominal[onset:common]).any(axis=1)
-    if not differs.any():
-        raise TrajectoryError(f"{source} equals its twin from its onset, row {onset}, on")
-    return onset + int(differs.argmax())
+    row = onset
+    for blocks in zip(source.blocks(episode, onset), source.blocks(twin, onset), strict=False):
+        rows, nominal = (block[: common - row, :width].astype(np.float32) for block in blocks)
+        differs = (rows != nominal).any(axis=1)
+        if differs.any():
+            return row + int(differs.argmax())
+        row += len(rows)
+    raise TrajectoryError(f"{episode.source} equals its twin from its onset, row {onset}, on")

@@ -1,0 +1,525 @@
+"""Recipes: what turns logs as they are into a frozen split, written down as TOML.
+
+A recipe names files, columns and labels, and says how rows become episodes. Nothing in it is run.
+"""
+
+import datetime as dt
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from oodd_eval.data.bounded import read_bytes
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, SPLITS, Group, Order
+from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.names import check_known
+
+FAILURE: Final = "failure"
+"""Kind of the episodes that failed, where a recipe names no other."""
+
+SHARES: Final = (0.4, 0.3, 0.3)
+"""Shares of training, calibration and test among nominal episodes, unless a recipe says others."""
+
+MISSING_ROWS: Final = 20
+"""Most rows in a run whose missing values are held or dropped, unless a recipe says others."""
+
+_RECIPE_BYTES: Final = 10**7
+
+Missing = Literal["refuse", "hold", "drop", "keep"]
+"""What missing values do; they are kept, as NaN, for scans alone."""
+Interval = tuple[str, int | float | str | None, int | float | str | None, str]
+"""File, start, stop and kind; a start or stop is a row, a time, or None where it is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class NominalFiles:
+    """Where nominal episodes are: the table ``[nominal]`` of a recipe.
+
+    Parameters
+    ----------
+    files
+        Globs of files whose episodes are shared out by `parts`.
+    parts
+        Shares of training, calibration and test among the episodes of `files`.
+    train, calibration, test
+        Globs of files with episodes of that part.
+    twins
+        Globs of files with the nominal twins of a paired recipe.
+    where
+        Values of a field, or of a column, that nominal episodes have; empty for no condition.
+    window
+        In place of the recipe's.
+    """
+
+    files: tuple[str, ...] = ()
+    parts: tuple[float, ...] = SHARES
+    train: tuple[str, ...] = ()
+    calibration: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    twins: tuple[str, ...] = ()
+    where: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    window: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AnomalousFiles:
+    """Where episodes with one anomaly are: a table ``[anomalous.NAME]`` of a recipe.
+
+    Parameters
+    ----------
+    files
+        Globs of files; empty where `Recipe.kinds` or `Recipe.outcome` tells the episodes apart.
+    group
+        Group of the anomaly.
+    where
+        Values of a field, or of a column, that these episodes have; empty for no condition.
+    labels
+        In place of the recipe's.
+    onset, stop
+        First anomalous row of each file, and the row after the last; None where not the same.
+    window
+        In place of the recipe's.
+    """
+
+    files: tuple[str, ...] = ()
+    group: Group = "dynamics"
+    where: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    labels: tuple[str, ...] = ()
+    onset: int | None = None
+    stop: int | None = None
+    window: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How logs become one environment of a split.
+
+    Parameters
+    ----------
+    split, environment
+        Names of both.
+    source, licence, citation
+        Where the logs are from.
+    time
+        Column with time stamps, ``NAME[s]``, ``[ms]``, ``[us]`` or ``[ns]``, or ISO 8601; empty for
+        the format's own, or none.
+    rate
+        Rows in a second of the result, to which rows are resampled, the last value held; None for
+        rows as they are.
+    gap
+        Seconds without a row beyond which a recording is cut; None refuses long gaps, and 0, for
+        scans, cuts there.
+    sensors, actions
+        Globs over columns or ``topic.field``, in order; ``"new = old"`` renames, ``NAME[UNIT]``
+        names the unit. Without sensors, the columns ``obs:NAME[UNIT]`` and ``action:NAME[UNIT]``.
+    reward
+        Column with rewards.
+    discrete
+        Number of actions, or their names, where each action is a whole number from 0 on.
+    angles
+        Globs of sensors that are replaced by their sine and cosine.
+    constant
+        What becomes of sensors that are constant in the training part: ``"keep"`` or ``"drop"``.
+    missing
+        What missing values do: ``"refuse"``, ``"hold"`` the last value, or ``"drop"`` the row.
+    missing_rows
+        Most rows in a run that are held or dropped.
+    labels
+        Columns that are nominal where they are 0, empty, false, ``"H"`` or `nominal_label`.
+    nominal_label
+        Values of the labels of nominal rows, in place of these.
+    intervals
+        Anomalous rows, or times, of files.
+    onset, stop
+        First anomalous row of each anomalous file, and the row after the last, if always the same.
+    outcome
+        Field, or column, that is true of episodes that succeeded: others are anomalous.
+    kinds
+        Field, or column, whose value names the anomaly of each episode.
+    task
+        Field, or column, with the task or set point of each episode.
+    baseline
+        Number of rows at the start of every episode that are nominal and not judged; 0 for none.
+    window
+        Rows to which longer recordings are cut; 0 for whole recordings.
+    clock
+        Whether row t of one episode may be compared with row t of another.
+    order
+        Whether parts follow one another as recorded, or episodes are shuffled before.
+    seed
+        Of the shuffling.
+    paired
+        Whether each anomalous episode has a nominal twin in a file of the same name.
+    format
+        Format of the files; empty to tell by their endings.
+    options
+        Of the format's reader.
+    nominal
+        Where nominal episodes are.
+    anomalous
+        Where anomalous episodes are, by the name of the anomaly.
+    """
+
+    split: str
+    environment: str
+    source: str = ""
+    licence: str = ""
+    citation: str = ""
+    time: str = ""
+    rate: float | None = None
+    gap: float | None = None
+    sensors: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
+    reward: str = ""
+    discrete: int | tuple[str, ...] = 0
+    angles: tuple[str, ...] = ()
+    constant: Literal["keep", "drop"] = "keep"
+    missing: Missing = "refuse"
+    missing_rows: int = MISSING_ROWS
+    labels: tuple[str, ...] = ()
+    nominal_label: tuple[Any, ...] = ()
+    intervals: str | tuple[Interval, ...] = ()
+    onset: int | None = None
+    stop: int | None = None
+    outcome: str = ""
+    kinds: str = ""
+    task: str = ""
+    baseline: int = 0
+    window: int = 0
+    clock: bool = True
+    order: Order = "recorded"
+    seed: int = 0
+    paired: bool = False
+    format: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    nominal: NominalFiles = field(default_factory=NominalFiles)
+    anomalous: Mapping[str, AnomalousFiles] = field(default_factory=dict)
+
+    @property
+    def label_columns(self) -> tuple[str, ...]:
+        """Columns with labels, of all anomalies."""
+        further = (column for table in self.anomalous.values() for column in table.labels)
+        return tuple(dict.fromkeys([*self.labels, *further]))
+
+    @classmethod
+    def load(cls, path: Path) -> "Recipe":
+        """Read a recipe.
+
+        Parameters
+        ----------
+        path
+            A TOML file.
+
+        Returns
+        -------
+        Recipe
+
+        Raises
+        ------
+        UsageError
+            When the file cannot be read or is no recipe; the message names the key.
+        """
+        try:
+            text = read_bytes(path, _RECIPE_BYTES, UsageError).decode()
+            content = tomllib.loads(text)
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+            raise UsageError(f"{path} cannot be read as a recipe in TOML: {error}") from None
+        return cls.parse(content, str(path))
+
+    @classmethod
+    def parse(cls, content: Mapping[str, Any], source: str = "the recipe") -> "Recipe":
+        """Check the content of a recipe.
+
+        Parameters
+        ----------
+        content
+            Keys and tables as in TOML.
+        source
+            What messages call it.
+
+        Returns
+        -------
+        Recipe
+
+        Raises
+        ------
+        UsageError
+            For an unknown or wrong key, with the nearest one, or keys that contradict each other.
+        """
+        values = _checked(source, content, _READERS)
+        if "split" not in values:
+            raise UsageError(f"{source} lacks the key 'split', the name of the split to make")
+        options = dict(values.pop("read", {}))
+        files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
+        recipe = cls(**{"environment": values["split"]} | values | files)
+        recipe.check(source)
+        return recipe
+
+    def check(self, source: str = "the recipe") -> None:
+        """Raise `UsageError` when names are taken or wrong, or keys contradict each other.
+
+        Parameters
+        ----------
+        source
+            What messages call the recipe.
+
+        Raises
+        ------
+        UsageError
+            With the key and what to do.
+        """
+        for kind, reserved, name in (
+            ("split", SPLITS, self.split),
+            ("environment", ENVIRONMENTS, self.environment),
+        ):
+            if name in reserved:
+                raise UsageError(f"{name!r} is the benchmark's {kind}: choose a name of your own")
+            check_name(kind, name)
+        for name, table in self.anomalous.items():
+            check_name("anomaly", name)
+            if name == "nominal":
+                raise UsageError(f"{source}: 'nominal' cannot be the name of an anomaly")
+            check_known("group", GROUPS, table.group)
+            if name in ANOMALIES and ANOMALIES[name].group != table.group:
+                shipped = ANOMALIES[name].group
+                raise UsageError(f"{name!r} is a {shipped} anomaly of the benchmark: rename it")
+        nominal = self.nominal
+        if not (nominal.files or nominal.train):
+            raise UsageError(f"{source}: [nominal] names neither files nor train, expected one")
+        if nominal.files and (nominal.train or nominal.calibration):
+            raise UsageError(
+                f"{source}: [nominal] has both files and parts of its own: name either files with "
+                "their shares, or train, calibration and test"
+            )
+        if nominal.train and not nominal.calibration:
+            raise UsageError(
+                f"{source}: [nominal] names train, but no calibration, which thresholds need"
+            )
+        if self.paired:
+            self._check_paired(source)
+        elif nominal.twins:
+            raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
+        if self.gap is not None and not self.time and self.rate is None:
+            raise UsageError(f"{source}: gap needs stamps: name their column with time")
+        if self.stop is not None and self.onset is None:
+            raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
+
+    def _check_paired(self, source: str) -> None:
+        if self.anomalous and not self.nominal.twins:
+            raise UsageError(
+                f"{source}: paired = true needs [nominal] twins: nominal episodes, each of which "
+                "has the file name of the anomalous one that it is compared with"
+            )
+        for key in ("window", "baseline", "outcome", "kinds", "task"):
+            if getattr(self, key):
+                raise UsageError(f"{source}: paired = true and {key} exclude each other")
+
+
+def check_name(kind: str, name: str) -> None:
+    """Raise `UsageError` unless a text can name a split, an environment or an anomaly."""
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise UsageError(
+            f"{name!r} cannot be the name of {'an' if kind[0] in 'ae' else 'a'} {kind}: expected "
+            "lower-case letters, digits, hyphens and underscores, at most 64"
+        )
+
+
+def anomaly_name(text: str) -> str:
+    """Return a name of an anomaly made of any text.
+
+    >>> anomaly_name("Front Collision (2)")
+    'front-collision-2'
+    """
+    plain = re.sub(r"[^a-z0-9_]+", "-", text.lower()).strip("-_")
+    return plain[:64] or FAILURE
+
+
+# Readers of values: each takes what messages call the key, and the value.
+
+
+def _wrong(key: str, value: Any, expected: str) -> UsageError:
+    return UsageError(f"{key} is {value!r:.100}, expected {expected}")
+
+
+def _text(key: str, value: Any) -> str:
+    if not isinstance(value, str) or not value.isprintable():
+        raise _wrong(key, value, "a text in one line")
+    return value
+
+
+def _texts(key: str, value: Any) -> tuple[str, ...]:
+    values = value if isinstance(value, list | tuple) else [value]
+    texts = tuple(_text(key, text) for text in values)
+    if "" in texts:
+        raise _wrong(key, value, "texts that are not empty")
+    return texts
+
+
+def _globs(key: str, value: Any) -> tuple[str, ...]:
+    patterns = _texts(key, value)
+    for pattern in patterns:
+        if pattern.startswith(("/", "~")) or re.match(r"[A-Za-z]:|.*\\", pattern):
+            raise _wrong(key, pattern, "paths relative to the recipe's folder, or to --root")
+        if ".." in pattern.split("/"):
+            raise _wrong(key, pattern, "paths without '..': choose a folder above with --root")
+    return patterns
+
+
+def _number(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e12:
+        raise _wrong(key, value, "a number above 0")
+    return float(value)
+
+
+def _whole(least: int, also: int | None = None) -> Callable[[str, Any], int]:
+    def read(key: str, value: Any) -> int:
+        is_whole = isinstance(value, int) and not isinstance(value, bool)
+        if not is_whole or not (least <= value < 2**53 or value == also):
+            zero = f", or {also} for none" if also is not None else ""
+            raise _wrong(key, value, f"a whole number from {least} on{zero}")
+        return int(value)
+
+    return read
+
+
+def _one_of(types: Any, expected: str) -> Callable[[str, Any], Any]:
+    def read(key: str, value: Any) -> Any:
+        if not isinstance(value, types):
+            raise _wrong(key, value, expected)
+        return value
+
+    return read
+
+
+_flag: Final = _one_of(bool, "true or false")
+_scalar: Final = _one_of(str | int | float | bool, "a text, number or truth value")
+_table: Final = _one_of(Mapping, "a table")
+
+
+def _choice(*names: str) -> Callable[[str, Any], str]:
+    def read(key: str, value: Any) -> str:
+        if value not in names:
+            raise UnknownNameError(f"value of {key}", str(value), names)
+        return str(value)
+
+    return read
+
+
+def _scalars(key: str, value: Any) -> tuple[Any, ...]:
+    values = value if isinstance(value, list | tuple) else [value]
+    return tuple(_scalar(key, one) for one in values)
+
+
+def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
+    return {name: _scalars(f"{key}.{name}", one) for name, one in _table(key, value).items()}
+
+
+def _discrete(key: str, value: Any) -> int | tuple[str, ...]:
+    if isinstance(value, list | tuple):
+        return _texts(key, value)
+    return _whole(0)(key, value)
+
+
+def _shares(key: str, value: Any) -> tuple[float, ...]:
+    shares = value if isinstance(value, list | tuple) else ()
+    numbers = all(isinstance(s, int | float) and 0 <= s <= 1 for s in shares)
+    if len(shares) not in {2, 3} or not numbers or abs(sum(shares) - 1) > 1e-6 or 0 in shares[:2]:
+        raise _wrong(
+            key,
+            value,
+            "shares of training, calibration and test with the sum 1, the first two above 0",
+        )
+    return tuple(map(float, shares))
+
+
+def _intervals(key: str, value: Any) -> str | tuple[Interval, ...]:
+    if isinstance(value, str):
+        return _globs(key, value)[0]
+    rows = value if isinstance(value, list | tuple) else [value]
+    intervals = []
+    for row in rows:
+        if not isinstance(row, list | tuple) or len(row) not in {3, 4}:
+            raise _wrong(key, row, "[file, start, stop] or [file, start, stop, kind]")
+        kind = _text(key, row[3]) if len(row) == 4 else ""
+        intervals.append((_text(key, row[0]), _moment(key, row[1]), _moment(key, row[2]), kind))
+    return tuple(intervals)
+
+
+def _moment(key: str, value: Any) -> int | float | str | None:
+    """Return a row, a time or a stamp; None for an empty text: it is not known."""
+    if value == "":
+        return None
+    if isinstance(value, dt.date):
+        return value.isoformat()
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise _wrong(key, value, "a row, a time in seconds with a decimal point, or ISO 8601")
+    return value
+
+
+def _nominal(key: str, value: Any) -> NominalFiles:
+    return NominalFiles(**_checked("[nominal]", _table(key, value), _NOMINAL))
+
+
+def _anomalous(key: str, value: Any) -> dict[str, AnomalousFiles]:
+    tables = {}
+    for name, table in _table(key, value).items():
+        where = f"[anomalous.{name}]"
+        content = _checked(where, _table(where, table), _ANOMALOUS)
+        if name in ANOMALIES:
+            content.setdefault("group", ANOMALIES[name].group)
+        tables[name] = AnomalousFiles(**content)
+    return tables
+
+
+_Readers = Mapping[str, Callable[[str, Any], Any]]
+
+_WINDOW: Final = _whole(2, also=0)
+_ROW: Final = _whole(0)
+
+_NOMINAL: Final[_Readers] = {
+    **dict.fromkeys(("files", "train", "calibration", "test", "twins"), _globs),
+    "parts": _shares,
+    "where": _conditions,
+    "window": _WINDOW,
+}
+_ANOMALOUS: Final[_Readers] = {
+    "files": _globs,
+    "group": _choice(*GROUPS),
+    "where": _conditions,
+    "labels": _texts,
+    "onset": _ROW,
+    "stop": _whole(1),
+    "window": _WINDOW,
+}
+_READERS: Final[_Readers] = {
+    **dict.fromkeys(("split", "environment", "source", "licence", "citation", "time"), _text),
+    **dict.fromkeys(("reward", "outcome", "kinds", "task"), _text),
+    **dict.fromkeys(("rate", "gap"), _number),
+    **dict.fromkeys(("sensors", "actions", "angles", "labels"), _texts),
+    **dict.fromkeys(("clock", "paired"), _flag),
+    **dict.fromkeys(("onset", "missing_rows", "seed"), _ROW),
+    "stop": _whole(1),
+    "discrete": _discrete,
+    "constant": _choice("keep", "drop"),
+    "missing": _choice("refuse", "hold", "drop"),
+    "nominal_label": _scalars,
+    "intervals": _intervals,
+    "baseline": _whole(2, also=0),
+    "window": _WINDOW,
+    "order": _choice("recorded", "shuffled"),
+    "read": _table,
+    "nominal": _nominal,
+    "anomalous": _anomalous,
+}
+
+
+def _checked(source: str, content: Mapping[str, Any], readers: _Readers) -> dict[str, Any]:
+    """Return the values of keys, each checked by its reader; unknown keys are errors."""
+    check_known(f"key of {source}", readers, *content)
+    return {key: readers[key](f"{source}: {key}", value) for key, value in content.items()}
+
+
+KEYS: Final = ("read", *(f.name for f in fields(Recipe) if f.name not in {"format", "options"}))
+"""Keys of a recipe, in the order in which one is written."""

@@ -1,0 +1,528 @@
+"""Logs as people have them become splits: each of these was refused, or came out wrong, before."""
+
+import csv
+import os
+import resource
+import subprocess
+import sys
+import types
+
+import h5py
+import numpy as np
+import pytest
+
+from oodd_eval import evaluate, import_frames, load_split
+from oodd_eval.cli.main import main
+from oodd_eval.data.facts import LogFacts
+from oodd_eval.data.importing import import_data, import_recipe
+from oodd_eval.data.recipe import Recipe
+from oodd_eval.errors import OoddError, OutputError, TrajectoryError, UsageError
+
+
+def write(path, columns, separator=",", decimal="."):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file, delimiter=separator)
+        rows.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            rows.writerow(
+                [str(c).replace(".", decimal) if isinstance(c, float) else c for c in row]
+            )
+
+
+def walk(rows, seed, shift=0.0, start=0, stop=0):
+    """Two sensors that follow one another; from `start` to `stop` the second is shifted."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=rows).cumsum() * 0.1
+    b = 2 * a + rng.normal(size=rows) * 0.1
+    b[start:stop] += shift
+    return {"a": a.round(6), "b": b.round(6)}
+
+
+def labels(rows, start, stop):
+    return np.isin(np.arange(rows), range(start, stop)).astype(int)
+
+
+def run_import(root, text, name="s"):
+    (root / "recipe.toml").write_text(text)
+    return import_recipe(Recipe.load(root / "recipe.toml"), root, root / "out" / name)
+
+
+@pytest.fixture
+def plant(tmp_path):
+    """Nominal files and faults of two kinds, of any number, without twins and of any length."""
+    for i in range(20):
+        rows = 60 + 7 * i % 20
+        write(tmp_path / "free" / f"{i}.csv", walk(rows, i) | {"fault": np.zeros(rows, int)})
+    for kind, count in (("valve", 3), ("front_tyre", 2)):
+        for i in range(count):
+            rows = walk(80, 100 + i, 5.0, 30, 50)
+            write(tmp_path / kind / f"{kind}-{i}.csv", rows | {"fault": labels(80, 30, 50)})
+    return tmp_path
+
+
+PLANT = """
+split = "plant"
+source = "our own"
+sensors = ["a[bar]", "b"]
+labels = "fault"
+[nominal]
+files = ["free/*.csv"]
+[anomalous.valve]
+files = ["valve/*.csv"]
+group = "sensor"
+[anomalous.front_tyre]
+files = ["front_tyre/*.csv"]
+"""
+
+
+# A1: faults without twins, in any number
+
+
+def test_faults_without_twins_become_a_split_that_every_command_takes(plant, capsys, tmp_path):
+    (plant / "plant.toml").write_text(PLANT)
+    output = tmp_path / "split"
+    assert main(["data", "import", str(plant / "plant.toml"), "--output", str(output)]) == 0
+    printed = capsys.readouterr().out
+    for line in ("test/valve: 3 episodes, 240 rows, 3 intervals with 60 anomalous rows",
+                 "train: 8 episodes"):  # fmt: skip
+        assert line in printed
+    split = load_split(output)
+    data = split.environment("plant")
+    assert [len(s) for s in (data.train, data.calibration, data.twins)] == [8, 6, 6]
+    assert data.logs == LogFacts(paired=False, source="our own")
+    assert split.groups == {"front_tyre": "dynamics", "valve": "sensor"}
+    assert {*data.anomalies} == {"valve", "front_tyre"}
+    valve = data.labelled("valve")
+    assert (len(valve), valve.intervals) == (3, [((30, 50),)] * 3)
+    assert valve.names == ("valve-0", "valve-1", "valve-2")
+    expected = walk(80, 101, 5.0, 30, 50)
+    assert valve[1].observations[:, 1] == pytest.approx(expected["b"], rel=1e-6)
+    assert data.twins.names == tuple(str(i) for i in range(14, 20))
+    assert main(["data", "verify", str(output)]) == 0
+    assert main(["data", "info", str(output)]) == 0
+    results = evaluate("mahalanobis", split)
+    assert results.mean("auc_pool") > 0.9
+
+
+def test_a_split_may_have_nominal_episodes_alone(plant):
+    text = PLANT.partition("[anomalous.valve]")[0]
+    data = run_import(plant, text).environment("plant")
+    assert (len(data.twins), data.anomalies) == (6, ())
+
+
+def test_a_whole_recording_in_one_file_is_one_environment(tmp_path):
+    rows = 1000
+    write(tmp_path / "log.csv", walk(rows, 1, 5.0, 710, 730) | {"fault": labels(rows, 710, 730)})
+    data = run_import(tmp_path, """
+split = "log"
+sensors = ["a", "b"]
+labels = "fault"
+window = 50
+clock = false
+[nominal]
+files = ["log.csv"]
+[anomalous.leak]
+files = ["log.csv"]
+""").environment("log")  # fmt: skip
+    assert [len(s) for s in (data.train, data.calibration, data.twins)] == [8, 5, 6]
+    assert data.labelled("leak").intervals == [((10, 30),)]
+    assert data.logs.clock is False
+
+
+# A5: an anomaly ends
+
+
+def test_an_anomaly_may_end_come_back_and_begin_at_an_unknown_row(tmp_path):
+    for name in ("train", "cal"):
+        write(tmp_path / f"{name}.csv", walk(30, 1))
+    write(tmp_path / "odd.csv", walk(30, 2))
+    (tmp_path / "labels.csv").write_text("file,start,stop\nodd.csv,5,9\nodd.csv,20,\n")
+    text = """
+split = "s"
+sensors = ["a", "b"]
+intervals = "labels.csv"
+[nominal]
+train = "train.csv"
+calibration = "cal.csv"
+[anomalous.x]
+files = "odd.csv"
+"""
+    odd = run_import(tmp_path, text).environment("s").labelled("x")
+    assert odd.intervals == [((5, 9), (20, 30))]
+    (tmp_path / "labels.csv").write_text("file,start,stop\nodd.csv,,9\n")
+    odd = run_import(tmp_path, text, "again").environment("s").labelled("x")
+    assert odd.intervals == [((-1, 9),)]
+
+
+# A6: formats, columns, stamps, missing values
+
+
+def csv_parts(root, columns, **layout):
+    for part in ("train", "calibration"):
+        write(root / part / "run-1.csv", columns, **layout)
+    return {"form": "csv", "train": root / "train", "calibration": root / "calibration"}
+
+
+def test_separator_decimal_comma_and_a_time_column(tmp_path):
+    rows = walk(20, 1)
+    stamps = [f"2024-05-01 12:00:{i:02d}" for i in range(20)]
+    for name in ("train", "cal"):
+        write(tmp_path / f"{name}.csv", {"when": stamps} | rows, separator=";", decimal=",")
+    data = run_import(tmp_path, """
+split = "s"
+time = "when"
+rate = 2
+sensors = ["pressure[bar] = a", "b"]
+[read]
+format = "csv"
+separator = ";"
+decimal = ","
+[nominal]
+train = "train.csv"
+calibration = "cal.csv"
+""").environment("s")  # fmt: skip
+    assert [(q.name, q.unit) for q in data.sensors] == [("pressure", "bar"), ("b", "1")]
+    assert data.train[0].observations[::2, 0] == pytest.approx(rows["a"], rel=1e-6)
+    assert data.logs.rate == 2.0
+
+
+@pytest.mark.parametrize("names", [("obs:a", " obs:b"), ("Obs:a", "OBS: b"), ("obs:a ", "obs: b")])
+def test_blanks_and_capitals_lose_no_column(tmp_path, names):
+    columns = dict(zip(names, walk(20, 1).values(), strict=True))
+    data = import_data("s", "e", output=tmp_path / "out", **csv_parts(tmp_path, columns))
+    assert [q.name for q in data.environment("e").sensors] == ["a", "b"]
+
+
+@pytest.mark.parametrize("first", ["obs:a", "Obs:a", "obs_a"])
+@pytest.mark.parametrize(
+    ("name", "right"), [("obs_b", "obs:b"), ("observation b", "obs:b"), ("Actions.b", "action:b")]
+)
+def test_a_name_that_is_nearly_right_is_an_error(tmp_path, first, name, right):
+    columns = dict(zip((name, first), walk(20, 1).values(), strict=True))
+    with pytest.raises(UsageError, match=f"{name}.*{right}"):
+        import_data("s", "e", output=tmp_path / "out", **csv_parts(tmp_path, columns))
+
+
+def test_columns_that_no_line_names_are_listed(tmp_path):
+    a, b = walk(20, 1).values()
+    lines = []
+    columns = {"obs:a": a, "flow": b}
+    given = csv_parts(tmp_path, columns)
+    import_data("s", "e", output=tmp_path / "out", report=lines.append, **given)
+    assert any("flow" in line for line in lines)
+
+
+def test_irregular_stamps_do_not_pass(plant):
+    rows = walk(60, 1)
+    stamps = np.arange(60) + np.where(np.arange(60) > 30, 500, 0)
+    write(plant / "free" / "3.csv", rows | {"fault": np.zeros(60, int)})
+    for path in plant.glob("free/*.csv"):
+        columns = walk(60, 1) | {"fault": np.zeros(60, int), "t": np.arange(60)}
+        write(path, columns | ({"t": stamps} if path.stem == "7" else {}))
+    text = PLANT.partition("[anomalous.valve]")[0]
+    with pytest.raises(TrajectoryError, match=r"7\.csv has a gap of 501 s after 30 s"):
+        run_import(plant, f'time = "t"\nrate = 1\n{text}')
+
+
+def test_missing_values_have_a_remedy_that_works(tmp_path):
+    columns = walk(20, 1)
+    columns["a"] = ["", *columns["a"][1:5], "", *columns["a"][6:]]
+    for name in ("train", "cal"):
+        write(tmp_path / f"{name}.csv", columns)
+    text = """
+split = "s"
+sensors = ["a", "b"]
+{}
+[nominal]
+train = "train.csv"
+calibration = "cal.csv"
+"""
+    with pytest.raises(TrajectoryError, match=r"cal\.csv, row 0, .*missing = 'hold'"):
+        run_import(tmp_path, text.format(""))
+    data = run_import(tmp_path, text.format('missing = "hold"')).environment("s")
+    assert data.train[0].observations.shape == (19, 2)
+    assert data.train[0].observations[4, 0] == np.float32(columns["a"][4])
+
+
+@pytest.mark.parametrize("form", ["numpy", "hdf5"])
+def test_as_many_actions_as_states_are_taken(tmp_path, form):
+    rows, actions = np.random.default_rng(0).normal(size=(20, 3)), np.arange(20.0)[:, None]
+    for part in ("train", "calibration"):
+        if form == "numpy":
+            (tmp_path / part).mkdir()
+            np.savez(tmp_path / part / "run.npz", observations=rows, actions=actions)
+        else:
+            with h5py.File(tmp_path / f"{part}.h5", "w") as file:
+                group = file.create_group("run")
+                group["observations"], group["actions"] = rows, actions
+    end = ".h5" if form == "hdf5" else ""
+    split = import_data("s", "e", form=form, output=tmp_path / "out",
+                        train=tmp_path / f"train{end}",
+                        calibration=tmp_path / f"calibration{end}")  # fmt: skip
+    (episode,) = split.environment("e").train
+    # What the last action led to was not recorded.
+    assert episode.actions[:, 0].tolist() == list(range(19))
+    assert episode.observations.shape == (20, 3)
+
+
+def paired(root, onsets, name="run.1.csv", kind="front_tyre"):
+    for part in ("train", "calibration", "test/nominal", f"test/{kind}"):
+        shift = 5.0 if part.endswith(kind) else 0.0
+        rows = walk(30, 1, shift, 10, 30)
+        write(root / part / name, {"obs:a": rows["a"], "obs:b": rows["b"]})
+    (root / "test" / kind / "onsets.csv").write_text(onsets)
+    return import_data("s", "e", form="csv", train=root / "train",
+                       calibration=root / "calibration", test=root / "test",
+                       output=root / "out")  # fmt: skip
+
+
+@pytest.mark.parametrize("onsets", ["file, onset\nrun.1.csv, 10\n", "file,onset\nrun.1,10\n"])
+def test_onsets_with_dots_and_blanks_and_anomalies_with_underscores(tmp_path, onsets):
+    data = paired(tmp_path, onsets).environment("e")
+    assert data.anomalous("front_tyre").onsets.tolist() == [10]
+
+
+@pytest.mark.parametrize(
+    ("onsets", "word"),
+    [
+        ("file,onset\nrun.1.csv,10\nrun.1.csv,12\n", "twice"),
+        ("file,onset\nrun.2.csv,10\n", r"run\.2\.csv"),
+        ("file,onset\nrun.1.csv,soon\n", "line 2"),
+        ("file\nrun.1.csv\n", "columns"),
+    ],
+)
+def test_wrong_onsets_are_told(tmp_path, onsets, word):
+    with pytest.raises(OoddError, match=word):
+        paired(tmp_path, onsets)
+
+
+# A7: float32
+
+
+def test_a_northing_has_the_scores_that_it_has_without_the_offset(tmp_path):
+    aucs = []
+    for offset in (0.0, 5.4e6):
+        root = tmp_path / str(int(offset))
+        for i in range(20):
+            write(root / "free" / f"{i}.csv", moved(walk(60, i), offset))
+        for i in range(6):
+            rows = walk(60, 50 + i, 1.0, 30, 60)
+            write(root / "odd" / f"{i}.csv", moved(rows, offset))
+        split = run_import(root, """
+split = "track"
+sensors = ["a", "b"]
+[nominal]
+files = "free/*.csv"
+[anomalous.slip]
+files = "odd/*.csv"
+onset = 30
+""")  # fmt: skip
+        data = split.environment("track")
+        assert (data.logs.offsets == ()) == (offset == 0.0)
+        assert np.abs(data.train[0].observations).max() < 100
+        aucs.append(evaluate("mahalanobis", split).mean("auc_pool"))
+    assert aucs[0] > 0.9
+    assert aucs[1] == pytest.approx(aucs[0], abs=0.005)
+
+
+def moved(rows, offset):
+    # Repr keeps all digits of float64.
+    return {name: [repr(float(v) + offset / 10) for v in values] for name, values in rows.items()}
+
+
+# Frames
+
+
+def frame(columns):
+    pandas = pytest.importorskip("pandas")
+    return pandas.DataFrame(columns)
+
+
+def test_data_frames_arrays_and_mappings_become_the_same_split(tmp_path):
+    episodes = [walk(40, i) for i in range(12)]
+    odd = walk(40, 20, 5.0, 10, 15) | {"fault": labels(40, 10, 15).astype(bool)}
+    rows = [{name: values[t] for name, values in odd.items()} for t in range(40)]
+    digests = set()
+    for form, make in {
+        "frames": frame,
+        "rows": lambda e: [dict(zip(e, row, strict=True)) for row in zip(*e.values(), strict=True)],
+        "other library": Table,
+    }.items():
+        made = [make(e | {"fault": np.zeros(40, bool)}) for e in episodes]
+        split = import_frames(
+            "arm", train=made[:6], calibration=made[6:10],
+            test={"nominal": made[10:], "bump": [make(odd) if form != "rows" else rows]},
+            labels="fault", output=tmp_path / form, report=len,
+        )  # fmt: skip
+        digests.add(split.digest)
+        data = split.environment("arm")
+        assert data.labelled("bump").intervals == [((10, 15),)]
+        assert [q.name for q in data.sensors] == ["a", "b"]
+    assert len(digests) == 1
+    arrays = [np.stack([*e.values()], axis=1) for e in episodes]
+    data = import_frames("arm", train=arrays[:6], calibration=arrays[6:],
+                         output=tmp_path / "arrays", report=len).environment("arm")  # fmt: skip
+    assert np.array_equal(data.train[1].observations, arrays[1].astype(np.float32))
+
+
+class Table:
+    """What data frames of other libraries share: columns, and columns that become arrays."""
+
+    def __init__(self, columns):
+        self._columns, self.columns = columns, [*columns]
+
+    def __getitem__(self, name):
+        return types.SimpleNamespace(to_numpy=lambda: np.asarray(self._columns[name]))
+
+
+def test_frames_in_a_list_are_told_apart_by_their_labels_and_stamps_may_be_an_index(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    times = pandas.date_range("2024-05-01", periods=40, freq="100ms", name="when")
+    frames = []
+    for i in range(10):
+        start, stop = (10, 15) if i == 9 else (0, 0)
+        columns = walk(40, i, 5.0, start, stop) | {"fault": labels(40, start, stop)}
+        frames.append(pandas.DataFrame(columns).set_index(times))
+    data = import_frames(
+        "arm", train=frames[:4], calibration=frames[4:7], test=frames[7:], labels="fault",
+        time="when", rate=10, environment="joint", output=tmp_path / "out", report=len,
+    ).environment("joint")  # fmt: skip
+    assert (len(data.twins), data.logs.rate) == (2, 10.0)
+    assert data.labelled("anomaly").intervals == [((10, 15),)]
+
+
+@pytest.mark.parametrize(
+    ("episode", "word"),
+    [
+        (np.zeros((3, 2, 2)), r"shape \(3, 2, 2\)"),
+        (np.array([["x"]]), "numbers"),
+        ((np.zeros((5, 2)), np.zeros((9, 1))), "5 observations and 9 actions"),
+    ],
+)
+def test_what_is_no_episode_is_refused(tmp_path, episode, word):
+    with pytest.raises(TrajectoryError, match=word):
+        import_frames("arm", train=[episode], calibration=[episode], output=tmp_path, report=len)
+    with pytest.raises(UsageError, match="import_frames 'windw'"):
+        import_frames("arm", train=[], calibration=[], windw=3, report=len)
+
+
+# Memory
+
+
+def test_the_rows_of_a_part_never_all_lie_in_memory(tmp_path):
+    values = np.random.default_rng(0).normal(size=(200_000, 8))
+    for part, count in (("train", 12), ("calibration", 4)):
+        (tmp_path / part).mkdir()
+        for i in range(count):
+            np.savez(tmp_path / part / f"run-{i}.npz", observations=values[: 200_000 - i])
+    program = (
+        "import resource, sys; from pathlib import Path\n"
+        "from oodd_eval.data.importing import import_data\n"
+        "root = Path(sys.argv[1])\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "before = peak()\n"
+        "import_data('s', 'e', form='numpy', train=root / 'train',\n"
+        "            calibration=root / 'calibration', output=root / 'out')\n"
+        "print((peak() - before) * 1024)"
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=True,
+                         capture_output=True, text=True)  # fmt: skip
+    # 16 files of 12.8 MB are 205 MB.
+    assert int(run.stdout) < 100e6
+
+
+# What users write by mistake
+
+
+@pytest.mark.parametrize(
+    ("change", "files", "words"),
+    [
+        ({"discrete": 10**11, "actions": ["b"], "sensors": ["a"]}, {}, "at most 1000"),
+        ({"time": "t[ns]", "rate": 10}, {}, r"60 rows were logged.*\[ms\]"),
+        ({"time": "t", "rate": 10, "gap": 1e-9}, {}, "pieces shorter than 2 rows"),
+        ({}, {"free/1.csv": "a,b,t\n1,2,0\n2,broken,.1\n"}, "texts such as 'broken'; leave"),
+        ({"time": "t"}, {"free/1.csv": "a,b,t\n"}, r"1\.csv has no rows, expected"),
+        ({}, {"free/1.csv": "a,b,tür\n1,2,3\n"}, "encoding = 'cp1252'"),
+        ({"labels": "c"}, {"free/0.csv": "a,b,c\n1,2,OK\n1,2,OK\n"}, "nominal_label"),
+    ],
+)  # fmt: skip
+def test_a_mistake_comes_with_what_to_do(tmp_path, change, files, words):
+    for i in range(10):
+        write(tmp_path / "free" / f"{i}.csv", walk(60, i) | {"t": np.arange(60) / 10})
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, "cp1252")
+    content = {"split": "s", "sensors": ["a", "b"], "nominal": {"files": "free/*.csv"}} | change
+    with pytest.raises(OoddError, match=words):
+        import_recipe(Recipe.parse(content), tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_value_beyond_float32_is_refused_without_a_warning(tmp_path, capsys):
+    for i in range(10):
+        rows = walk(60, i)
+        rows["a"][5] = 1e300 if i == 3 else 0.0
+        write(tmp_path / "free" / f"{i}.csv", rows)
+    content = {"split": "s", "sensors": ["a", "b"], "nominal": {"files": "free/*.csv"}}
+    with pytest.raises(TrajectoryError, match="sensor 'a' reaches 1e"):
+        import_recipe(Recipe.parse(content), tmp_path, tmp_path / "out")
+    assert main(["data", "inspect", str(tmp_path / "free")]) == 0
+    assert "1e+300" in capsys.readouterr().out
+
+
+def test_a_name_of_a_file_may_be_no_text(tmp_path):
+    for i in range(10):
+        write(tmp_path / "free" / os.fsdecode(b"\xff%d.csv" % i), walk(60, i))
+    content = {"split": "s", "sensors": ["a", "b"], "nominal": {"files": "free/*.csv"}}
+    split = import_recipe(Recipe.parse(content), tmp_path, tmp_path / "out")
+    assert split.environment("s").train.names[0] == "\\udcff0"
+
+
+@pytest.mark.parametrize("form", [{}, {"read": {"format": "csv"}}])
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path, form):
+    (tmp_path / "free").mkdir()
+    os.mkfifo(tmp_path / "free" / "0.csv")
+    content = {"split": "s", "sensors": ["a"], "nominal": {"files": "free/*.csv"}} | form
+    with pytest.raises(TrajectoryError, match=r"0\.csv is no plain file, but a broken link"):
+        import_recipe(Recipe.parse(content), tmp_path, tmp_path / "out")
+
+
+@pytest.fixture
+def full_disk():
+    """Lets files grow to some bytes and no further."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize(
+    ("while_reading", "words"),
+    [(True, "rows cannot be kept in .*TMPDIR"), (False, r"s\.h5' cannot be written")],
+)
+def test_a_full_disk_is_told_and_nothing_is_left(tmp_path, full_disk, while_reading, words):
+    for i in range(10):
+        write(tmp_path / "free" / f"{i}.csv", walk(600, i))
+    content = {"split": "s", "sensors": ["a", "b"], "nominal": {"files": "free/*.csv"}}
+    recipe, output = Recipe.parse(content), tmp_path / "out"
+    output.mkdir()
+    (output / ".s.h5.999999999").write_text("what a killed import left")
+    if while_reading:  # rows take 144 kB
+        full_disk(100_000)
+    with pytest.raises(OutputError, match=words):
+        import_recipe(recipe, tmp_path, output, progress=lambda _part: full_disk(20_000))
+    full_disk(2**40)
+    assert not (output / "s.h5").exists()
+    assert import_recipe(recipe, tmp_path, output).environment("s").train
+    assert {path.name for path in output.iterdir()} == {"manifest.json", "s.h5"}
+
+
+def test_a_line_break_in_a_name_does_not_end_a_remark_of_a_draft(tmp_path):
+    for i in range(6):
+        write(tmp_path / "free" / f"{i}.csv", walk(60, i))
+    copy = tmp_path / "free" / 'x\nsplit = "y".csv'
+    copy.write_bytes((tmp_path / "free" / "1.csv").read_bytes())
+    recipe = tmp_path / "r.toml"
+    assert main(["data", "inspect", str(tmp_path / "free"), "--recipe", str(recipe)]) == 0
+    assert Recipe.load(recipe).sensors == ("a", "b")
+    assert main(["scan", str(tmp_path / "free")]) in {0, 1}
