@@ -1,9 +1,19 @@
-"""What `data info` shows, against numbers worked by hand from the synthetic split."""
+"""What `data info` shows, against numbers worked by hand from the synthetic splits."""
 
+import dataclasses
+import json
+
+import minari
+import numpy as np
 import pytest
+from helpers_logs import UNPAIRED, log_parts, make_log_split, write_log_split
+from helpers_split import make_group
 
-from oodd_eval.data.facts import TABLE1
-from oodd_eval.data.info import collect_returns, describe, group_rows, return_rows
+from oodd_eval.cli.main import main
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, LogFacts
+from oodd_eval.data.info import collect_returns, describe, group_rows, log_rows, return_rows
+from oodd_eval.data.layout import write_environment, write_manifest
+from oodd_eval.data.parts import NOMINAL
 from oodd_eval.data.split import load_split
 
 KINDS = ("nominal", *TABLE1)
@@ -42,3 +52,125 @@ def test_the_description_names_digest_recipe_and_every_environment(tiny_split):
     for title in ("CartPole: 0.", "Hopper: 0.", "Table 2", "0 thigh torque [75 N m]"):
         assert title in text
     assert "61.0" in text
+
+
+FACTS = dataclasses.replace(
+    UNPAIRED, clock=False, baseline=20, rate=50.0, order="shuffled", offsets=(5.4e6, 0.0, 0.0),
+    source="https://example.org/arm", licence="CC BY 4.0", citation="Someone, 2024",
+)  # fmt: skip
+SLIPS = [((30, 45),), ((10, 20), (30, 40)), ((-1, 12),), ()]
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """A split of logs; episode i of an anomaly has 60 + i % 3 rows."""
+    return make_log_split(tmp_path / "arm", FACTS, anomalies={"slip": SLIPS, "leak": [()] * 2})
+
+
+def test_parts_of_logs_have_rows_intervals_and_outcomes(logs):
+    rows = {row[0]: row[1:] for row in log_rows(load_split(logs).environment("arm"))}
+    assert list(rows) == ["train", "calibration", "test/nominal", "test/leak", "test/slip"]
+    assert rows["train"] == ["6", "", "366", "60..62", "", "", "", ""]
+    # 15 + 20 + 12 rows of the three episodes with intervals, which have 60 + 61 + 62.
+    assert rows["test/slip"] == ["4", "", "243", "60..62", "4", "47 (26%)", "1", ""]
+    assert rows["test/leak"] == ["2", "", "121", "60..61", "0", "", "2", ""]
+
+
+def test_the_description_of_logs_says_where_they_are_from_and_how_rows_are_meant(logs):
+    text = describe(load_split(logs))
+    for line in (
+        "6 training, 40 calibration and 8 nominal test episodes; imported",
+        "source: https://example.org/arm",
+        "licence: CC BY 4.0",
+        "citation: Someone, 2024",
+        "rate: 50 rows/s",
+        "order: shuffled",
+        "offsets: subtracted in float64: q0 5400000",
+    ):
+        assert line in text.splitlines()
+    assert "first 20 rows" in text
+    assert "clock:" in text
+    for nothing in ("Table 2", "±", "return", "policy", "arm arm", "redraws", "tasks"):
+        assert nothing not in text
+
+
+def test_facts_that_a_recipe_leaves_out_are_left_out(tmp_path):
+    text = describe(load_split(make_log_split(tmp_path / "arm")))
+    for nothing in ("source", "licence", "rate:", "baseline", "offsets", "outcome only"):
+        assert nothing not in text
+
+
+def test_pairs_of_logs_have_onsets_and_no_returns(tmp_path):
+    info = ENVIRONMENTS["cartpole"]
+    groups = {part: make_group("cartpole", range(3), 60) for part in NOMINAL}
+    groups["test/iid"] = make_group("cartpole", range(3), 60, "iid")
+    for arrays in groups.values():
+        arrays["rewards"] = np.zeros_like(arrays["rewards"])
+    entry = write_environment(
+        tmp_path / "cartpole.h5", groups.items(), "imported", sensors=info.sensors,
+        actions=info.actions, logs=LogFacts(paired=True, source="the shed"),
+    )  # fmt: skip
+    recipe = {"name": "shed", "source": "imported"}
+    write_manifest(tmp_path, recipe, {"cartpole": entry}, generator=0, versions={})
+    text = describe(load_split(tmp_path))
+    header = next(line for line in text.splitlines() if line.startswith("group"))
+    assert header.split() == ["group", "trajectories", "transitions", "length", "onset", "effect",
+                              "tail", "redraws"]  # fmt: skip
+    assert "source: the shed" in text
+    for nothing in ("Table 2", "±", "policy"):
+        assert nothing not in text
+
+
+def test_tasks_and_rewards_are_told_where_there_are_any(tmp_path):
+    parts = log_parts()
+    parts["train"] = [
+        dataclasses.replace(episode, task=f"task {i % 2}")
+        for i, episode in enumerate(parts["train"])
+    ]
+    rows = log_rows(load_split(write_log_split(tmp_path / "arm", parts)).environment("arm"))
+    assert [row[2] for row in rows] == ["2", "", "", ""]
+
+
+def test_the_command_examines_the_promise_of_logs(logs, capsys):
+    assert main(["data", "info", str(logs)]) == 0
+    text = capsys.readouterr().out
+    assert "40 calibration episodes" in text
+    assert main(["data", "verify", str(logs)]) == 0
+    assert "6 of 6 groups" in capsys.readouterr().out
+
+
+def test_a_changed_label_is_no_longer_verified(logs, capsys):
+    import h5py
+
+    with h5py.File(logs / "arm.h5", "r+") as file:
+        file["test/slip/intervals"][0] = (31, 45)
+    assert main(["data", "verify", str(logs)]) == 1
+    assert "test/slip" in capsys.readouterr().out
+
+
+def test_imported_environments_are_listed_and_described(logs, capsys, monkeypatch):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(logs.parent))
+    assert main(["list", "envs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].split(maxsplit=3)[:3] == ["arm", "split", "arm"]
+    assert main(["info", "arm"]) == 0
+    page = capsys.readouterr().out
+    for text in ("q0 (rad)", "CC BY 4.0", "40 episodes", "data info arm"):
+        assert text in page
+    assert main(["info", "arn"]) == 4
+    assert "did you mean 'arm'" in capsys.readouterr().err
+
+
+def test_labels_of_logs_are_metadata_of_an_export(logs, tmp_path, monkeypatch):
+    root = tmp_path / "datasets"
+    assert main(["data", "export", str(logs), "--format", "minari", "--output", str(root)]) == 0
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
+    dataset = minari.load_dataset("oodd/arm/arm/test-slip-v0")
+    metadata = list(dataset.storage.get_episode_metadata(range(4)))
+    assert [json.loads(m["intervals"]) for m in metadata] == [[[30, 45]], [[10, 20], [30, 40]],
+                                                              [[-1, 12]], []]  # fmt: skip
+    assert {m["anomaly"] for m in metadata} == {"slip"}
+    episode = load_split(logs).environment("arm").labelled("slip")[1]
+    assert (next(dataset.iterate_episodes([1])).observations == episode.observations).all()
+    facts = json.loads((root / "oodd/arm/arm/train-v0/data/metadata.json").read_text())["logs"]
+    assert (facts["licence"], facts["offsets"]) == ("CC BY 4.0", [5.4e6, 0, 0])

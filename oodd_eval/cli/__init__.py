@@ -292,6 +292,12 @@ expression_option: Final = click.option(
     help="only cells whose id matches, such as 'hopper and not (iid or drift)'",
 )
 
+row_metrics_option: Final = click.option(
+    "--row-metrics",
+    is_flag=True,
+    help="add the rows' F1, alarm rates and VUS-PR, of splits without twins",
+)
+
 detector_options: Final = together(
     click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text"),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),

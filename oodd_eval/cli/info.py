@@ -1,7 +1,8 @@
 """``oodd-eval info``: describe a detector, an environment or an anomaly."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import click
 from tabulate import tabulate
@@ -10,7 +11,9 @@ from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.condition import read_ladder, rungs_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
+from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
+from oodd_eval.data.split import imported_environments
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -30,10 +33,16 @@ def info(options: Options) -> int:
     else:
         plugins = discovered(options)
         custom = plugins.custom_specs
+        imported = {env: (split, entry) for env, split, entry in imported_environments()}
         try:
-            lines = _custom(*custom[name]) if name in custom else _detector(plugins.offer(name))
+            if name in custom:
+                lines = _custom(*custom[name])
+            elif name in imported:
+                lines = _imported(name, *imported[name])
+            else:
+                lines = _detector(plugins.offer(name))
         except UnknownNameError:
-            names = [*ENVIRONMENTS, *ANOMALIES, *custom, *plugins.offers]
+            names = [*ENVIRONMENTS, *ANOMALIES, *custom, *imported, *plugins.offers]
             raise UnknownNameError("detector, environment or anomaly", name, names) from None
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
@@ -65,6 +74,20 @@ def _custom(spec: Spec, origin: str) -> Lines:
         for i, column in enumerate(columns):
             yield "" if i else f"{len(columns)} {kind}", f"{column.name} ({column.unit})"
     yield "attributes", ", ".join(spec.attributes) or "none"
+
+
+def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
+    facts = log_facts(entry)
+    yield "environment", f"{name}, imported from logs into split {split}"
+    for key in ("source", "licence", "citation"):
+        if text := getattr(facts, key):
+            yield key, text
+    for part, group in entry["groups"].items():
+        yield part, f"{group['trajectories']} episodes"
+    for kind in ("sensors", "actions"):
+        for i, column in enumerate(entry[kind]):
+            yield "" if i else f"{len(entry[kind])} {kind}", f"{column['name']} ({column['unit']})"
+    yield "more", f"oodd-eval data info {split}"
 
 
 def _anomaly(info: AnomalyInfo) -> Lines:

@@ -43,6 +43,7 @@ def rows(kind: str, plugins: Plugins) -> Rows:
                 yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
             for env, origin in _custom(plugins, EnvironmentSpec):
                 yield env.name, origin, f"{len(env.sensors)} sensors, its own policy"
+            yield from _imported()
         case "anomalies":
             for a in ANOMALIES.values():
                 yield a.id, a.group, a.summary
@@ -59,6 +60,14 @@ def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
     for spec, origin in plugins.custom_specs.values():
         if isinstance(spec, kind):
             yield spec, origin
+
+
+def _imported() -> Rows:
+    """Yield the environments of logs in the splits that are at hand."""
+    from oodd_eval.data.split import imported_environments
+
+    for name, split, entry in imported_environments():
+        yield name, f"split {split}", f"{len(entry['sensors'])} sensors, imported from logs"
 
 
 def _detectors(plugins: Plugins) -> Rows:

@@ -21,7 +21,7 @@ FIRST_STEPS: Final = (
     "show oodd-results                  print tables of that run again",
     "list detectors                     list what else can be run",
     "leaderboard show                   print the published board",
-    "data import --help                 bring logs of your own system",
+    "data inspect LOGS                  look at logs of your own system",
 )
 
 EXIT_CODES: Final = (
@@ -34,6 +34,7 @@ EXIT_CODES: Final = (
 )
 
 DATA: Final[Commands] = {
+    "inspect": ("look at logs, write a first recipe", "oodd_eval.cli.inspect_logs:inspect"),
     "import": ("import logs of your own as an environment", "oodd_eval.cli.data:import_logs"),
     "info": ("describe a split", "oodd_eval.cli.data:info"),
     "verify": ("compare a split with its digests", "oodd_eval.cli.data:verify"),
@@ -61,6 +62,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
     "Evaluate": {
         "run": ("fit and score every selected cell", "oodd_eval.cli.run:run"),
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
+        "scan": ("find odd episodes in recorded logs", "oodd_eval.cli.scan:scan"),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
         "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),

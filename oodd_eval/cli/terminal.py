@@ -4,7 +4,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -14,14 +14,17 @@ from rich.text import Text
 from oodd_eval._version import __version__
 from oodd_eval.cli import Options, say
 from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.data.logs import register_readers
 from oodd_eval.data.registry import Spec, register
-from oodd_eval.metrics.catalogue import METRICS
+from oodd_eval.metrics.bootstrap import nan_mean
+from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins, discover, printable
-from oodd_eval.results.board import boards
+from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render.text import print_prose, print_sections
 from oodd_eval.results.report import Report
+from oodd_eval.results.strengths import NO_UNITS
 from oodd_eval.scoring.plan import Plan, Unit
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
@@ -54,10 +57,16 @@ def register_custom(options: Options) -> list[Spec]:
     return specs
 
 
+def register_formats(options: Options) -> None:
+    """Make formats of logs of plug-ins known in this process."""
+    register_readers(reader for reader, _ in discovered(options).readers.values())
+
+
 class TerminalReporter:
     """Print a header, a line per fit, tables, failures and a summary.
 
     `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
+    `units` are those of strengths by kind of anomaly.
     """
 
     def __init__(
@@ -67,9 +76,10 @@ class TerminalReporter:
         verbosity: int = 0,
         intervals: bool = False,
         log: Callable[[str], Path] | None = None,
+        units: Mapping[str, str] = NO_UNITS,
     ) -> None:
         self.console, self.verbosity, self.intervals = console, verbosity, intervals
-        self._log = log
+        self._log, self._units = log, units
         self._start = time.perf_counter()
         self._open: dict[tuple[str, str], list[Record]] = {}
         self._sizes: dict[tuple[str, str], int] = {}
@@ -151,7 +161,7 @@ class TerminalReporter:
 
     def tables(self, records: Sequence[Record]) -> None:
         """Print the tables of every board among some records."""
-        report = Report(records, intervals=self.intervals, detail="brief")
+        report = Report(records, intervals=self.intervals, detail="brief", units=self._units)
         print_sections(report.sections, self.console)
 
     def failures(self, records: Sequence[Record]) -> None:
@@ -169,9 +179,13 @@ class TerminalReporter:
     def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
         parts = [f"{last.status:<12} {name}"]
         if last.ok:
-            defined = [v for r in cells if not math.isnan(v := r.value("auc_matched"))]
-            mean = sum(defined) / len(defined) if defined else math.nan
-            parts.append(f"matched AUC {METRICS['auc_matched'].text(mean)}")
+            name = ranked_by(cells)[0]
+            if not any(name in r.metrics for r in cells):  # nominal episodes alone
+                name = f"false_episodes_{level_of(cells)}"
+            info = metric_info(name)
+            if any(name in r.metrics for r in cells):  # there are enough calibration episodes
+                mean = nan_mean(r.value(info.name) for r in cells)
+                parts.append(f"{info.title} {info.text(mean)}")
             spent = last.seconds_fit + last.seconds_score
             if resumed:
                 parts.append("from an earlier run")

@@ -1,0 +1,1 @@
+"""Looking at logs before they are imported, and writing a first recipe for them."""

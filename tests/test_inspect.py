@@ -1,0 +1,464 @@
+"""`data inspect` sees what a recipe has to say of logs, and nothing where there is nothing."""
+
+import csv
+import datetime as dt
+import json
+import tomllib
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from oodd_eval.cli.main import main
+from oodd_eval.data.inspection.columns import ClockFacts, ColumnFacts, time_unit
+from oodd_eval.data.inspection.draft import draft, draft_recipe
+from oodd_eval.data.inspection.logs import inspect_logs
+from oodd_eval.data.inspection.report import advise, describe_logs, looks_like
+from oodd_eval.data.recipe import Recipe
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+
+
+def process(rows, seed=0):
+    """Two smooth sensors."""
+    rng = np.random.default_rng(seed)
+    return {
+        "q[rad]": np.sin(np.arange(rows) / 20) + rng.normal(0, 0.01, rows),
+        "tau[N m]": rng.normal(0, 1, rows),
+    }
+
+
+def write(path, columns, separator=","):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        out = csv.writer(file, delimiter=separator)
+        out.writerow(columns)
+        out.writerows(zip(*columns.values(), strict=True))
+
+
+def times(rows, step=0.01):
+    return {"t": np.round(np.arange(rows) * step, 6)}
+
+
+@pytest.fixture
+def clean(tmp_path):
+    """A folder with nothing to remark but that there are few episodes."""
+    for i in range(40):
+        write(tmp_path / f"run-{i}.csv", times(60) | process(60, i))
+    return tmp_path
+
+
+def topics(logs):
+    return {advice.topic: advice.text for advice in advise(logs)}
+
+
+def test_a_clean_folder_has_no_remark_but_its_rate(clean):
+    logs = inspect_logs(clean)
+    assert topics(logs).keys() == {"time", "nominal"}
+    assert (len(logs.recordings), {r.length for r in logs.recordings}) == (40, {60})
+    assert logs.times == {"t": "s"}
+    assert 'time = "t", rate = 100' in topics(logs)["time"]
+    assert [*looks_like(logs).values()] == ["time (seconds)", "", ""]
+
+
+def with_columns(clean, rows=60, **columns):
+    """The clean folder, the first file with further columns."""
+    for i, path in enumerate(sorted(clean.glob("*.csv"))):
+        with path.open() as file:
+            table = list(csv.reader(file))
+        extra = {name: function(rows, i) for name, function in columns.items()}
+        cells = [[*table[0], *extra]]
+        cells += [[*row, *(values[k] for values in extra.values())] for k, row in
+                  enumerate(table[1:])]  # fmt: skip
+        with path.open("w", newline="") as file:
+            csv.writer(file).writerows(cells)
+    return inspect_logs(clean)
+
+
+def wrapped(period):
+    def angle(rows, i):
+        return np.mod(np.arange(rows) * period / 40 + i, period) - period / 2
+
+    return angle
+
+
+PECULIAR = {
+    "constant": lambda rows, _: np.full(rows, 3.5),
+    "empty": lambda rows, _: [""] * rows,
+    "text": lambda rows, _: [f"note {k}" for k in range(rows)],
+    "counters": lambda rows, _: np.arange(rows) + 17,
+    "flags": lambda rows, _: np.arange(rows) // 20 % 2,
+    "angles": wrapped(2 * np.pi),
+    "missing": lambda rows, _: ["" if 5 < k < 9 else k % 7 + 0.1 * k for k in range(rows)],
+    "float32": lambda rows, i: 5.4e6 + np.random.default_rng(i).normal(0, 10, rows),
+    "setpoints": lambda rows, i: np.full(rows, 100.0 * i),
+}
+
+
+@pytest.mark.parametrize("topic", PECULIAR)
+def test_a_peculiar_column_is_named_and_nothing_else(clean, topic):
+    remarks = topics(with_columns(clean, odd=PECULIAR[topic]))
+    assert remarks.keys() == {"time", "nominal", topic}
+    assert "odd" in remarks[topic]
+
+
+def test_degrees_wrap_too_and_what_jumps_by_less_does_not(clean):
+    logs = with_columns(
+        clean,
+        heading=wrapped(360.0),
+        sawtooth=wrapped(5.0),
+        noise=lambda rows, i: np.random.default_rng(i).uniform(-3.1, 3.1, rows),
+    )
+    assert logs.columns["heading"].wraps == 360
+    assert not logs.columns["sawtooth"].wraps
+    assert not logs.columns["noise"].wraps
+
+
+def test_what_float32_keeps_is_not_remarked(clean):
+    logs = with_columns(
+        clean,
+        temperature=lambda rows, i: 300 + np.random.default_rng(i).normal(0, 5, rows),
+        pressure=lambda rows, i: 101_325 + np.random.default_rng(i).normal(0, 0.5, rows),
+    )
+    # Steps of float32 are 3e-5 at 300 and .008 at 101 325.
+    assert not logs.columns["temperature"].coarse
+    assert logs.columns["pressure"].coarse
+
+
+def test_missing_cells_are_counted_at_the_start_and_in_runs(tmp_path):
+    values = ["", "", "", *map(str, range(10)), "", "", *map(str, range(5))]
+    write(tmp_path / "a.csv", {"x": values, "y": range(20)})
+    facts = inspect_logs(tmp_path / "a.csv").columns["x"]
+    assert (facts.missing, facts.leading, facts.longest) == (5, 3, 2)
+
+
+def test_blocks_count_as_the_whole_does():
+    rng = np.random.default_rng(1)
+    values = 1e6 + rng.normal(size=1000)
+    values[rng.random(1000) < 0.3] = np.nan
+    values[:7] = np.nan
+    whole, parts, pair = ColumnFacts(), ColumnFacts(), ColumnFacts()
+    for facts in (whole, parts, pair):
+        facts.begin()
+    whole.add(values)
+    for block in np.split(values, [3, 7, 8, 500, 501]):
+        parts.add(block)
+    assert (parts.missing, parts.leading, parts.longest) == (
+        whole.missing, whole.leading, whole.longest)  # fmt: skip
+    assert (parts.steps, parts.falls, parts.rises) == (whole.steps, whole.falls, whole.rises)
+    pair.add(values[:400])
+    pair.begin()
+    pair.add(values[400:])
+    assert pair.recordings == 2
+    # The step from one recording to the next is none.
+    assert pair.steps == whole.steps - 1
+    for facts in (whole, parts, pair):
+        assert facts.numbers.mean == pytest.approx(np.nanmean(values), abs=1e-9)
+        assert facts.numbers.spread == pytest.approx(np.nanstd(values), rel=1e-9)
+
+
+def test_gaps_are_counted_and_the_longest_is_named(clean):
+    stamps = np.arange(60) * 0.01
+    stamps[30:] += 1.5
+    write(clean / "run-3.csv", {"t": stamps} | process(60))
+    remarks = topics(inspect_logs(clean))
+    assert remarks.keys() == {"time", "nominal", "gaps"}
+    assert "1.51 s before row 30 of run-3.csv" in remarks["gaps"]
+    assert "gap = 0.2" in remarks["gaps"]
+
+
+def test_a_clock_that_was_set_back_is_cut_there(clean):
+    stamps = np.arange(60) * 0.01
+    stamps[30:] -= 0.1
+    write(clean / "run-3.csv", {"t": stamps} | process(60))
+    logs = inspect_logs(clean)
+    assert "1 row earlier" in topics(logs)["falls"]
+    recipe = Recipe.parse(tomllib.loads(draft(logs)))
+    assert (recipe.time, recipe.rate, recipe.gap) == ("t", 100, 0.2)
+
+
+def test_one_file_at_another_rate(clean):
+    write(clean / "run-7.csv", times(60, 0.02) | process(60))
+    remarks = topics(inspect_logs(clean))
+    assert remarks.keys() == {"time", "nominal", "rates"}
+    assert "run-7.csv" in remarks["rates"]
+    assert "0.02 s" in remarks["rates"]
+
+
+@pytest.mark.parametrize(
+    ("name", "stamps", "unit"),
+    [
+        ("datetime", ["2024-05-01 10:00:00", "2024-05-01 10:00:01"], "date"),
+        ("stamp", [1.7e18, 1.7e18 + 1e7], "ns"),
+        ("time", [1.7e12, 1.7e12 + 10], "ms"),
+        ("time", [1.7e9, 1.7e9 + 1], "s"),
+        ("Time", [9862, 9877], "ms"),
+        ("time_us", [0, 4000], "us"),
+        ("t", [0, 1], "s"),
+        ("t [s]", [0, 20], "s"),
+    ],
+)
+def test_units_of_stamps(tmp_path, name, stamps, unit):
+    write(tmp_path / "a.csv", {name: stamps, "x": [1.5, 2.5]})
+    assert inspect_logs(tmp_path).times == {name: unit}
+
+
+def test_a_clock_that_falls_is_no_clock():
+    rng = np.random.default_rng(0)
+    random = ClockFacts.of([(0, rng.normal(size=100))])
+    assert random.steps.falls > 30
+    assert ClockFacts.of([(0, np.array([1.0]))]) is None
+    assert time_unit("t", [ClockFacts.of([(0, np.arange(9.0))])]) == "s"
+
+
+@pytest.mark.parametrize("separator", [";", ","])
+def test_labels_by_rows_sort_the_files(tmp_path, separator):
+    for i in range(3):
+        write(tmp_path / f"free-{i}.csv", times(200) | process(200, i), separator)
+        labels = {"anomaly": (np.arange(200) // 50 == 2).astype(float)}
+        write(tmp_path / f"valve-{i}.csv", times(200) | process(200, i) | labels, separator)
+    logs = inspect_logs(tmp_path)
+    assert logs.labels == ("anomaly",)
+    assert "150 of 600 rows, in 3 of 6 episodes" in topics(logs)["labels"]
+    assert "anomaly" in topics(logs)["headers"]
+    recipe = Recipe.parse(tomllib.loads(draft(logs)))
+    assert recipe.labels == ("anomaly",)
+    assert recipe.sensors == ("q[rad]", "tau[N m]")
+    assert recipe.nominal.files == ("free*.csv",)
+    assert recipe.anomalous["valve"].files == ("valve*.csv",)
+    assert (recipe.time, recipe.rate) == ("t", 100)
+
+
+def test_text_labels_name_their_nominal_value(tmp_path):
+    state = ["fine"] * 150 + ["broken"] * 50
+    write(tmp_path / "a.csv", process(200) | {"health": state})
+    recipe = draft_recipe(tmp_path)
+    assert recipe.labels == ("health",)
+    assert recipe.nominal_label == ("fine",)
+    # One file with both kinds of rows stands below both.
+    assert recipe.nominal.files == recipe.anomalous["fault"].files == ("a.csv",)
+
+
+def test_folders_sort_files_where_no_label_does(tmp_path):
+    for i in range(3):
+        write(tmp_path / "nominal" / f"run-{i}.csv", times(50) | process(50, i))
+        write(tmp_path / "Slip 1" / f"run-{i}.csv", times(50) | process(50, 9 + i))
+    recipe = draft_recipe(tmp_path)
+    assert recipe.nominal.files == ("nominal/*.csv",)
+    assert recipe.anomalous["slip-1"].files == ("Slip 1/*.csv",)
+
+
+def test_names_of_files_sort_them(tmp_path):
+    for i, name in enumerate(["1_no_failure", "2_engine_failure", "3_no_failure"]):
+        write(tmp_path / f"flight_{name}.csv", times(50) | process(50, i))
+    recipe = draft_recipe(tmp_path)
+    assert recipe.nominal.files == ("flight*no_failure.csv",)
+    assert recipe.anomalous["engine"].files == ("flight_2_engine_failure.csv",)
+
+
+def test_a_transposed_matrix_is_noticed_by_its_neighbours_and_read_as_it_is_meant(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("d01.dat", "d02.dat"):
+        np.savetxt(tmp_path / name, rng.normal(size=(96, 12)))
+    np.savetxt(tmp_path / "d00.dat", rng.normal(size=(12, 50)))
+    logs = inspect_logs(tmp_path)
+    assert logs.transposed == ["d00.dat"]
+    assert sorted(r.length for r in logs.recordings) == [50, 96, 96]
+    assert len(logs.columns) == 12
+    assert 'transpose = ["d00.dat"]' in topics(logs)["transposed"]
+    assert draft_recipe(tmp_path).options == {"transpose": ["d00.dat"]}
+
+
+def test_a_first_row_that_counts_gives_a_transposed_matrix_away(tmp_path):
+    rows = np.vstack([np.arange(300), np.random.default_rng(0).normal(size=(3, 300))])
+    np.savetxt(tmp_path / "a.dat", rows)
+    assert inspect_logs(tmp_path).transposed == ["a.dat"]
+    np.savetxt(tmp_path / "a.dat", rows.T)
+    assert not inspect_logs(tmp_path).transposed
+
+
+def test_short_matrices_are_not_taken_for_transposed_ones(tmp_path):
+    np.savetxt(tmp_path / "a.dat", np.random.default_rng(0).normal(size=(15, 20)))
+    assert not inspect_logs(tmp_path).transposed
+
+
+def test_equal_files_are_named_whatever_their_bytes(tmp_path):
+    for name, seed in (("a", 0), ("b", 1), ("c", 0)):
+        write(tmp_path / f"{name}.csv", process(50, seed), ";" if name == "c" else ",")
+    assert inspect_logs(tmp_path).equal == [["a.csv", "c.csv"]]
+    assert draft_recipe(tmp_path).nominal.files == ("a.csv", "b.csv")
+
+
+def test_files_with_no_column_in_common_are_not_drafted_together(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"arm-{i}.csv", process(50, i))
+    write(tmp_path / "room.csv", {"temperature": np.random.default_rng(0).normal(20, 1, 50)})
+    logs = inspect_logs(tmp_path)
+    assert "temperature" in topics(logs)["headers"]
+    recipe = draft_recipe(tmp_path)
+    assert recipe.nominal.files == ("arm*.csv",)
+    assert recipe.sensors == ("q[rad]", "tau[N m]")
+
+
+@pytest.mark.parametrize(("zeros", "label"), [(30, True), (10, False)])
+def test_a_label_is_often_nominal(tmp_path, zeros, label):
+    write(tmp_path / "a.csv", process(60) | {"fail_flags": (np.arange(60) >= zeros) * 8})
+    assert bool(inspect_logs(tmp_path).labels) == label
+
+
+def test_blocks_with_classes_are_sorted_by_kind(tmp_path):
+    blocks = []
+    for i, kind in enumerate(["normal", "collision"] * 20):
+        rows = np.random.default_rng(i).normal(size=(15, 6))
+        blocks.append("\n".join([kind, *(" ".join(f"{x:.3f}" for x in row) for row in rows), ""]))
+    (tmp_path / "lp1.data").write_text("\n".join(blocks))
+    logs = inspect_logs(tmp_path)
+    assert len(logs.recordings) == 40
+    recipe = draft_recipe(tmp_path)
+    assert recipe.kinds == "class"
+    assert recipe.nominal.where == {"class": ("normal",)}
+    assert "nominal" not in topics(logs)
+
+
+def test_episodes_that_stand_in_two_files_are_counted(tmp_path):
+    def write_blocks(name, seeds):
+        rows = {i: np.random.default_rng(i).normal(size=(15, 3)) for i in seeds}
+        blocks = ["\n".join(["fine", *(" ".join(map(str, x)) for x in r)]) for r in rows.values()]
+        (tmp_path / name).write_text("\n\n".join(blocks))
+
+    write_blocks("a.data", range(8))
+    write_blocks("b.data", range(5, 12))
+    logs = inspect_logs(tmp_path)
+    assert logs.shared == {"a.data": 3, "b.data": 3}
+    assert "3 of a.data" in topics(logs)["shared"]
+    assert not logs.equal
+
+
+def test_a_recording_that_ends_as_another_begins_is_named(tmp_path):
+    columns, first = process(300, 0), process(300, 1)
+    write(tmp_path / "free.csv", times(300) | columns)
+    rest = {name: np.append(columns[name][-60:], first[name]) for name in columns}
+    # It has a label, and times of its own.
+    write(tmp_path / "odd.csv", times(360) | rest | {"fault": np.arange(360) > 300})
+    write(tmp_path / "other.csv", times(300) | process(300, 2))
+    logs = inspect_logs(tmp_path)
+    assert logs.continued == [("free.csv", "odd.csv", 60)]
+    assert "60 rows of free.csv" in topics(logs)["continued"]
+
+
+def test_recordings_that_stand_still_at_either_end_are_not_taken_for_one(tmp_path):
+    for i in range(2):
+        rows = {name: np.pad(x, 40) for name, x in process(200, i).items()}
+        write(tmp_path / f"{i}.csv", times(280) | rows)
+    assert not inspect_logs(tmp_path).continued
+
+
+def test_a_file_of_intervals_is_no_recording(clean):
+    write(clean / "labels.csv", {"file": ["run-1.csv"], "start": [30], "stop": [40]})
+    logs = inspect_logs(clean)
+    assert logs.intervals == "labels.csv"
+    assert len(logs.recordings) == 40
+    assert draft_recipe(clean).intervals == "labels.csv"
+
+
+def test_other_formats_are_told(clean):
+    (clean / "notes.pdf").write_bytes(b"%PDF")
+    assert ".pdf" in topics(inspect_logs(clean))["others"]
+
+
+def test_a_file_that_cannot_be_read_is_reported_beside_the_others(clean):
+    (clean / "run-2.csv").write_text("t,q\n1,2\n1,2,3,4\n")
+    remarks = topics(inspect_logs(clean))
+    assert "run-2.csv" in remarks["unreadable"]
+    for path in clean.glob("run-*.csv"):
+        path.write_text("t,q\n1,2\n1,2,3,4\n")
+    with pytest.raises(TrajectoryError, match=r"run-0\.csv"):
+        inspect_logs(clean)
+
+
+def test_what_is_no_log_is_an_error(tmp_path):
+    with pytest.raises(UsageError, match="does not exist"):
+        inspect_logs(tmp_path / "nothing")
+    (tmp_path / "notes.pdf").write_bytes(b"%PDF")
+    with pytest.raises(UsageError, match="--format"):
+        inspect_logs(tmp_path)
+    with pytest.raises(UnknownNameError, match="did you mean 'csv'"):
+        inspect_logs(tmp_path, "cvs")
+    write(tmp_path / "a.csv", process(5))
+    with pytest.raises(UnknownNameError, match="did you mean 'separator'"):
+        inspect_logs(tmp_path, "", {"seperator": ";"})
+
+
+def test_a_long_recording_takes_few_windows_and_bounded_memory(tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    rows, block = 3_000_000, 100_000
+    rng = np.random.default_rng(0)
+    path = tmp_path / "long.parquet"
+    schema = pyarrow.schema([("t", "float64"), ("x", "float64"), ("y", "float64")])
+    with parquet.ParquetWriter(path, schema) as file:
+        for start in range(0, rows, block):
+            columns = [np.arange(start, start + block) * 0.01, *rng.normal(size=(2, block))]
+            file.write_table(pyarrow.table(columns, schema=schema))
+    tracemalloc.start()
+    logs = inspect_logs(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 200e6
+    assert logs.recordings[0].length == rows
+    assert 1_000_000 < logs.columns["x"].cells < rows
+    assert logs.columns["x"].numbers.spread == pytest.approx(1, abs=0.01)
+    assert "of 3000000 rows" in topics(logs)["sample"]
+    assert draft_recipe(path).window == rows // 100
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_text_fits_the_terminal(clean, width):
+    logs = with_columns(clean, **PECULIAR)
+    text = describe_logs(logs, width)
+    assert max(map(len, text.splitlines())) <= width
+    assert not any(line.endswith(" ") for line in text.splitlines())
+    assert "rad" in text
+    assert all(name in text for name in PECULIAR)
+
+
+def test_the_command_prints_and_writes_a_recipe_that_is_read(clean, capsys, monkeypatch):
+    monkeypatch.chdir(clean.parent)
+    with_columns(clean, **PECULIAR)
+    recipe = clean.parent / "arm.toml"
+    assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 0
+    assert "data import arm.toml" in capsys.readouterr().out
+    drafted = Recipe.load(recipe)
+    # Files are relative to the recipe, and what is no sensor is left out.
+    assert drafted.nominal.files == (f"{clean.name}/*.csv",)
+    assert drafted.sensors == ("q[rad]", "tau[N m]", "flags", "angles", "missing", "float32")
+    assert drafted.angles == ("angles",)
+    assert drafted.missing == "hold"
+    assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 4
+
+
+def test_a_recipe_elsewhere_names_the_root(clean, tmp_path_factory, capsys):
+    elsewhere = tmp_path_factory.mktemp("recipes") / "arm.toml"
+    assert main(["data", "inspect", str(clean), "--recipe", str(elsewhere)]) == 0
+    assert f"--root {clean}" in capsys.readouterr().out
+    assert Recipe.load(elsewhere).nominal.files == ("*.csv",)
+
+
+def test_dates_are_times(tmp_path):
+    start = dt.datetime(2024, 5, 1, tzinfo=dt.UTC).replace(tzinfo=None)
+    stamps = [(start + dt.timedelta(seconds=k)).isoformat() for k in range(30)]
+    write(tmp_path / "a.csv", {"when": stamps} | process(30))
+    logs = inspect_logs(tmp_path)
+    assert logs.times == {"when": "date"}
+    assert draft_recipe(tmp_path).rate == 1
+
+
+def test_an_outcome_and_a_task_of_each_episode_are_named(tmp_path):
+    lines = []
+    for i in range(40):
+        steps = [{"v": float(x)} for x in np.random.default_rng(i).normal(size=20)]
+        fields = {"success": i % 3 > 0, "task_id": i % 2, "terminated": True}
+        lines.append(json.dumps(fields | {"steps": steps}))
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    remarks = topics(inspect_logs(tmp_path))
+    assert remarks.keys() == {"time", "fields"}
+    recipe = draft_recipe(tmp_path)
+    assert (recipe.outcome, recipe.task) == ("success", "task_id")
