@@ -7,6 +7,7 @@ its interval contains the true value. The table stands in docs/metrics.md.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -14,9 +15,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import IntervalKind
+from oodd_eval.metrics.unpaired import UnpairedScores, separability
 
 SEEDS: Final = (10, 20, 50)
 """Test seeds per environment: those of mini, reduced and standard."""
@@ -101,11 +104,54 @@ class Scenario:
         return cells
 
 
+@dataclass(frozen=True)
+class TwoSamples:
+    """The pooled AUC of anomalous episodes against nominal ones, which are no twins.
+
+    Scores of a row are normal with variance 2, half of it the same for all rows of an episode;
+    anomalous ones are shifted. For n anomalous episodes there are `ratio` times n nominal ones,
+    which all of the conditions share.
+    """
+
+    title: str
+    shift: float = 1.0
+    ratio: int = 1
+    conditions: int = 1
+    rows: int = 5
+
+    def coverage(self, n: int, problems: int = PROBLEMS) -> float:
+        """Return the share of problems whose interval contains the true value."""
+        rng = np.random.default_rng(0)
+        truth = (1 + math.erf(self.shift / 2 / math.sqrt(2))) / 2  # the difference has variance 4
+        inside = 0
+        for _ in range(problems):
+            low, high = mean_interval(self._cells(rng, n), kind="share")
+            inside += low <= truth <= high
+        return inside / problems
+
+    def _cells(self, rng: np.random.Generator, n: int) -> list[DrawnCells]:
+        nominal = self._episodes(rng, self.ratio * n, 0.0)
+        cells = []
+        for k in range(self.conditions):
+            anomalous = self._episodes(rng, n, self.shift)
+            tasks = [""] * len(nominal), [""] * n
+            cell = UnpairedScores(nominal, anomalous, [()] * n, *tasks)
+            terms = separability(cell, GuaranteedAlarm(None, math.inf))["auc_pool"]
+            cells.append(drawn_cell("e", 0, terms, f"a{k}"))
+        return cells
+
+    def _episodes(
+        self, rng: np.random.Generator, n: int, shift: float
+    ) -> list[NDArray[np.float64]]:
+        episodes = rng.normal(shift, 1, size=(n, 1)) + rng.normal(size=(n, self.rows))
+        return list(episodes)
+
+
 FALLS_SHORT: Final = "delays with 5 % misses"
 """The scenario whose intervals contain the true value too seldom: a resample holds no miss that the
 sample lacks."""
 
-SCENARIOS: Final = (
+SCENARIOS: Final[tuple[Scenario | TwoSamples, ...]] = (
     Scenario("AUCs, skewed towards 1", _aucs, "share"),
     Scenario("AUCs, mean over 7 environments", _aucs, "share", 7),
     Scenario("delays, skewed", _delays, "mean"),
@@ -121,6 +167,10 @@ SCENARIOS: Final = (
     Scenario("share of 5 %, exact", functools.partial(_share, 0.05), "exact"),
     Scenario("pooled rate", _rates, "share"),
     Scenario("pooled rates, mean over 7 environments", _rates, "share", 7),
+    TwoSamples("pooled AUC, no twins, as many nominal episodes"),
+    TwoSamples("pooled AUC, no twins, 4 times as many nominal episodes", ratio=4),
+    TwoSamples("pooled AUC of 96 %, no twins, as many nominal episodes", shift=3.5),
+    TwoSamples("pooled AUC, no twins, mean over 3 conditions", conditions=3),
 )
 
 

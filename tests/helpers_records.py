@@ -6,6 +6,9 @@ from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.results.record import Metric, Record
 
+PAIRED = [n for n, info in METRICS.items() if info.cells == "paired" and n != "auc_before"]
+"""Metrics without a level of recorded cells with twins."""
+
 
 def make_record(
     detector="riqn", environment="hopper", anomaly="iid", *, values=None, status="ok", reason="",
@@ -17,7 +20,9 @@ def make_record(
     """
     plugin = plugin or ("trivial" if detector in ("clock", "persistence", "random") else detector)
     given = values or {}
-    numbers = {name: list(given.get(name, [0.5, 0.5])) for name in {**METRICS, **given}}
+    numbers = {
+        name: list(given.get(name, [0.5, 0.5])) for name in {**dict.fromkeys(PAIRED), **given}
+    }
     per_trajectory = {
         name: np.array([[v or 0.0 for v in column], [v is not None for v in column]], dtype=float)
         for name, column in numbers.items()

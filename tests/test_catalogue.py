@@ -34,6 +34,7 @@ def test_every_name_has_facts_and_every_null_is_a_metric():
 def test_the_names_of_a_level_are_those_of_its_metrics_their_nulls_and_the_threshold():
     own = ["early", "delay", "missed", "delay_censored", "found_within_20", "found_within_100"]
     expected = ["false_episodes", *(n for name in own for n in (name, f"{name}_null"))]
+    expected += ["events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null"]
     assert list(GUARANTEED) == expected
     assert {n for n in NAMES if n.endswith("_at_5pct")} == {
         f"{name}_at_5pct" for name in [*expected, "threshold", "sensor_named", "onset_error"]
@@ -72,9 +73,9 @@ def test_other_names_are_refused(name):
 
 
 def test_better_sides():
-    """Nulls, the placebo and thresholds describe a benchmark or a setting; the others rank rows."""
+    """Nulls and their like describe a benchmark or a setting; the others rank rows."""
     for name in NAMES:
-        beside = any(word in name for word in ("null", "placebo", "threshold"))
+        beside = any(word in name for word in ("null", "placebo", "threshold", "before"))
         assert bool(metric_info(name).better) != beside, name
     found = [n for n in NAMES if n.startswith("found") and "null" not in n]
     for name in ("auc", RANKING, "sensor_named_at_5pct", *found):
@@ -83,9 +84,23 @@ def test_better_sides():
         assert metric_info(name).better == "lower"
 
 
+def test_metrics_without_twins_and_those_on_request():
+    facts = {name: metric_info(name) for name in NAMES}
+    assert {n for n in facts if facts[n].request} == {"f1_rows", "far_rows", "mar_rows", "vus_pr"}
+    assert {n.partition("_at_")[0] for n in facts if facts[n].cells == "unpaired"} == {
+        "auc_pool", "auc_pool_null", "auc_rows", "auc_outcome", "f1_rows", "far_rows", "mar_rows",
+        "vus_pr", "events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null",
+    }  # fmt: skip
+    for name, info in facts.items():
+        assert not info.null or facts[info.null].cells in (info.cells, "")
+        assert "_null" not in name or f"{name.replace('_null', '')}" in facts
+
+
 def test_kinds_of_intervals():
     kinds = {name: metric_info(name).interval for name in NAMES}
     assert {n for n in NAMES if kinds[n] == "exact"} == {f"false_episodes_{s}" for s in LEVELS}
+    rates = {f"false_alarms_per_hour_{s}" for s in LEVELS}
+    assert {n for n in NAMES if kinds[n] == "count"} == rates
     assert {n for n in NAMES if not kinds[n]} == {f"threshold_{s}" for s in LEVELS}
     assert {n.partition("_at_")[0] for n in NAMES if kinds[n] == "mean"} == {
         "delay", "delay_null", "delay_censored", "delay_censored_null", "onset_error",

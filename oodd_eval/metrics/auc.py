@@ -35,6 +35,9 @@ class Contribution:
         Float64 arrays of shape (n,), both 0 for a trajectory in which the metric is undefined.
     median
         Whether the value is the median of the numerators; then denominators are 1 or 0.
+    nominal
+        Of test data without twins, how many of the first terms are of nominal test episodes; the
+        others are of anomalous ones. None where terms are of anomalous episodes and their twins.
 
     Examples
     --------
@@ -46,6 +49,7 @@ class Contribution:
     numerator: Floats
     denominator: Floats
     median: bool = False
+    nominal: int | None = None
 
     @cached_property
     def value(self) -> float:
@@ -244,6 +248,31 @@ def auc_contributions(
     return {name: mean_of([function(p) for p in pairs]) for name, function in AUCS.items()}
 
 
+def auc_before(
+    anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int]
+) -> Contribution:
+    """Return the AUC of rows before the onset against the twin's, one half where twins are such.
+
+    Parameters
+    ----------
+    anomalous, twins
+        Scores of the n anomalous trajectories and of their nominal twins.
+    onsets
+        For each, the first row in which the anomaly is in force.
+
+    Returns
+    -------
+    Contribution
+        Undefined where the anomaly is in force from the first row on.
+    """
+    return mean_of(
+        [
+            auc_same_times(a, b, 0, int(onset))
+            for a, b, onset in zip(anomalous, twins, onsets, strict=True)
+        ]
+    )
+
+
 def alarm_contributions(
     anomalous: Sequence[Floats], twins: Sequence[Floats], onsets: Sequence[int], rule: AlarmRule
 ) -> dict[str, Contribution]:
@@ -287,7 +316,7 @@ def cell_contributions(
     """
     contributions = auc_contributions(anomalous, twins, onsets, effects, rule.standardization)
     contributions |= alarm_contributions(anomalous, twins, onsets, rule)
-    return {name: contributions[name] for name in METRICS}
+    return {name: contributions[name] for name in METRICS if name in contributions}
 
 
 def _rate(pairs: Sequence[tuple[NDArray[np.bool_], Floats]]) -> Contribution:

@@ -5,6 +5,9 @@ detectors of an environment use the same one, so that differences between them a
 taken in a fixed order, without a matrix library, so that an interval does not depend on what is
 computed beside it.
 
+Without twins, nominal and anomalous episodes are drawn apart: nominal ones with weights that all
+cells of an environment share, anomalous ones with those of the environment and the condition.
+
 Percentiles of the resamples are corrected for bias, skewness and few trajectories, see `bounds`.
 Shares that no trajectory contradicts (all 0 or all 1), for which resamples say nothing, and the
 share of nominal episodes with an alarm have exact binomial intervals (`metrics.binomial`).
@@ -14,8 +17,8 @@ import functools
 import itertools
 import math
 import zlib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Final, NamedTuple
 
@@ -45,6 +48,8 @@ def bootstrap_weights(
 
     The same seed and key, such as an environment, give the same weights, and so the same intervals.
     """
+    if not n:
+        return np.zeros((resamples, 0))
     rng = np.random.default_rng([seed, zlib.crc32(key.encode()), n])
     # In this order sums over trajectories take half as long.
     return rng.multinomial(n, np.full(n, 1 / n), size=resamples).astype(np.float64, order="F")
@@ -58,6 +63,14 @@ def shared_weights(environment: str, n: int) -> Weights:
     return weights
 
 
+@functools.lru_cache(maxsize=16)
+def _anomalous_weights(environment: str, condition: str, n: int) -> Weights:
+    """Return the weights of a condition's n episodes without twins."""
+    weights = bootstrap_weights(n, key=f"{environment}/{condition}")
+    weights.setflags(write=False)
+    return weights
+
+
 def resampled(contribution: Contribution, weights: Weights) -> Samples:
     """Return a metric in every resample; NaN where its denominator is 0."""
     if contribution.median:
@@ -66,9 +79,28 @@ def resampled(contribution: Contribution, weights: Weights) -> Samples:
     return numerator / _total(contribution.denominator, weights)
 
 
-def cell_samples(environment: str, contribution: Contribution) -> Samples:
-    """Return the resamples of one cell, with the weights that its environment shares."""
-    return resampled(contribution, shared_weights(environment, len(contribution.numerator)))
+def cell_samples(environment: str, contribution: Contribution, condition: str = "") -> Samples:
+    """Return the resamples of one cell, with the weights that its environment shares.
+
+    The condition decides how anomalous episodes without twins are drawn.
+    """
+    n, m = len(contribution.numerator), contribution.nominal
+    if m is None:
+        return resampled(contribution, shared_weights(environment, n))
+    numerator, denominator = (
+        _drawn(terms[:m], shared_weights(environment, m))
+        + _drawn(terms[m:], _anomalous_weights(environment, condition, n - m))
+        for terms in (contribution.numerator, contribution.denominator)
+    )
+    return np.divide(numerator, np.where(denominator > 0, denominator, np.nan))
+
+
+def _drawn(terms: Floats, weights: Weights) -> Samples:
+    """Return a sum of terms in every resample; those of none, or all 0, need no weights."""
+    if not terms.any():
+        return np.zeros(len(weights))
+    drawn: Samples = np.einsum("rn,n->r", weights, terms)
+    return drawn
 
 
 def _total(denominator: Floats, weights: Weights) -> Samples:
@@ -109,6 +141,10 @@ class DrawnCells:
         Terms of shape (cells, n), see `Contribution`.
     median
         Whether values are medians; then denominators are 1 or 0.
+    nominal
+        Number of nominal test episodes that terms begin with; None where episodes have twins.
+    condition
+        That of all of these cells, where episodes have no twins.
     """
 
     environment: str
@@ -116,6 +152,8 @@ class DrawnCells:
     numerators: Floats
     denominators: Floats
     median: bool = False
+    nominal: int | None = None
+    condition: str = ""
 
     @functools.cached_property
     def values(self) -> list[float]:
@@ -131,15 +169,40 @@ class DrawnCells:
 
     @property
     def sizes(self) -> list[int]:
-        """The number of trajectories that contribute to each cell."""
-        sizes: list[int] = np.count_nonzero(self.denominators, axis=1).tolist()
+        """The number of trajectories that contribute to each cell, of the smaller of two samples.
+
+        A sample of which no cell has a term is none.
+        """
+        samples = [np.count_nonzero(s, axis=1) for s in self._samples if s.any()]
+        sizes: list[int] = np.min(samples or [np.zeros(len(self.seeds), int)], axis=0).tolist()
         return sizes
+
+    @property
+    def _samples(self) -> list[Floats]:
+        """Denominators of each sample."""
+        if self.nominal is None:
+            return [self.denominators]
+        return [self.denominators[:, : self.nominal], self.denominators[:, self.nominal :]]
+
+    @property
+    def compared(self) -> bool:
+        """Whether the metric is of nominal and of anomalous episodes."""
+        return len(self._samples) > 1 and all(s.any() for s in self._samples)
+
+    @property
+    def sample(self) -> tuple[str, str]:
+        """Name of the sample whose sizes count: cells of one name have the same episodes.
+
+        Nominal episodes are the same under all conditions.
+        """
+        anomalous = self.nominal is not None and self._samples[1].any()
+        return self.environment, self.condition if anomalous else ""
 
     def only(self, cells: Sequence[int]) -> "DrawnCells":
         """Return the cells at some indices."""
         seeds = [self.seeds[i] for i in cells]
         terms = self.numerators[list(cells)], self.denominators[list(cells)]
-        return DrawnCells(self.environment, seeds, *terms, self.median)
+        return replace(self, seeds=seeds, numerators=terms[0], denominators=terms[1])
 
     @functools.cached_property
     def sums(self) -> list[CellSum]:
@@ -155,16 +218,21 @@ class DrawnCells:
         added = np.array([self.numerators[cells].sum(axis=0) for cells in groups.values()])
         sums = []
         for numerator, cells in zip(added, groups.values(), strict=True):
-            terms = Contribution(numerator, self.denominators[cells[0]], self.median)
-            samples = cell_samples(self.environment, terms)
+            terms = Contribution(
+                numerator, self.denominators[cells[0]], self.median, nominal=self.nominal
+            )
+            samples = cell_samples(self.environment, terms, self.condition)
             sums.append(CellSum(self.seeds[cells[0]], samples, len(cells)))
         return sums
 
 
-def drawn_cell(environment: str, seed: int, contribution: Contribution) -> DrawnCells:
-    """Return one cell of a detector seed."""
+def drawn_cell(
+    environment: str, seed: int, contribution: Contribution, condition: str = ""
+) -> DrawnCells:
+    """Return one cell of a detector seed; the condition matters where episodes have no twins."""
     terms = contribution.numerator[None], contribution.denominator[None]
-    return DrawnCells(environment, [seed], *terms, median=contribution.median)
+    median, nominal = contribution.median, contribution.nominal
+    return DrawnCells(environment, [seed], *terms, median, nominal, condition)
 
 
 def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[float, float]:
@@ -173,15 +241,19 @@ def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[f
     Kind ``"mean"``: see `bounds`. ``"share"``: the same, but where all trajectories are at one end
     of [0, 1], the exact interval for that many trajectories. ``"exact"``: a share of nominal
     twins, which are the same for all anomalies of an environment, with its exact interval.
+    ``"count"``: a number of events over a time; where there are none, Poisson's exact interval.
 
     The exact interval of a share that is 0 everywhere holds for any independent trajectories of
     several environments with values in [0, 1]: with means p_i the chance of none is at most the
     product of 1 - p_i, which is at most (1 - p) ** n with p their mean.
+
+    Where nominal and anomalous episodes are two samples the smaller one counts, and the terms of an
+    AUC may leave its range in a resample, so that the ends of a share are clipped to [0, 1].
     """
-    sizes: dict[str, int] = {}
+    sizes: dict[tuple[str, str], int] = {}
     for c in cells:
         for n in filter(None, c.sizes):
-            sizes[c.environment] = min(sizes.get(c.environment, n), n)
+            sizes[c.sample] = min(sizes.get(c.sample, n), n)
     if not sizes:
         return math.nan, math.nan
     value = mean_over_cells(pair for c in cells for pair in zip(c.seeds, c.values, strict=True))
@@ -189,10 +261,30 @@ def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[f
         low, high = _exact(cells)
         # The mean over cells and the share of all twins differ where environments do in size.
         return min(low, value), max(high, value)
-    total = sum(sizes.values())
+    if kind == "count" and not value:
+        return 0.0, _most_events(cells)
     if kind == "share" and value in (0.0, 1.0):
+        total = _trials(cells, sizes)
         return clopper_pearson(value * total, total, LEVEL)
-    return bounds(sample_cells(cells), value, list(sizes.values()))
+    low, high = bounds(sample_cells(cells), value, list(sizes.values()))
+    if kind == "share" and any(c.nominal is not None for c in cells):
+        return max(low, 0.0), min(high, 1.0)
+    return low, high
+
+
+def _trials(cells: Sequence[DrawnCells], sizes: Mapping[tuple[str, str], int]) -> int:
+    """Return the number of independent trajectories behind some cells.
+
+    Where all conditions of an environment are compared with the same nominal episodes, there are no
+    more than of these.
+    """
+    totals: dict[str, int] = {}
+    for (environment, _), n in sizes.items():
+        totals[environment] = totals.get(environment, 0) + n
+    for c in cells:
+        if c.nominal is not None and c.compared and c.environment in totals:
+            totals[c.environment] = min(totals[c.environment], c.nominal)
+    return sum(totals.values())
 
 
 def bounds(values: Samples, value: float, sizes: Sequence[int]) -> tuple[float, float]:
@@ -254,6 +346,16 @@ def _quantile(sizes: tuple[int, ...]) -> float:
         return _NORMAL.inv_cdf((1 + LEVEL) / 2)
     freedom = sum(n - 1 for n in several)
     return t_quantile((1 + LEVEL) / 2, freedom) * math.sqrt(sum(several) / freedom)
+
+
+def _most_events(cells: Sequence[DrawnCells]) -> float:
+    """Return the upper end of a mean rate over environments, none of which had an event."""
+    times: dict[str, float] = {}
+    for c in cells:
+        for time in filter(None, c.denominators.sum(axis=1).tolist()):
+            times[c.environment] = min(times.get(c.environment, time), time)
+    # With rates r over times t the chance of no event is exp(-sum(r t)).
+    return -math.log((1 - LEVEL) / 2) / (len(times) * min(times.values()))
 
 
 def _exact(cells: Sequence[DrawnCells]) -> tuple[float, float]:

@@ -17,7 +17,8 @@ from oodd_eval.names import check_known
 
 Unit = Literal["percent", "steps", "rate"]
 Better = Literal["higher", "lower", ""]
-IntervalKind = Literal["mean", "share", "exact", ""]
+IntervalKind = Literal["mean", "share", "exact", "count", ""]
+Cells = Literal["paired", "unpaired", ""]
 
 RANKING: Final = "auc_matched"
 """The metric that boards rank by."""
@@ -59,6 +60,10 @@ class MetricInfo:
         The level of guaranteed alarms, such as ``"5 %"``.
     median
         Whether a cell's value is the median over trajectories and not their mean.
+    cells
+        The cells that have the metric: those with twins (``"paired"``), those without, or both.
+    request
+        Whether it is computed only when asked for. Such a metric never ranks.
     """
 
     name: str
@@ -71,14 +76,18 @@ class MetricInfo:
     null: str = ""
     level: str = ""
     median: bool = False
+    cells: Cells = ""
+    request: bool = False
 
     def text(self, value: float) -> str:
-        """Return a value as printed: percent and steps with one decimal, rates with three."""
+        """Return a value as printed: rates below 10 with three decimals, all else with one."""
         if math.isnan(value):
             return UNDEFINED
         if self.unit == "percent":
             return f"{100 * value:.1f}"
-        return f"{value:.1f}" if self.unit == "steps" else f"{value:.3f}"
+        if self.unit == "steps" or value >= 10:
+            return f"{value:.1f}"
+        return f"{value:.3f}"
 
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Floats, auc_same_times, first_delay
 from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Alarms, cusum
+from oodd_eval.metrics.unpaired import LEAST_NOMINAL, UnpairedScores, anomalous_rows
 
 FPR: Final = tuple((i / 24) ** 2 for i in range(25))
 """False-positive rates at which ROC curves are given, denser towards 0."""
@@ -84,6 +86,7 @@ class Sweep:
     """One fitted detector's alarms on the nominal twins under several thresholds, ascending.
 
     They are the same for all anomalies, and most of the work; `quiet` has them by rule and twin.
+    Without twins they are those on nominal test episodes.
     """
 
     rules: list[AlarmRule]
@@ -98,29 +101,24 @@ class Sweep:
 
 
 def delay_far(
-    sweep: Sweep, anomalous: Sequence[Floats], onsets: Sequence[int]
+    sweep: Sweep, anomalous: Sequence[Floats], onsets: Sequence[int], *, paired: bool = True
 ) -> dict[str, list[float]]:
     """Return delay, misses and false-alarm rate of a cell at the thresholds of a sweep.
 
-    ``far`` is that over whole twins, and ``null_censored`` the censored delay of the twins at their
-    partners' onsets: what false alarms alone give. All are empty when the twins have no score.
+    ``far`` is that over whole twins, and ``null_censored``, if `paired`, the censored delay of the
+    twins at their partners' onsets: what false alarms alone give. All are empty when the twins have
+    no score, or nothing is anomalous.
     """
-    names = ("threshold", "far", "delay_censored", "missed", "null_censored")
+    names = ("threshold", "far", "delay_censored", "missed", *["null_censored"] * paired)
     rows = []
     steps = sum(int(np.count_nonzero(~np.isnan(b))) for b in sweep.twins)
-    for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if steps else ():
+    known = steps and len(anomalous)
+    for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if known else ():
         loud = [rule.alarms(a) for a in anomalous]
         missed = [math.isnan(first_delay(x, t)) for x, t in zip(loud, onsets, strict=True)]
         far = sum(int(alarms.sum()) for alarms in quiet) / steps
-        rows.append(
-            (
-                rule.threshold,
-                far,
-                _censored(loud, onsets),
-                sum(missed) / len(missed),
-                _censored(quiet, onsets),
-            )
-        )
+        row = [rule.threshold, far, _censored(loud, onsets), sum(missed) / len(missed)]
+        rows.append([*row, _censored(quiet, onsets)] if paired else row)
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
@@ -147,26 +145,36 @@ def example(
         auc_same_times(a, b, effect, min(len(a), len(b)))
         for a, b, effect in zip(anomalous, twins, effects, strict=True)
     ]
-    ranked = sorted((area, i) for i, area in enumerate(areas) if not math.isnan(area))
-    area, index = ranked[(len(ranked) - 1) // 2] if ranked else (math.nan, 0)
+    area, index = _median(areas)
     onset = int(onsets[index])
     start = max(0, onset - BEFORE)
-    matched = None if math.isnan(area) else area
-    content: dict[str, Any] = {
+    rows = slice(start, onset + AFTER)
+    return {
         "index": index,
-        "auc_matched": matched,
+        "auc_matched": area,
         "onset": onset,
         "length": len(anomalous[index]),
         "start": start,
+        **_drawn(anomalous[index], rule, rows, ("scores", "cusum", "alarms")),
+        **_drawn(twins[index], rule, rows, ("twin", "twin_cusum", "twin_alarms")),
     }
-    for prefix, scores, name in (("", anomalous[index], "scores"), ("twin_", twins[index], "twin")):
-        x = rule.standardization(scores)
-        statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
-        rows = slice(start, onset + AFTER)
-        content[name] = [None if math.isnan(v) else v for v in (x[rows] / UNIT).tolist()]
-        content[f"{prefix}cusum"] = statistic[rows].tolist()
-        content[f"{prefix}alarms"] = (start + np.flatnonzero(alarms[rows])).tolist()
-    return content
+
+
+def _median(areas: Sequence[float]) -> tuple[float | None, int]:
+    """Return the lower median of the areas that are defined, and the first index that has it."""
+    ranked = sorted((area, i) for i, area in enumerate(areas) if not math.isnan(area))
+    return ranked[(len(ranked) - 1) // 2] if ranked else (None, 0)
+
+
+def _drawn(
+    scores: Floats, rule: AlarmRule, rows: slice, names: tuple[str, str, str]
+) -> dict[str, Any]:
+    """Return scores, statistics and rows with an alarm of a part of an episode."""
+    x = rule.standardization(scores)
+    statistic, alarms = cusum(x, drift=rule.drift, threshold=rule.threshold)
+    standardized = [None if math.isnan(v) else v for v in (x[rows] / UNIT).tolist()]
+    at = (rows.start + np.flatnonzero(alarms[rows])).tolist()
+    return dict(zip(names, (standardized, statistic[rows].tolist(), at), strict=True))
 
 
 def cell_curves(
@@ -177,16 +185,116 @@ def cell_curves(
     effects: Sequence[int],
 ) -> dict[str, Any]:
     """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
-    tpr = mean_matched_roc(anomalous, sweep.twins, effects)
-    defined = not np.isnan(tpr).any()
-    curves: dict[str, Any] = rounded(
-        {
-            "roc": {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []},
-            "delay_far": delay_far(sweep, anomalous, onsets),
-            "example": example(anomalous, sweep.twins, onsets, effects, rule),
-        }
+    return _curves(
+        mean_matched_roc(anomalous, sweep.twins, effects),
+        delay_far(sweep, anomalous, onsets),
+        example(anomalous, sweep.twins, onsets, effects, rule),
     )
+
+
+def _curves(tpr: Floats, delays: dict[str, list[float]], drawn: dict[str, Any]) -> dict[str, Any]:
+    defined = not np.isnan(tpr).any()
+    roc_curve = {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []}
+    curves: dict[str, Any]
+    curves = rounded({"roc": roc_curve, "delay_far": delays, "example": drawn})
     return curves
+
+
+LONGEST: Final = 600  # most rows of an example without twins
+
+
+def unpaired_curves(cell: UnpairedScores, sweep: Sweep, rule: AlarmRule) -> dict[str, Any]:
+    """Return the three curves of a cell without twins, rounded for drawing.
+
+    Parameters
+    ----------
+    cell
+        The scores, of at least one anomalous episode.
+    sweep
+        Alarms on the nominal test episodes.
+    rule
+        That of the example.
+
+    Returns
+    -------
+    dict
+        ``roc`` is the curve of ``auc_pool``, ``delay_far`` that of delays from the first interval
+        on, and ``example`` the episode with the median pooled AUC.
+    """
+    areas, curve = pooled_roc(cell)
+    starts = {i: cell.intervals[i][0][0] for i in cell.labelled}
+    known = {i: start for i, start in starts.items() if 0 <= start < len(cell.anomalous[i])}
+    episodes = [cell.anomalous[i] for i in known]
+    delays = delay_far(sweep, episodes, [*known.values()], paired=False)
+    return _curves(curve, delays, _unpaired_example(cell, areas, rule))
+
+
+def pooled_roc(
+    cell: UnpairedScores, fpr: Floats | Sequence[float] = FPR
+) -> tuple[list[float], Floats]:
+    """Return the pooled AUC of each anomalous episode, and the mean of their ROC curves.
+
+    A row is found at the false-positive rates from the share of nominal scores above it on: those
+    of the same row in the task's nominal test episodes, or without a clock all of them. Ties are
+    diagonal lines. NaN where no row can be compared.
+    """
+    grid = np.asarray(fpr, dtype=np.float64)
+    areas = [math.nan] * len(cell.anomalous)
+    curves = []
+    for nominal, anomalous in cell.by_task():
+        references = [cell.nominal[j] for j in nominal]
+        for i in anomalous:
+            scores = cell.anomalous[i]
+            rows = anomalous_rows(cell.intervals[i], len(scores)) & ~np.isnan(scores)
+            above, ties = _shares_above(scores, rows, references, clock=cell.clock)
+            if above.size:
+                areas[i] = float(np.mean(1 - above - ties / 2))
+                width = np.where(ties > 0, ties, 1.0)[:, None]
+                ramp = np.clip((grid - above[:, None]) / width, 0.0, 1.0)
+                step = grid >= above[:, None]
+                curves.append(np.where(ties[:, None] > 0, ramp, step).mean(axis=0))
+    return areas, np.mean(curves, axis=0) if curves else np.full(len(grid), np.nan)
+
+
+def _shares_above(
+    scores: Floats, rows: NDArray[np.bool_], references: Sequence[Floats], *, clock: bool
+) -> tuple[Floats, Floats]:
+    """Return for rows of an episode the shares of nominal scores above them, and equal to them."""
+    if not clock:
+        ordered = np.sort(np.concatenate([r[~np.isnan(r)] for r in references]))
+        n = max(len(ordered), 1)
+        values = scores[rows] if len(ordered) else np.zeros(0)
+        low, high = (np.searchsorted(ordered, values, side=s) for s in ("left", "right"))
+        return 1 - high / n, (high - low) / n
+    table = np.full((len(references), len(scores)), np.nan)
+    for line, reference in zip(table, references, strict=True):
+        line[: len(reference)] = reference[: len(scores)]
+    counts = (~np.isnan(table)).sum(axis=0)
+    chosen = rows & (counts >= LEAST_NOMINAL)
+    table, counts = table[:, chosen], counts[chosen]
+    return (
+        (table > scores[chosen]).sum(axis=0) / counts,
+        (table == scores[chosen]).sum(axis=0) / counts,
+    )
+
+
+def _unpaired_example(
+    cell: UnpairedScores, areas: Sequence[float], rule: AlarmRule
+) -> dict[str, Any]:
+    """Return the episode with the median pooled AUC of a cell, around its first interval."""
+    area, index = _median(areas)
+    scores, intervals = cell.anomalous[index], cell.intervals[index]
+    first, stop = intervals[0] if intervals else (0, len(scores))
+    start = max(0, first - BEFORE)
+    rows = slice(start, min(max(stop + BEFORE, first + AFTER), start + LONGEST))
+    return {
+        "index": index,
+        "auc_pool": area,
+        "intervals": [list(interval) for interval in intervals],
+        "length": len(scores),
+        "start": start,
+        **_drawn(scores, rule, rows, ("scores", "cusum", "alarms")),
+    }
 
 
 def rounded(value: Any) -> Any:

@@ -152,8 +152,11 @@ def rank(
     expected = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * 2 * pairs)
     count = min(expected, max(MOST_RESAMPLES, resamples or 0))
     means = {name: _mean(rows[name]) for name in names}
+    used = _used(rows)
     bootstrap = _PairBootstrap(
-        {name: _influences(name, rows[name]) for name in names}, count, extended=expected > count
+        {name: _influences(name, rows[name], used) for name in names},
+        count,
+        extended=expected > count,
     )
 
     def tests(name: str, others: Sequence[str]) -> list[PairTest]:
@@ -181,8 +184,8 @@ def rank(
 class _Influences(NamedTuple):
     """Shifts of a row's mean by each test seed and each detector seed, centred on 0.
 
-    `of_tests` is by environment, `of_detectors` is empty where there is one detector seed; `key`
-    names the draws of these.
+    `of_tests` is by sample, see `_samples`; `of_detectors` is empty where there is one detector
+    seed, and `key` names the draws of these.
     """
 
     of_tests: Mapping[str, Floats]
@@ -212,7 +215,7 @@ class _PairBootstrap:
         self._index = {name: i for i, name in enumerate(rows)}
         self._rows = list(rows.values())
         shared = self._rows[0].of_tests if rows else {}
-        self._sizes = {environment: z.size for environment, z in shared.items()}
+        self._sizes = {sample: z.size for sample, z in shared.items()}
         ends = itertools.accumulate(self._sizes.values(), initial=0)
         self._columns = [slice(*both) for both in itertools.pairwise(ends)]
         self._n = np.repeat([*self._sizes.values()], [*self._sizes.values()])
@@ -395,12 +398,14 @@ def _check_shape(rows: Mapping[str, Row]) -> None:
                     "only rows with all cells are ranked"
                 )
             for cell, contribution in cells.items():
-                label, n = "/".join(cell), len(contribution.numerator)
-                if n != (size := sizes.setdefault(cell[0], n)):
-                    raise ResultsError(
-                        f"{name} has {n} test trajectories in {label}, expected {size}: rows of "
-                        "one table are of the same split and limit"
-                    )
+                label = "/".join(cell)
+                for sample, terms in _samples(cell, contribution).items():
+                    n = len(contribution.numerator[terms])
+                    if n != (size := sizes.setdefault(sample, n)):
+                        raise ResultsError(
+                            f"{name} has {n} test trajectories in {label}, expected {size}: rows "
+                            "of one table are of the same split and limit"
+                        )
                 if math.isnan(contribution.value):
                     raise ResultsError(f"{name} has no value in {label}, so it has no rank")
 
@@ -410,22 +415,53 @@ def _mean(row: Row) -> float:
     return float(np.mean([row[s][c].value for s in sorted(row) for c in sorted(row[s])]))
 
 
-def _influences(name: str, row: Row) -> _Influences:
-    """Return what every drawn seed adds to the row's mean, centred.
+def _samples(cell: Position, contribution: Contribution) -> dict[str, slice]:
+    """Return the terms of each sample of test trajectories by its name, for one cell.
+
+    Cells of one environment have one sample. Without twins nominal episodes are that sample, and
+    each condition has a sample of its own.
+    """
+    if contribution.nominal is None:
+        return {cell[0]: slice(None)}
+    return {cell[0]: slice(contribution.nominal), "/".join(cell): slice(contribution.nominal, None)}
+
+
+def _influences(name: str, row: Row, used: Collection[str]) -> _Influences:
+    """Return what every drawn seed adds to the row's mean, centred, by the samples that are used.
 
     A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
     """
     seeds, cells = sorted(row), sorted(row[min(row)])
-    of_tests = {}
-    for environment, members in itertools.groupby(cells, key=lambda cell: cell[0]):
-        parts = [_influence(row[seed][cell]) for cell in members for seed in seeds]
-        of_tests[environment] = np.sum(parts, axis=0) / (len(seeds) * len(cells))
+    parts: dict[str, list[Floats]] = {}
+    for cell in cells:
+        for seed in seeds:
+            influence = _influence(row[seed][cell])
+            for sample, terms in _samples(cell, row[seed][cell]).items():
+                part = influence[terms]
+                parts.setdefault(sample, []).append(part * (len(part) / len(influence)))
+    of_tests = {
+        sample: np.sum(parts[sample], axis=0) / (len(seeds) * len(cells))
+        for sample in parts
+        if sample in used
+    }
     of_detectors = np.zeros(0)
     if len(seeds) > 1:
         means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
         of_detectors = means - means.mean()
         of_detectors = np.where(np.abs(of_detectors) > NOISE, of_detectors, 0.0)
     return _Influences(of_tests, of_detectors, f"{DETECTOR_SEEDS} of {name}")
+
+
+def _used(rows: Mapping[str, Row]) -> set[str]:
+    """Return the samples that any row has a term of: alarms on nominal episodes have no others."""
+    used: set[str] = set()
+    for row in rows.values():
+        for cells in row.values():
+            for cell, contribution in cells.items():
+                for sample, terms in _samples(cell, contribution).items():
+                    if sample not in used and contribution.denominator[terms].any():
+                        used.add(sample)
+    return used
 
 
 def _influence(contribution: Contribution) -> Floats:

@@ -173,7 +173,7 @@ class ResultsDirectory:
                 if order is not None:
                     group.attrs["order"] = float(order)
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
-                columns = {"scores": np.concatenate(sequences)}
+                columns = {"scores": np.concatenate([np.zeros(0), *sequences])}
                 if explained is not None:
                     columns |= zip(EXPLAINED, np.concatenate(explained, axis=1), strict=True)
                 for name, data in columns.items():
@@ -248,7 +248,9 @@ def _stored_part(part: h5py.Group) -> _StoredPart:
     SCORES.check("scores", stored.dtype, stored.nbytes)
     if stored.ndim != 1:
         raise SCORES.error(f"scores have shape {stored.shape}, expected one column")
-    sequences = np.split(np.asarray(stored[:], np.float64), part["offsets"][1:-1])
+    offsets = part["offsets"][:]
+    # A part may have no trajectories.
+    sequences = np.split(np.asarray(stored[:], np.float64), offsets[1:-1])[: len(offsets) - 1]
     # Files of earlier versions have one order for all parts.
     order = part.attrs.get("order", part.file.attrs.get("order"))
     return _StoredPart(sequences, order, _explained(part))

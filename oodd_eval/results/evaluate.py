@@ -1,22 +1,31 @@
-"""From the scores of a cell to its metrics with intervals, and to its record."""
+"""From the scores of a cell to its metrics with intervals, and to its record.
 
+Cells without twins have metrics of their own, see `oodd_eval.metrics.unpaired`.
+"""
+
+import contextlib
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, lengths_of, parts_of
+from oodd_eval.data.condition import NOMINAL, Condition
+from oodd_eval.data.facts import LogFacts
+from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, Interval, lengths_of, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ResultsError
-from oodd_eval.metrics import alarms
-from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
-from oodd_eval.metrics.auc import AlarmRule, Contribution, cell_contributions
+from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.metrics import alarms, unpaired
+from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
+from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import HEADLINE, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell
@@ -29,19 +38,51 @@ class Rules:
 
     `paper` has the paper's drift and threshold. `guaranteed` are rules by suffix, such as
     ``"at_5pct"``, that raise an alarm in at most that share of nominal episodes; levels that need
-    more calibration episodes are left out.
+    more calibration episodes are left out. `statistic` is theirs, with a threshold that nothing
+    exceeds. With a rolling calibration they are those after all nominal test episodes, and
+    `earlier` are those of each of these.
     """
 
     paper: AlarmRule
     guaranteed: dict[str, GuaranteedAlarm]
+    statistic: GuaranteedAlarm
+    earlier: dict[str, list[GuaranteedAlarm]] = field(default_factory=dict)
 
     @classmethod
-    def fit(cls, calibration: Sequence[Scores], alarm: AlarmKind = "cusum") -> "Rules":
-        """Standardize and find thresholds on the scores of nominal trajectories."""
+    def fit(
+        cls,
+        calibration: Sequence[Scores],
+        alarm: AlarmKind = "cusum",
+        joining: Sequence[Scores] | None = None,
+    ) -> "Rules":
+        """Standardize and find thresholds on the scores of nominal trajectories.
+
+        `joining` are those of nominal test episodes that join a rolling calibration.
+        """
         levels = alarms.offered_levels(len(calibration), alarm)
-        rules = GuaranteedAlarm.fits(calibration, list(levels.values()), alarm)
+        known = Calibration.fit(calibration, alarm)
+        # A run goes on with a threshold that nothing exceeds, and counts what it misses.
+        guaranteed = {
+            suffix: GuaranteedAlarm(known.standardization, known.threshold(level))
+            for suffix, level in levels.items()
+        }
         paper = AlarmRule(Standardization.fit(calibration))
-        return cls(paper, dict(zip(levels, rules, strict=True)))
+        if joining is None:
+            return cls(paper, guaranteed, known.unbounded)
+        earlier: dict[str, list[GuaranteedAlarm]] = {}
+        for suffix, level in levels.items():
+            with contextlib.suppress(UsageError):  # too few for this level
+                earlier[suffix] = alarms.rolling_rules(known, joining, level)
+        last = {suffix: rules.pop() for suffix, rules in earlier.items()}
+        return cls(paper, last, known.unbounded, earlier)
+
+    def thresholds(self) -> dict[str, Metric]:
+        """Return the thresholds of all levels as metrics.
+
+        JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
+        """
+        values = {f"threshold_{s}": rule.threshold for s, rule in self.guaranteed.items()}
+        return {name: Metric(t if math.isfinite(t) else NAN) for name, t in values.items()}
 
 
 def cell_metrics(
@@ -57,31 +98,63 @@ def cell_metrics(
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
     """Compute all metrics of one cell with their intervals; attribution where it is explained."""
     contributions = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
-    thresholds = {}
     for suffix, rule in rules.guaranteed.items():
         of_level = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
         contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
-        # JSON has no infinity: a threshold that no statistic exceeds is written as undefined.
-        finite = math.isfinite(rule.threshold)
-        thresholds[f"threshold_{suffix}"] = Metric(rule.threshold if finite else NAN)
     if explained and (headline := rules.guaranteed.get(HEADLINE)):
         named = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
         contributions |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
     metrics = {name: metric_of(name, c, environment) for name, c in contributions.items()}
-    return metrics | thresholds, contributions
+    return metrics | rules.thresholds(), contributions
 
 
-def metric_of(name: str, contribution: Contribution, environment: str) -> Metric:
+def unpaired_metrics(
+    cell: UnpairedScores,
+    rules: Rules,
+    *,
+    environment: str,
+    condition: Condition,
+    rate: float | None = None,
+    rows: bool = False,
+) -> tuple[dict[str, Metric], dict[str, Contribution]]:
+    """Compute all metrics of one cell without twins, those of rows if asked for.
+
+    Under the condition `NOMINAL` there are nominal episodes alone, and metrics of false alarms.
+    """
+    contributions = {} if condition == NOMINAL else unpaired.separability(cell, rules.statistic)
+    if rows:
+        # The headline, or the nearest level that is offered.
+        usual = list(rules.guaranteed)[: [*LEVELS].index(HEADLINE) + 1][-1:]
+        contributions |= unpaired.row_metrics(cell, rules.guaranteed[usual[0]] if usual else None)
+    for suffix, rule in rules.guaranteed.items():
+        of_level = unpaired.unpaired_alarms(cell, rule, rate, rules.earlier.get(suffix, ()))
+        contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
+    metrics = {
+        name: metric_of(name, c, environment, str(condition)) for name, c in contributions.items()
+    }
+    return metrics | rules.thresholds(), contributions
+
+
+def metric_of(
+    name: str, contribution: Contribution, environment: str, condition: str = ""
+) -> Metric:
     """Return a metric of a cell with its interval, from its terms."""
-    cell = drawn_cell(environment, 0, contribution)
+    cell = drawn_cell(environment, 0, contribution, condition)
     ends = mean_interval([cell], kind=metric_info(name).interval)
     return Metric(contribution.value, *ends, n=contribution.n)
 
 
-def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentData) -> list[Record]:
+def evaluated(
+    records: Sequence[Record],
+    scores: ScoreFile,
+    data: EnvironmentData,
+    *,
+    row_metrics: bool = False,
+) -> list[Record]:
     """Return the records of a unit with metrics; ``invalid`` if scores cannot be standardized."""
     try:
-        rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm)
+        joining = scores.parts[TWINS] if records[0].rolling else None
+        rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm, joining)
     except OverflowError:
         reason = "scores are too large: their sum over the calibration trajectories overflows"
         return [replace(record, status="invalid", reason=reason) for record in records]
@@ -89,16 +162,41 @@ def evaluated(records: Sequence[Record], scores: ScoreFile, data: EnvironmentDat
         # Any score would be an alarm.
         reason = "no score of the calibration trajectories is defined, so there is no threshold"
         return [replace(record, status="invalid", reason=reason) for record in records]
-    return [_with_metrics(record, data, scores, rules) for record in records]
+    measure = _with_metrics if data.paired else partial(_without_twins, rows=row_metrics)
+    measured = (measure(record, data, scores, rules) for record in records)
+    few = _too_few_to_roll(len(scores.parts[CALIBRATION]), records[0], rules)
+    return [replace(r, note=few) if r.rolling else r for r in measured]
+
+
+def _too_few_to_roll(episodes: int, record: Record, rules: Rules) -> str:
+    """Return which levels a rolling calibration lacks; empty if none."""
+    offered = alarms.offered_levels(episodes, record.alarm) if record.rolling else {}
+    missing = [level for suffix, level in offered.items() if suffix not in rules.guaranteed]
+    return "; ".join(
+        f"guaranteed alarms at {100 * level:g} % are left out: a rolling calibration takes "
+        f"{alarms.least_rolling(level):g} episodes that the threshold is from"
+        for level in missing
+    )
+
+
+def counts_of(data: EnvironmentData, condition: Condition, limit: int | None) -> dict[str, int]:
+    """Return the numbers of trajectories that a cell uses, by part."""
+    twins = "test" if data.paired else "nominal"
+    parts = {"train": data.train, "calibration": data.calibration, twins: data.twins}
+    if not data.paired and condition != NOMINAL:
+        parts["test"] = data.labelled(condition)
+    counts = {name: len(part.lengths[:limit]) for name, part in parts.items()}
+    return counts if data.paired else {**counts, "test": counts.get("test", 0)}
 
 
 def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
     anomalous, known = scores.parts[record.condition.part], data.anomalous(record.condition)
+    twins = scores.parts[TWINS]
     starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
     explained = scores.explained.get(record.condition.part, [])
     metrics, contributions = cell_metrics(
         anomalous,
-        scores.parts[TWINS],
+        twins,
         starts,
         effects,
         rules,
@@ -106,24 +204,98 @@ def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rule
         explained=explained,
         corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
     )
-    per_trajectory = {
-        name: np.array([c.numerator, c.denominator]) for name, c in contributions.items()
-    }
-    return replace(record, metrics=metrics, per_trajectory=per_trajectory, brief=bool(known.brief))
+    note = ""
+    if data.logs is not None:
+        before = auc_before(anomalous, twins, starts)
+        contributions["auc_before"] = before
+        metrics["auc_before"] = metric_of("auc_before", before, record.environment)
+        if note := _distrusted(before.value):
+            for name in NEED_TWINS:
+                del metrics[name], contributions[name]
+    return replace(
+        record,
+        metrics=metrics,
+        per_trajectory=_terms(contributions),
+        brief=bool(known.brief),
+        note=note,
+    )
 
 
-def rescore(records: Sequence[Record], results: ResultsDirectory, split: Split) -> list[Record]:
+LIKE: Final = (0.4, 0.6)
+"""AUC before the onset, in the mean, up to which imported twins are taken for such."""
+
+NEED_TWINS: Final = ("auc_matched", "auc_unpaired", "auc_smoothed")
+"""Metrics that mean nothing where twins are none."""
+
+
+def _distrusted(before: float) -> str:
+    """Return why metrics that need twins are withheld; empty if they are not."""
+    if not before < LIKE[0] and not before > LIKE[1]:
+        return ""
+    return (
+        f"{', '.join(NEED_TWINS)} are withheld: the episodes differ from their twins before the "
+        f"onset already (auc_before {before:.3f}, expected {LIKE[0]:g} to {LIKE[1]:g}), so they "
+        "are no twins; import the episodes without twins"
+    )
+
+
+def unpaired_scores(
+    record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData
+) -> UnpairedScores:
+    """Return the scores of a cell without twins, with what is known of its episodes.
+
+    Parameters
+    ----------
+    record
+        Of the cell.
+    parts
+        Scores of its unit by part.
+    data
+        The environment.
+    """
+    nominal, facts = parts[TWINS], data.logs or LogFacts()
+    cell = UnpairedScores(nominal, [], [], data.twins.tasks[: len(nominal)], [], facts.clock)
+    if record.condition == NOMINAL:
+        return cell
+    anomalous, known = parts[record.condition.part], data.labelled(record.condition)
+    n = len(anomalous)
+    return replace(cell, anomalous=anomalous, intervals=known.intervals[:n], tasks=known.tasks[:n])
+
+
+def _without_twins(
+    record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules, *, rows: bool
+) -> Record:
+    metrics, contributions = unpaired_metrics(
+        unpaired_scores(record, scores.parts, data),
+        rules,
+        environment=record.environment,
+        condition=record.condition,
+        rate=data.logs.rate if data.logs else None,
+        rows=rows,
+    )
+    return replace(record, metrics=metrics, per_trajectory=_terms(contributions))
+
+
+def _terms(contributions: Mapping[str, Contribution]) -> dict[str, NDArray[np.float64]]:
+    return {name: np.array([c.numerator, c.denominator]) for name, c in contributions.items()}
+
+
+def rescore(
+    records: Sequence[Record], results: ResultsDirectory, split: Split, *, row_metrics: bool = False
+) -> list[Record]:
     """Recompute the metrics of records from the stored scores, without any detector."""
-    units: dict[tuple[str, str], list[Record]] = {}
+    units: dict[tuple[str, str, bool], list[Record]] = {}
     for record in records:
         must_be_of(split, record)
         if record.ok:
-            units.setdefault((record.environment, record.scores), []).append(record)
+            key = record.environment, record.scores, record.rolling
+            units.setdefault(key, []).append(record)
     fresh: dict[tuple[str, ...], Record] = {}
     with split.opened() as environment:
-        for (name, _), unit in units.items():
+        for (name, _, _), unit in units.items():
             data = environment(name)
-            again = evaluated(unit, stored_scores(unit, results, data), data)
+            kept = stored_scores(unit, results, data)
+            again = evaluated(unit, kept, data, row_metrics=row_metrics)
             fresh |= {record.identity: record for record in again}
     return [fresh.get(record.identity, record) for record in records]
 
@@ -158,34 +330,45 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredEpisode:
-    """An anomalous episode beside its nominal twin, with the scores of both.
+    """An anomalous episode with its scores, beside its nominal twin where there is one.
 
     Attributes
     ----------
     cell, index
         The cell, and the index of the episode among the cell's.
     scores, twin_scores
-        One for each observation, NaN where undefined.
+        One for each observation, NaN where undefined; None for a twin that there is not.
     trajectory, twin
         The episodes, of T + 1 observations each.
     onset, effect
         The row from which the anomaly is in force, and the first that differs from the twin's.
+        Without a twin both are the start of the first interval, None where that is not known.
     sensors
         Names of the sensors, in the order of columns.
     rule
-        The guaranteed alarm at 5 %; None where there are too few calibration episodes for it.
+        The guaranteed alarm at a `level`; None where there are too few calibration episodes for it.
+    intervals
+        Without a twin, the rows [start, stop) that are anomalous; a start of -1 is not known.
+    nominal
+        Without a twin, mean and spread of each sensor in nominal test episodes: shape (2, D).
+    level
+        The largest share of nominal episodes with an alarm: 0.05, or without twins 0.1 where that
+        is the strictest that is offered.
     """
 
     cell: Cell
     index: int
     scores: Floats
-    twin_scores: Floats
+    twin_scores: Floats | None
     trajectory: Trajectory
-    twin: Trajectory
-    onset: int
-    effect: int
+    twin: Trajectory | None
+    onset: int | None
+    effect: int | None
     sensors: tuple[str, ...]
     rule: GuaranteedAlarm | None
+    intervals: tuple[Interval, ...] = ()
+    nominal: Floats | None = None
+    level: float = LEVELS[HEADLINE]
 
     @property
     def alarm(self) -> int | None:
@@ -203,12 +386,13 @@ class ScoredEpisode:
         Returns
         -------
         float
-            Infinite without an alarm; NaN where that precedes the effect, or no row follows it.
+            Infinite without an alarm; NaN where that precedes the effect, or no row follows it,
+            and without a twin or a known start.
         """
         scores = self.twin_scores if of_twin else self.scores
-        first = self.rule.first(scores) if self.rule else None
-        if self.rule is None or len(scores) <= self.effect:
+        if self.rule is None or scores is None or self.effect is None or len(scores) <= self.effect:
             return math.nan
+        first = self.rule.first(scores)
         if first is None:
             return math.inf
         return first - self.effect if first >= self.effect else math.nan

@@ -9,13 +9,17 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import UsageError
 
 # A text value that needs quotes: it would be read as JSON, or holds what separates values.
 _QUOTED = re.compile(r"[\[\]{},=\"\s]|^$")
+
+
+ROLLING: Final = "rolling"
+"""Word by which the text of a setting tells that its calibration is a rolling one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,8 @@ class Setting:
     parameters
         The parameters that differ from their default, sorted by name; values are JSON texts, so
         that settings can be dictionary keys.
+    rolling
+        Whether nominal test episodes join the calibration of its alarms (`rolling_rules`).
 
     Examples
     --------
@@ -43,16 +49,22 @@ class Setting:
     detector: str
     horizon: int = 1
     parameters: tuple[tuple[str, str], ...] = ()
+    rolling: bool = False
 
     @classmethod
     def of(
-        cls, detector: str, horizon: int = 1, overrides: Mapping[str, Any] | None = None
+        cls,
+        detector: str,
+        horizon: int = 1,
+        overrides: Mapping[str, Any] | None = None,
+        *,
+        rolling: bool = False,
     ) -> "Setting":
         """Make a setting from a mapping of the parameters that are not at their default.
 
         Parameters
         ----------
-        detector, horizon
+        detector, horizon, rolling
             As those of the class.
         overrides
             Values by name.
@@ -63,7 +75,7 @@ class Setting:
         """
         items = sorted((overrides or {}).items())
         texts = ((k, json.dumps(value, sort_keys=True, default=str)) for k, value in items)
-        return cls(detector, horizon, tuple(texts))
+        return cls(detector, horizon, tuple(texts), rolling)
 
     @property
     def overrides_json(self) -> str:
@@ -78,7 +90,7 @@ class Setting:
     def __str__(self) -> str:
         """Return the detector's name with all that is not a default."""
         horizon = {"h": self.horizon} if self.horizon != 1 else {}
-        return _bracketed(self.detector, horizon | self.overrides)
+        return _bracketed(self.detector, horizon | self.overrides | self._calibration)
 
     @classmethod
     def parse(cls, text: str) -> "Setting":
@@ -91,11 +103,17 @@ class Setting:
         settings = _read_settings(match[2] or "") if match else None
         if match is None or settings is None:
             raise UsageError(f"{text!r} is no setting: expected DETECTOR[h=N,NAME=VALUE,...]")
-        return cls.of(match[1], settings.pop("h", 1), settings)
+        rolling = settings.pop(ROLLING, False) is True
+        return cls.of(match[1], settings.pop("h", 1), settings, rolling=rolling)
 
     def label(self, seed: int) -> str:
         """Return the right-hand side of a cell's text, such as ``riqn[h=1,seed=0]``."""
-        return _bracketed(self.detector, {"h": self.horizon, "seed": seed, **self.overrides})
+        settings = {"h": self.horizon, "seed": seed, **self.overrides, **self._calibration}
+        return _bracketed(self.detector, settings)
+
+    @property
+    def _calibration(self) -> dict[str, bool]:
+        return {ROLLING: True} if self.rolling else {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -111,10 +111,11 @@ class Record:
         Whether half of the cell's episodes are so short that fewer than 20 rows are left to detect
         anything in.
     counts
-        Numbers of trajectories used, by part.
+        Numbers of trajectories used, by part; ``nominal`` are nominal test episodes that are no
+        twins, ``test`` the anomalous ones.
     per_trajectory
         For each metric that is a ratio of sums, its numerators and denominators in test order:
-        shape (2, n).
+        shape (2, n). Without twins, nominal test episodes come first, then the anomalous ones.
     scores
         Key of the file with the scores.
     seconds_fit, seconds_score, steps_scored, peak_rss_mb
@@ -122,6 +123,12 @@ class Record:
         `steps_scored` observations. NaN or None where unknown.
     provenance
         Versions, machine, device and time: nothing that decides identity.
+    paired
+        Whether each anomalous episode has a nominal twin.
+    rolling
+        Whether nominal test episodes joined the calibration of its alarms, in recorded order.
+    note
+        What is missing among the metrics, and why; empty where nothing is.
     protocol, schema
         Versions of splits, metrics and defaults, and of this layout.
     """
@@ -158,6 +165,9 @@ class Record:
     steps_scored: int | None = None
     peak_rss_mb: Number = NAN
     provenance: dict[str, Any] = field(default_factory=dict)
+    paired: bool = True
+    rolling: bool = False
+    note: str = ""
     schema: int = SCHEMA
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
@@ -179,7 +189,7 @@ class Record:
     @property
     def setting(self) -> Setting:
         """The row of a board that the record belongs to."""
-        return Setting.of(self.detector, self.horizon, self.overrides)
+        return Setting.of(self.detector, self.horizon, self.overrides, rolling=self.rolling)
 
     @property
     def cell(self) -> Cell:
@@ -215,16 +225,17 @@ class Record:
     def to_json(self) -> str:
         """Return one line of JSON, keys in a fixed order, NaN as null.
 
-        Without a number of its strength the record has no ``magnitude``, as before there was one.
+        Without a number of its strength the record has no ``magnitude``, as before there was one;
+        ``paired``, ``rolling`` and ``note`` are left out where they say nothing.
         """
-        plain = {f.name: getattr(self, f.name) for f in fields(self)}
-        if self.magnitude is None:
-            del plain["magnitude"]
+        silent = {"magnitude": None, "paired": True, "rolling": False, "note": ""}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        plain = {n: v for n, v in values.items() if n not in silent or v != silent[n]}
         plain["metrics"] = {
             name: {"value": m.value, "low": m.low, "high": m.high, "n": m.n}
             for name, m in self.metrics.items()
         }
-        plain = _without_nan(plain | {"per_trajectory": {}})  # terms are finite, and many
+        plain = without_nan(plain | {"per_trajectory": {}})  # terms are finite, and many
         plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
         return json.dumps(plain, allow_nan=False)
 
@@ -329,14 +340,14 @@ def _other_schema(schema: object) -> str:
     )
 
 
-def _without_nan(value: Any) -> Any:
-    """Replace numbers that JSON does not know by None, at any depth."""
+def without_nan(value: Any) -> Any:
+    """Return a value for JSON: None in place of numbers that it does not know, at any depth."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(k): _without_nan(v) for k, v in value.items()}
+        return {str(k): without_nan(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(v) for v in value]
+        return [without_nan(v) for v in value]
     return value
 
 
