@@ -5,13 +5,14 @@ import inspect
 import re
 import shutil
 import tempfile
+import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import PromiseWarning, UsageError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import Offer, Plugins, check_detector_spec, discover
@@ -19,6 +20,7 @@ from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record
+from oodd_eval.scoring.doubts import doubts_after, doubts_before
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
@@ -40,8 +42,12 @@ def evaluate(
     output: str | Path | None = None,
     jobs: int | None = None,
     progress: bool = False,
+    row_metrics: bool = False,
+    rolling: bool = False,
 ) -> Results:
     """Evaluate detectors and return a record per cell, with the scores behind them.
+
+    What puts promises on false alarms in doubt is raised as a `PromiseWarning`.
 
     Parameters
     ----------
@@ -68,6 +74,12 @@ def evaluate(
         Installed detectors that are fitted at a time; by default one per core.
     progress
         Whether to show a bar on standard error.
+    row_metrics
+        Whether to compute figures of published tables, too, for splits without twins: ``f1_rows``,
+        ``far_rows``, ``mar_rows`` and ``vus_pr``.
+    rolling
+        Whether nominal test episodes join the calibration of alarms once they are judged, in
+        recorded order, for splits of logs without twins: see `oodd_eval.metrics.alarms`.
 
     Returns
     -------
@@ -82,6 +94,11 @@ def evaluate(
         For unknown names, and for what is no detector.
     ContractError
         When a detector in this process breaks the score contract.
+
+    Warns
+    -----
+    PromiseWarning
+        Of what puts promises on false alarms in doubt.
 
     Examples
     --------
@@ -112,14 +129,20 @@ def evaluate(
         seeds=[seed] if isinstance(seed, int) else list(seed),
         parameters=arguments,
         limit=limit,
+        rolling=rolling,
     )
     path = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)
     directory = ResultsDirectory(path)
     if output is None:
         weakref.finalize(directory, shutil.rmtree, path, ignore_errors=True)
     observers = [_Bar()] if progress else []
-    settings = RunSettings(jobs=jobs)
+    settings = RunSettings(jobs=jobs, row_metrics=row_metrics)
+    for name, finding in doubts_before(plan, opened):
+        if finding.subject != "episodes":  # the tables lack what these are too few for
+            warnings.warn(f"{name}: {finding}", PromiseWarning, stacklevel=2)
     outcome = run(plan, opened, plugins, settings, directory, observers)
+    for name, finding in doubts_after(plan, opened, directory):
+        warnings.warn(f"{name}: {finding}", PromiseWarning, stacklevel=2)
     return Results(outcome.records, directory, opened)
 
 

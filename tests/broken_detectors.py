@@ -24,8 +24,8 @@ class Good:
     Whole numbers, so that messages do not depend on the last digit of a computation.
     """
 
-    def __init__(self, *, seed=0, horizon=1, power=1.0):
-        self.seed, self.horizon, self.power = seed, horizon, power
+    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0):
+        self.seed, self.horizon, self.power, self.baseline = seed, horizon, power, baseline
         self.std_ = None
 
     def fit(self, nominal):
@@ -43,6 +43,8 @@ class Good:
         scores = np.full(len(x), np.nan)
         h = self.horizon
         scores[h:] = np.round(4 * self.power * np.abs(z[h:] - z[:-h]).mean(axis=1))
+        if self.baseline:
+            scores[self.baseline :] -= np.round(np.nanmean(scores[: self.baseline]))
         return scores
 
     def score_many(self, trajectories):
@@ -90,6 +92,7 @@ GOOD = DetectorSpec(
     deterministic=True,
     parameters=declared_by({"power": 1.0}),
     horizon_decides_fit=False,
+    adapts="baseline",
 )
 
 
@@ -225,7 +228,7 @@ for name, message, change in (
     ("OneShort", "80 scores for an episode, fitted with horizon 1", lambda _, s, x: s[1:]),
     ("SecretWarmUp", "nan at t = 1", undefined(0, 3)),
 ):
-    fails = {"horizon"} if name == "OneShort" else ()
+    fails = {"horizon", "baseline"} if name == "OneShort" else ()
     alters("score", change, "scores", name, message, also=fails)
 
 for check, name, message, change in (
@@ -436,6 +439,12 @@ class SavesNothing(Good):
 class LoadsElsewhere(Good):
     def load(self, directory):
         (directory / "elsewhere").read_bytes()
+
+
+@breaks("baseline", "scores with baseline=21 are those without it")
+class LearnsNothingFromIt(Good):
+    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0):
+        super().__init__(seed=seed, horizon=horizon, power=power)
 
 
 @breaks("shared-fit", "a fit of horizon 1, loaded for horizon 3, differs from a")

@@ -1,6 +1,7 @@
 """A watchdog beside a robot: its promise, its alarm, its memory, and what it keeps on disk."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,18 +88,67 @@ def test_fresh_nominal_episodes_stay_within_alpha():
         fresh = [walk(seed) for seed in range(20_000 + 30 * draw, 20_030 + 30 * draw)]
         scores = map(watchdog._handle.detector.score, fresh)
         alarms += [watchdog.rule.first(s) is not None for s in scores]
-        assert sum(map(watchdog._limits.faulty, fresh)) == 0
+        assert not any(map(watchdog._limits.faults, fresh))
     assert 0.03 < np.mean(alarms) < 0.15
 
 
-def test_an_episode_with_a_fault_counts_as_one_with_an_alarm():
-    stuck = walk(5)
-    observations = stuck.observations.copy()
+def out_of_range(seed, rows=10):
+    """A nominal episode with some rows that no sensor of the training shows."""
+    x = walk(seed)
+    observations = x.observations.copy()
+    observations[60 : 60 + rows, 1] = 400.0 + np.arange(rows)
+    return Trajectory(observations, x.actions)
+
+
+def stuck(seed):
+    x = walk(seed)
+    observations = x.observations.copy()
     observations[60:75, 0] = observations[60, 0]
-    faulty = [Trajectory(observations, stuck.actions)]
+    return Trajectory(observations, x.actions)
+
+
+@pytest.mark.parametrize(
+    ("episode", "fault"),
+    [(out_of_range(5), "y out of range in rows 63 to"), (stuck(5), "x frozen in rows")],
+)
+def test_one_calibration_episode_with_a_fault_is_named_and_not_a_threshold_without_end(
+    episode, fault
+):
     twenty = CALIBRATION[:19]
-    assert np.isfinite(Watchdog.fit("mewma", TRAIN, twenty, 0.05).rule.threshold)
-    assert np.isinf(Watchdog.fit("mewma", TRAIN, twenty[1:] + faulty, 0.05).rule.threshold)
+    Watchdog.fit("mewma", TRAIN, twenty, 0.05)
+    with pytest.raises(UsageError, match=rf"1 of 19 calibration episodes .*episode 18: {fault}"):
+        Watchdog.fit("mewma", TRAIN, [*twenty[1:], episode], 0.05, sensors=NAMES)
+
+
+def test_calibration_episodes_without_a_score_stay_below_every_threshold(tmp_path):
+    """JSON has no infinities: minus infinity is written, and read back with its sign."""
+    watchdog = Watchdog.fit("mewma", TRAIN, CALIBRATION, 0.05)
+    known = watchdog.calibration
+    watchdog.calibration = replace(known, largest=(-np.inf, np.inf, *known.largest[2:]))
+    watchdog.save(tmp_path / "kept")
+    again = Watchdog.load(tmp_path / "kept").calibration
+    assert again == watchdog.calibration
+    json.loads((tmp_path / "kept" / "watchdog.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_a_wider_range_leaves_rows_out_of_it_to_the_detector():
+    twenty = [*CALIBRATION[:18], out_of_range(5)]
+    watchdog = Watchdog.fit("mewma", TRAIN, twenty, 0.05, margin=np.inf)
+    assert np.isfinite(watchdog.calibration.largest).all()
+    assert watchdog.calibration.largest[-1] == watchdog.rule.threshold
+
+
+def test_a_fault_that_the_promise_can_bear_counts_as_an_alarm_and_is_said():
+    calibration = [*CALIBRATION[1:], out_of_range(5)]
+    watchdog = Watchdog.fit("mewma", TRAIN, calibration, 0.05, sensors=NAMES)
+    assert np.isinf(watchdog.calibration.largest[-1])
+    (note,) = [note for note in watchdog.notes if "faults of their sensors" in note]
+    assert "1 of 40" in note
+    assert "episode 39: y out of range in rows 63 to" in note
+    # The second largest of 40 is the largest of the others.
+    assert watchdog.rule.threshold == max(watchdog.calibration.largest[:-1])
+    silent = Watchdog.fit("mewma", TRAIN, CALIBRATION, 0.05)
+    assert not [note for note in silent.notes if "faults" in note]
 
 
 def test_a_push_is_an_alarm_from_then_on(watchdog):
@@ -180,6 +230,7 @@ def test_endless_operation_keeps_its_promise_within_the_interval(name, episodes,
         ({"confidence": 1.0}, "confidence=1.0: expected shares between 0 and 1"),
         ({"confidence": 0.0}, "confidence=0.0: expected shares between 0 and 1"),
         ({"confidence": 0.9, "hours": 1, "rate": 50}, "a confidence is of a share of episodes"),
+        ({"margin": -1.0}, "margin=-1.0, expected a share of a range"),
         ({"rate": 0}, "rate=0, expected observations in a second"),
         ({"alpha": 0}, "expected shares between 0 and 1"),
         ({"hours": 8}, "needs both"),
@@ -253,7 +304,16 @@ def test_an_instance_is_loaded_into_another(tmp_path):
         watchdog.save(tmp_path)
 
 
-@pytest.mark.parametrize("harm", ["threshold", "sensors", "made", "{"])
+@pytest.mark.parametrize("threshold", [float("inf"), float("nan")])
+def test_a_saved_threshold_that_nothing_exceeds_is_refused(watchdog, tmp_path, threshold):
+    watchdog.save(tmp_path / "kept")
+    file = tmp_path / "kept" / "watchdog.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"threshold": threshold}))
+    with pytest.raises(FittedStateError, match="which nothing exceeds"):
+        Watchdog.load(tmp_path / "kept")
+
+
+@pytest.mark.parametrize("harm", ["threshold", "sensors", "made", "calibration", "notes", "{"])
 def test_a_damaged_watchdog_is_refused(watchdog, tmp_path, harm):
     watchdog.save(tmp_path / "kept")
     file = tmp_path / "kept" / "watchdog.json"

@@ -2,10 +2,12 @@
 
 import json
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
 
 from oodd_eval.cli import (
     COUNT,
@@ -21,21 +23,26 @@ from oodd_eval.cli import (
     detector_options,
     expression_option,
     fit_options,
+    row_metrics_option,
     say,
     say_notes,
 )
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.files import write_text
-from oodd_eval.data.split import load_split, split_places
+from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
+from oodd_eval.metrics.promise import PromiseFinding
 from oodd_eval.names import expression
+from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render.text import print_prose
 from oodd_eval.results.report import Report
+from oodd_eval.scoring.doubts import doubts_after, doubts_before
 from oodd_eval.scoring.executors import LOCAL, RunSettings
-from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run as run_plan
 
 
@@ -72,7 +79,11 @@ class _Configurable(Command):
     "--sandbox", is_flag=True, help="run detectors without network, splits, results and home"
 )
 @click.option("--fresh", is_flag=True, help="fit again what the results directory has already")
+@click.option(
+    "--rolling", is_flag=True, help="judged nominal test episodes join the calibration, for logs"
+)
 @click.option("--intervals", is_flag=True, help="print 95 % intervals in the tables")
+@row_metrics_option
 @click.option("--config", type=FILE, help="TOML file with these options by their long names")
 @click.option("--output", default="oodd-results", type=DIRECTORY, help="results directory")
 def run(options: Options) -> int:
@@ -95,6 +106,7 @@ def run(options: Options) -> int:
         parameters=dict(options.param),
         device=options.device,
         limit=options.limit,
+        rolling=options.rolling,
     )
     plan = plan.matching(expression(options.expression))
     if not plan.cells:
@@ -119,15 +131,22 @@ def run(options: Options) -> int:
         stop_on_failure=options.stop,
         executor=options.executor,
         command=options.invocation,
+        row_metrics=options.row_metrics,
     )
     results = ResultsDirectory(options.output)
     reporter = TerminalReporter(
-        console, verbosity=options.verbosity, intervals=options.intervals, log=results.log_path
+        console,
+        verbosity=options.verbosity,
+        intervals=options.intervals,
+        log=results.log_path,
+        units=split.units,
     )
-    done = run_plan(plan, split, plugins, settings, results, observers=[reporter])
+    doubts = _Doubts(make_console(quiet=options.verbosity < 0), split)
+    done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
+    doubts.print(doubts_after(plan, split, results))
     say_notes(results.notes)
     if done.records:
-        report = Report(results.records(), intervals=options.intervals)
+        report = Report(results.records(), intervals=options.intervals, units=split.units)
         path = results.path / REPORT
         write_text(path, FORMATS["markdown"].render(report))
         if options.verbosity >= 0:
@@ -135,6 +154,24 @@ def run(options: Options) -> int:
     if done.interrupted:
         return 2
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
+
+
+class _Doubts:
+    """Prints what puts promises on false alarms in doubt before there is any alarm."""
+
+    def __init__(self, console: Console, split: Split) -> None:
+        self._console, self._split = console, split
+
+    @hookimpl
+    def oodd_run_started(self, plan: Plan) -> None:
+        """Print what no detector is needed to find out, but for what stands below the tables."""
+        doubts = doubts_before(plan, self._split)
+        self.print((name, doubt) for name, doubt in doubts if doubt.subject != "episodes")
+
+    def print(self, doubts: Iterable[tuple[str, PromiseFinding]]) -> None:
+        """Print a sentence on each environment and finding."""
+        for name, finding in doubts:
+            print_prose(f"{name}: {finding}", self._console, "yellow")
 
 
 def _options_of(file: str) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import AlarmKind
@@ -16,19 +17,22 @@ from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.explanations import ExplainingDetector
 
 Row = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorHandle:
     """A detector, with what it takes to make it again.
 
-    `alarm` is the statistic of its alarms, and `actions` tells whether it gets actions. `state` has
-    JSON values that `from_state` reads; its name is empty for an instance that was passed in.
+    `alarm` is the statistic of its alarms, `actions` tells whether it gets actions, and `adapts`
+    whether it learns from baseline rows by itself. `state` has JSON values that `from_state` reads;
+    its name is empty for an instance that was passed in.
     """
 
     detector: Detector
     alarm: AlarmKind
     actions: bool
+    adapts: bool
     state: Mapping[str, Any]
 
     @classmethod
@@ -39,28 +43,43 @@ class DetectorHandle:
         seed: int,
         horizon: int,
         parameters: Mapping[str, Any],
+        baseline: int = 0,
     ) -> Self:
-        """Make the detector of that name, or take an instance."""
+        """Make the detector of that name, or take an instance, for so many baseline rows."""
         if statistic not in {None, "cusum", "score"}:
             raise UsageError(f"statistic={statistic!r}, expected 'cusum' or 'score'")
-        kind, name, actions = cast("AlarmKind | None", statistic), "", True
+        kind, name, actions, adapts = cast("AlarmKind | None", statistic), "", True, False
         if isinstance(detector, str):
             offer = discover().offer(detector)
             offer.require()
             spec = offer.spec
+            adapts = spec.adapts == "baseline"
             detector = make_detector(
-                spec.factory, seed=seed, horizon=horizon, parameters=parameters
+                spec.factory,
+                seed=seed,
+                horizon=horizon,
+                parameters=parameters,
+                baseline=baseline if adapts else 0,
             )
             kind, name, actions = kind or spec.alarm, spec.name, spec.inputs != "observations"
         elif not isinstance(detector, Detector):
             expected = "a name or an object with the methods fit(nominal) and score(trajectory)"
             raise UsageError(f"detector is {type(detector).__name__}, expected {expected}")
-        state = {"name": name, "statistic": kind or "cusum", "seed": seed, "horizon": horizon}
-        return cls(detector, kind or "cusum", actions, {**state, "parameters": dict(parameters)})
+        state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
+        state |= {"seed": seed, "horizon": horizon}
+        state |= {"parameters": dict(parameters), "baseline": baseline}
+        return cls(detector, kind or "cusum", actions, adapts, state)
 
-    def visible(self, trajectory: Trajectory) -> Trajectory:
-        """Return an episode as the detector may see it."""
-        return trajectory if self.actions else trajectory.without_actions()
+    def visible(self, trajectory: Trajectory, base: Baseline | None = None) -> Trajectory:
+        """Return what the detector may see of an episode: all rows if it learns from the first."""
+        judged = trajectory if base is None or self.adapts else base.judged(trajectory)
+        return judged if self.actions else judged.without_actions()
+
+    def scores(self, trajectory: Trajectory, base: Baseline | None = None) -> Floats:
+        """Return the scores of a whole episode, undefined in its baseline rows."""
+        scores = np.asarray(self.detector.score(self.visible(trajectory, base)), np.float64)
+        rows = base.rows if base else 0
+        return undefined(scores[len(scores) - len(trajectory) + rows :], rows)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], detector: Detector | None) -> Self:
@@ -76,6 +95,7 @@ class DetectorHandle:
             int(state["seed"]),
             int(state["horizon"]),
             state["parameters"],
+            int(state["baseline"]),
         )
 
 

@@ -5,13 +5,15 @@ and in their place the detector is handed the last good reading.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
-from typing import Final
+from itertools import chain
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from oodd_eval.data.baseline import Baseline, Shift
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import FeatureScale
@@ -69,9 +71,19 @@ class StreamLimits:
     rest: Floats
 
     @classmethod
-    def fit(cls, nominal: Iterable[Trajectory]) -> "StreamLimits":
-        """Learn from nominal trajectories."""
+    def fit(
+        cls,
+        nominal: Iterable[Trajectory],
+        judged: Iterable[Trajectory] | None = None,
+        margin: float = MARGIN,
+    ) -> "StreamLimits":
+        """Learn from nominal trajectories; the range from what is judged of them, if that differs.
+
+        With baseline rows that is what is behind them, brought to training's. A reading may leave
+        the range by the share `margin` of it.
+        """
         episodes = list(nominal)
+        inside = episodes if judged is None else list(judged)
         scale = FeatureScale.fit(episodes)
         equal = [x.observations[1:] == x.observations[:-1] for x in episodes]
         longest = np.stack([_longest_runs(e) for e in equal])
@@ -83,11 +95,12 @@ class StreamLimits:
         still = np.where(constant, np.inf, np.max(runs, axis=0))
         repeated = max(map(_largest_count, whole))
         rest = np.concatenate([x.actions for x in episodes]).mean(axis=0, dtype=np.float64)
-        low = np.min([x.observations.min(axis=0) for x in episodes], axis=0).astype(np.float64)
-        high = np.max([x.observations.max(axis=0) for x in episodes], axis=0)
-        margin = np.where(high > low, MARGIN * (high - low), np.inf)
+        low = np.min([x.observations.min(axis=0) for x in inside], axis=0).astype(np.float64)
+        high = np.max([x.observations.max(axis=0) for x in inside], axis=0)
+        # A span of 0 is that of a constant, which has no range.
+        beyond = np.where(high > low, margin * np.where(high > low, high - low, 1.0), np.inf)
         return cls(
-            scale.mean, scale.std, low - margin, high + margin, still, np.array(repeated), rest
+            scale.mean, scale.std, low - beyond, high + beyond, still, np.array(repeated), rest
         )
 
     def arrays(self) -> Arrays:
@@ -106,11 +119,25 @@ class StreamLimits:
         rest = take(arrays, "rest", (None,))
         return cls(mean, std, low, high, still, take(arrays, "repeated", ()), rest)
 
-    def faulty(self, trajectory: Trajectory) -> bool:
-        """Tell whether an episode raises an alarm of the stream."""
-        stream = Stream(self)
-        rows = zip(trajectory.observations, [None, *trajectory.actions], strict=True)
-        return any(stream.take(*row) and stream.faults for row in rows)
+    def faults(
+        self, trajectory: Trajectory, baseline: Baseline | None = None
+    ) -> "dict[int | str, StreamFault]":
+        """Return what raises an alarm of the stream in an episode, by sensor."""
+        stream = Stream(self, baseline=baseline)
+        faults: dict[int | str, StreamFault] = {}
+        for t in stream.through(trajectory.observations, trajectory.actions):
+            for what, fault in stream.faults.items():
+                first = faults[what].first if what in faults else t
+                faults[what] = StreamFault(fault, first, t)
+        return faults
+
+
+class StreamFault(NamedTuple):
+    """A fault of a sensor in a recorded episode, and the rows in which it was above its limit."""
+
+    fault: str
+    first: int
+    last: int
 
 
 class Stream:
@@ -121,16 +148,19 @@ class Stream:
     faults
         What is beyond its limit: ``"missing"``, ``"frozen"``, ``"out of range"``, ``"repeated"``,
         ``"irregular"`` or ``"late"`` by the number of a sensor, `OBSERVATION` or `ACTION`.
+    shift
+        What brings this episode to training's, once its baseline rows were taken; None before, and
+        without any.
     suspects
         Rows since when a sensor does what it never did in nominal episodes, by its number: below
         the limit, but where it would be found if there is an alarm.
     """
 
-    def __init__(self, limits: StreamLimits, rate: float | None = None) -> None:
-        self.limits, self.rate = limits, rate
+    def __init__(
+        self, limits: StreamLimits, rate: float | None = None, baseline: Baseline | None = None
+    ) -> None:
+        self.limits, self.rate, self.baseline = limits, rate, baseline
         self._moving = np.isfinite(limits.still)
-        self._low = np.maximum(limits.low, limits.mean - FAR * limits.std)
-        self._high = np.minimum(limits.high, limits.mean + FAR * limits.std)
         # Of what all sensors or the actions do; the first that is beyond its limit is told.
         self._most = {
             (OBSERVATION, "missing"): MISSING,
@@ -157,6 +187,24 @@ class Stream:
         self._rows = 0  # since that stamp
         self._quiet = True
         self._since = np.full(len(limits.mean), NEVER)
+        self.shift: Shift | None = None
+        self._gathered: list[NDArray[np.float32]] = []
+        if self.baseline is None:
+            self._bound(limits.low, limits.high)
+        else:  # A range that is relative to the baseline is not known yet.
+            self._bound(*np.array([[-np.inf], [np.inf]]))
+
+    def _bound(self, low: Floats, high: Floats) -> None:
+        """Take readings between these for measurements that training had."""
+        limits = self.limits
+        self._low = np.maximum(low, limits.mean - FAR * limits.std)
+        self._high = np.minimum(high, limits.mean + FAR * limits.std)
+
+    def through(self, rows: Iterable[ArrayLike], actions: Iterable[ArrayLike]) -> Iterator[int]:
+        """Take all rows of an episode and the actions between them; yield each row's number."""
+        for t, (row, action) in enumerate(zip(rows, chain([None], actions), strict=True)):
+            self.take(row, action)
+            yield t
 
     def take(
         self,
@@ -169,6 +217,21 @@ class Stream:
 
         `time` and `acted` are the time stamps of the two in seconds, compared with the rate.
         """
+        row, command = self._take(observation, action, time, acted)
+        if self.baseline is not None and self.shift is None:
+            self._gathered.append(row)
+            if len(self._gathered) == self.baseline.rows:
+                self.shift = self.baseline.shift(np.stack(self._gathered))
+                self._bound(*map(self.shift.inverse, (self.limits.low, self.limits.high)))
+        return row, command
+
+    def _take(
+        self,
+        observation: ArrayLike | None,
+        action: ArrayLike | None,
+        time: float | None,
+        acted: float | None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         self._t += 1
         self._rows += 1
         if time is not None and self.rate is not None:

@@ -1,29 +1,41 @@
 """A detector with its alarm beside a running robot: one call for each observation."""
 
 import copy
+import itertools
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import FittedStateError, UsageError
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.errors import FittedStateError, PromiseWarning, UsageError
 from oodd_eval.live.handle import DetectorHandle, streaming
+from oodd_eval.live.nominal import Episode, Nominal, NominalData
 from oodd_eval.live.reading import Reading, RunLength
-from oodd_eval.live.stream import ACTION, OBSERVATION, Stream, StreamLimits
-from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor, least_episodes
+from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
+from oodd_eval.metrics.alarms import (
+    AlarmKind,
+    Calibration,
+    GuaranteedAlarm,
+    Monitor,
+    least_episodes,
+    too_few,
+)
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Detector, StorableDetector
 from oodd_eval.plugins.state import load_state, save_state
 
-KIND: Final = "watchdog/1"
+KIND: Final = "watchdog/2"
 FILE: Final = "watchdog.json"
 DETECTOR: Final = "detector"
+
+_LISTED: Final = 5  # episodes and sensors that a message names
 
 Floats = NDArray[np.float64]
 
@@ -49,8 +61,13 @@ class Watchdog:
     ----------
     promise
         How rare false alarms are, in words.
+    notes
+        What was found out about the promise, in sentences: drift, whether calibration is like what
+        is judged, calibration episodes with faults of sensors.
     run_length
         The promised mean time between false alarms with its interval; None with an ``alpha``.
+    calibration
+        What the threshold is from, with the episodes that joined it; None without an ``alpha``.
     raised
         The reading that raised the present alarm; None without one.
     """
@@ -58,31 +75,40 @@ class Watchdog:
     def __init__(
         self,
         handle: DetectorHandle,
+        calibration: Calibration | None,
         rule: GuaranteedAlarm,
         limits: StreamLimits,
-        sensors: Sequence[str],
+        nominal: Nominal,
         settings: Settings,
         run_length: RunLength | None,
+        notes: Sequence[str] = (),
     ) -> None:
-        self._handle, self.rule, self._limits, self.sensors = handle, rule, limits, list(sensors)
-        self.settings, self.run_length = settings, run_length
+        self._handle, self.calibration, self.rule = handle, calibration, rule
+        self._limits, self._nominal, self.sensors = limits, nominal, list(nominal.sensors)
+        self.settings, self.run_length, self.notes = settings, run_length, list(notes)
         self._live = streaming(handle.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
-        self._monitor, self._stream = Monitor(rule), Stream(limits, settings.rate)
+        self._stream = Stream(limits, settings.rate, nominal.baseline)
+        # Rows at the start that are not judged, and rows that the detector is not shown.
+        self._rows = nominal.baseline.rows if nominal.baseline else 0
+        self._hidden = 0 if handle.adapts else self._rows
         self.reset()
 
     @classmethod
     def fit(
         cls,
         detector: str | Detector,
-        train: Sequence[Trajectory],
-        calibration: Sequence[Trajectory],
+        train: EnvironmentData | Sequence[Episode],
+        calibration: Sequence[Episode] | None = None,
         alpha: float = 0.05,
         *,
         confidence: float | None = None,
         hours: float | None = None,
         rate: float | None = None,
         sensors: Sequence[Any] | None = None,
+        baseline: int | None = None,
+        offsets: Sequence[float] | None = None,
+        margin: float = MARGIN,
         latch: bool = True,
         hold_off: int = 0,
         statistic: str | None = None,
@@ -92,14 +118,18 @@ class Watchdog:
     ) -> Self:
         """Fit a detector on nominal episodes and find its threshold on others.
 
+        What puts the promise in doubt is also raised as a `PromiseWarning`.
+
         Parameters
         ----------
         detector
             Name of an installed detector, or an unfitted one. Without ``update`` it scores the
             whole episode so far at every row, which a warning says.
         train, calibration
-            Nominal episodes to fit on, and others, in an order that has nothing to do with what
-            happened, for the threshold.
+            Nominal episodes to fit on, and others for the threshold, both in the order in which
+            they were recorded: `Trajectory` objects, observations of shape (T + 1, D), or tuples of
+            observations and actions (T, A). Or an environment of a split alone, which knows its
+            episodes, sensors, offsets, baseline rows and rate.
         alpha
             Largest share of nominal episodes with an alarm.
         confidence
@@ -111,6 +141,15 @@ class Watchdog:
             Observations in a second; needed for `hours`, and for time stamps in `update`.
         sensors
             Names, or quantities with names as those of a split; default "sensor 0" and so on.
+        baseline
+            Number of rows at the start of every episode that are nominal. They are not judged, and
+            each sensor's mean and spread over them are brought to training's.
+        offsets
+            Subtracted from the sensors in float64, which a `Trajectory` has behind it already. By
+            default what arrays of float64 need, so that float32 can tell their spread.
+        margin
+            Share of a sensor's range in training by which a reading may leave it, before it is no
+            measurement any more; infinite to leave it to the detector.
         latch
             Whether an alarm stays until `acknowledge`, and not only as long as its cause.
         hold_off
@@ -128,12 +167,17 @@ class Watchdog:
         Raises
         ------
         UsageError
-            When the calibration episodes are too few for the promise, or an argument is wrong.
+            When the calibration episodes are too few for the promise, too many of them have faults
+            of sensors, or an argument is wrong.
         """
-        handle = DetectorHandle.make(detector, statistic, seed, horizon, parameters or {})
-        training, others = list(train), list(calibration)
         if rate is not None and not rate > 0:
             raise UsageError(f"rate={rate!r}, expected observations in a second, above 0")
+        data = NominalData.of(
+            train, calibration, sensors=sensors, offsets=offsets, baseline=baseline, rate=rate
+        )
+        nominal, rate = data.nominal, data.rate
+        rows = nominal.baseline.rows if nominal.baseline else 0
+        handle = DetectorHandle.make(detector, statistic, seed, horizon, parameters or {}, rows)
         if hours is not None and not (hours > 0 and rate):
             raise UsageError(
                 f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
@@ -144,45 +188,43 @@ class Watchdog:
                 f"hours={hours!r} and confidence={confidence!r}: a confidence is of a share of "
                 "episodes, alpha; a mean time between false alarms has its interval, `run_length`"
             )
+        if not margin >= 0:
+            raise UsageError(f"margin={margin!r}, expected a share of a range, 0 or more")
         if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
             expected = "shares between 0 and 1"
             raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
+        training, others = data.train, data.calibration
         least = least_episodes(alpha, handle.alarm, confidence) if hours is None else 1
         if len(others) < least:
-            raise UsageError(
-                f"alpha={alpha!r} takes {least} calibration episodes, got {len(others)}: record "
-                "more, or promise less"
-            )
-        names = [str(getattr(s, "name", s)) for s in sensors or ()]
-        width = training[0].observation_dim if training else 0
-        if sensors is not None and (len(names) != width or len({*names}) != width):
-            raise UsageError(f"{len(names)} names of sensors {names}, expected {width}, all unlike")
-        handle.detector.fit([handle.visible(x) for x in training])
+            subject = f"alpha={alpha!r}"
+            raise UsageError(too_few(subject, len(others), alpha, handle.alarm, confidence))
+        handle.detector.fit([handle.visible(x, nominal.baseline) for x in training])
         # Without a guarantee to keep exact, the limits may know what the threshold is from.
-        limits = StreamLimits.fit(training if hours is None else training + others)
-        score = handle.detector.score
-        scores = [np.asarray(score(handle.visible(x)), np.float64) for x in others]
-        run_length = None
-        if hours is None:
-            faulty = [limits.faulty(x) for x in others]
-            # An episode with a fault alarms at any threshold. Those that standardize stay.
-            scores = [
-                np.array([np.inf]) if f and (handle.alarm == "score" or i % 2) else s
-                for i, (f, s) in enumerate(zip(faulty, scores, strict=True))
-            ]
-            rule = GuaranteedAlarm.fit(scores, alpha, handle.alarm, confidence)
-        else:
-            cusum = Standardization.fit(scores) if handle.alarm == "cusum" else None
-            unbounded = GuaranteedAlarm(cusum, math.inf)
-            # One after the other: what a sum has reached at the end of one goes on in the next.
-            joined = unbounded.statistic(np.concatenate(scores))
-            ends = np.cumsum([len(s) for s in scores])
-            largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
-            threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate or 0))
-            rule = replace(unbounded, threshold=threshold)
-        names = names or [f"sensor {d}" for d in range(width)]
+        known = training if hours is None else training + others
+        limits = StreamLimits.fit(known, map(nominal.judged, known), margin)
+        scores = [handle.scores(x, nominal.baseline) for x in others]
         settings = Settings(alpha, confidence, rate, latch, hold_off)
-        return cls(handle, rule, limits, names, settings, run_length)
+        findings = data.findings()
+        notes = [finding.text for finding in findings]
+        for finding in findings:
+            if finding.doubt:
+                warnings.warn(finding.text, PromiseWarning, stacklevel=2)
+        if hours is None:
+            faults = [limits.faults(x, nominal.baseline) for x in others]
+            fitted = _calibrated(scores, faults, handle.alarm)
+            rule = _guaranteed(fitted, faults, settings, nominal.sensors)
+            if any(faults):
+                notes.append(_faults_note(faults, nominal.sensors))
+            return cls(handle, fitted, rule, limits, nominal, settings, None, notes)
+        cusum = Standardization.fit(scores) if handle.alarm == "cusum" else None
+        unbounded = GuaranteedAlarm(cusum, math.inf)
+        # One after the other: what a sum has reached at the end of one goes on in the next.
+        joined = unbounded.statistic(np.concatenate(scores))
+        ends = np.cumsum([len(s) for s in scores])
+        largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
+        threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate or 0))
+        rule = replace(unbounded, threshold=threshold)
+        return cls(handle, None, rule, limits, nominal, settings, run_length, notes)
 
     @property
     def promise(self) -> str:
@@ -201,13 +243,40 @@ class Watchdog:
     def reset(self) -> None:
         """Begin a new episode, without an alarm."""
         self._live.reset()
-        self._monitor.reset()
+        self._monitor, self._whole = Monitor(self.rule), Monitor(self.rule)
         self._stream.reset()
         self._t = -1
+        self._largest = -math.inf
         self._causes: frozenset[str] = frozenset()
         self._known = self._causes
         self._held = 0
         self.raised: Reading | None = None
+
+    def confirm(self) -> None:
+        """Let the episode that has just ended join the calibration, since it was nominal.
+
+        The threshold is then that of a rolling calibration, in which an episode counts .95 to the
+        power of its age, and a new episode begins, as by `reset`. For machines that drift slowly.
+
+        Raises
+        ------
+        UsageError
+            Where no statistic could exceed the new threshold, for operation without end or with a
+            confidence, or before the first row; then nothing changes.
+        """
+        if self.calibration is None or self.settings.confidence is not None:
+            raise UsageError(
+                f"a rolling calibration keeps alpha on average, but this watchdog promises "
+                f"{self.promise}: fit it with alpha alone"
+            )
+        if self._t < self._rows:
+            raise UsageError(
+                f"there were {self._t + 1} rows since the last reset, expected more than "
+                f"{self._rows}: confirm an episode at its end, before reset"
+            )
+        joined = self.calibration.joined(self._largest)
+        self.rule, self.calibration = joined.rule(self.settings.alpha), joined
+        self.reset()
 
     def acknowledge(self) -> None:
         """Take note of the alarm: it ends, and what caused it raises no other until it was gone.
@@ -259,14 +328,26 @@ class Watchdog:
         self._t += 1
         if isinstance(observation, Mapping):
             observation = [observation.get(name, math.nan) for name in self.sensors]
-        row, command = self._stream.take(observation, action, time, acted)
-        score = float(self._live.update(row, command if self._handle.actions else None))
+        row, command = self._stream.take(self._measured(observation), action, time, acted)
+        score = math.nan
+        if self._t >= self._hidden:
+            shift = None if self._handle.adapts else self._stream.shift
+            visible = row if shift is None else shift(row)
+            first = self._t == self._hidden
+            command = None if first or not self._handle.actions else command
+            score = float(self._live.update(visible, command))
+        if self._t < self._rows:
+            score = math.nan
         above = self._monitor.update(score)
+        self._whole.update(score)
+        self._largest = max(self._largest, self._whole.statistic)
         faults = {
             str(d): fault
             for d, fault in self._stream.faults.items()
             if d != ACTION or self._handle.actions
         }
+        if faults:
+            self._largest = math.inf  # an alarm at any threshold
         self._causes = frozenset(faults) | ({"statistic"} if above else set())
         self._known &= self._causes
         new = bool(self._causes - self._known) and not self._held
@@ -289,6 +370,13 @@ class Watchdog:
             self.raised = reading
         return reading
 
+    def _measured(self, observation: ArrayLike | None) -> ArrayLike | None:
+        """Return readings without offsets, in float64; of another length as they are."""
+        if observation is None or not self._nominal.offsets.any():
+            return observation
+        row = np.asarray(observation, dtype=np.float64)
+        return row - self._nominal.offsets if row.shape == self._nominal.offsets.shape else row
+
     def _blamed(self) -> tuple[dict[str, float], int | None]:
         """Return shares by sensor and the onset: from faults where there are any."""
         if suspects := self._stream.suspects:
@@ -301,7 +389,7 @@ class Watchdog:
         if onset < 0:
             return {}, None
         order = np.argsort(-shares, kind="stable").tolist()
-        return {self.sensors[d]: float(shares[d]) for d in order}, int(onset)
+        return {self.sensors[d]: float(shares[d]) for d in order}, int(onset) + self._hidden
 
     def _name(self, number: int | str) -> str:
         return number if isinstance(number, str) else self.sensors[number]
@@ -339,15 +427,24 @@ class Watchdog:
             raise UsageError(f"{str(path)!r} is not empty: save into a new directory")
         (path / DETECTOR).mkdir(parents=True)
         self._handle.detector.save(path / DETECTOR)
-        save_state(path, kind=KIND, settings={}, arrays=self._limits.arrays())
-        nominal = self.rule.standardization
+        arrays = {**self._limits.arrays(), **self._nominal.arrays()}
+        save_state(path, kind=KIND, settings={}, arrays=arrays)
+        scale, known = self.rule.standardization, self.calibration
         state = {
             "made": self._handle.state,
             "sensors": self.sensors,
-            "threshold": None if math.isinf(self.rule.threshold) else self.rule.threshold,
-            "standardization": nominal and [nominal.mean, nominal.std],
+            "threshold": self.rule.threshold,
+            "standardization": scale and [scale.mean, scale.std],
+            "calibration": known
+            and {
+                # JSON has no infinities, of which there are two: as texts.
+                "largest": [x if math.isfinite(x) else str(x) for x in known.largest],
+                "episodes": known.episodes,
+                "rolling": known.rolling,
+            },
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
+            "notes": self.notes,
         }
         (path / FILE).write_text(json.dumps(state, indent=1), encoding="utf-8")
 
@@ -372,25 +469,88 @@ class Watchdog:
             When the files are missing or damaged.
         """
         path = Path(directory)
-        limits = StreamLimits.of(load_state(path, kind=KIND, settings={}))
+        arrays = load_state(path, kind=KIND, settings={})
+        limits = StreamLimits.of(arrays)
         try:
             state = json.loads((path / FILE).read_text(encoding="utf-8"))
             handle = DetectorHandle.from_state(state["made"], detector)
-            nominal, threshold = state["standardization"], state["threshold"]
-            rule = GuaranteedAlarm(
-                None if nominal is None else Standardization(*map(float, nominal)),
-                math.inf if threshold is None else float(threshold),
-            )
+            scale, threshold = state["standardization"], float(state["threshold"])
+            standardization = None if scale is None else Standardization(*map(float, scale))
+            known = state["calibration"]
             length = state["run_length"]
             run_length = None if length is None else RunLength(*map(float, length))
             names = [str(name) for name in state["sensors"]]
+            nominal = Nominal.of(arrays, names, int(state["made"]["baseline"]))
             settings = Settings(**state["settings"])
+            notes = [str(note) for note in state["notes"]]
+            calibration = known and Calibration(
+                handle.alarm,
+                standardization,
+                tuple(map(float, known["largest"])),
+                int(known["episodes"]),
+                bool(known["rolling"]),
+            )
         except UsageError:
             raise
         except (OSError, ValueError, KeyError, TypeError) as error:
             what = f"{str(path / FILE)!r} cannot be read as a saved watchdog"
             raise FittedStateError(f"{what}: {type(error).__name__}: {error}") from None
+        if not math.isfinite(threshold):
+            raise FittedStateError(
+                f"{str(path / FILE)!r} has the threshold {threshold}, which nothing exceeds, "
+                "expected a finite one: fit the watchdog anew"
+            )
         if not isinstance(handle.detector, StorableDetector) or len(names) != len(limits.mean):
             raise FittedStateError(f"{str(path)!r} does not fit {type(handle.detector).__name__}")
         handle.detector.load(path / DETECTOR)
-        return cls(handle, rule, limits, names, settings, run_length)
+        rule = GuaranteedAlarm(standardization, threshold)
+        return cls(handle, calibration, rule, limits, nominal, settings, run_length, notes)
+
+
+_Faults: TypeAlias = Mapping[int | str, StreamFault]
+
+
+def _calibrated(
+    scores: Sequence[Floats], faults: Sequence[_Faults], kind: AlarmKind
+) -> Calibration:
+    """Return the calibration, in which an episode with a fault alarms at any threshold."""
+    # Those that standardize stay.
+    counted = [
+        np.array([np.inf]) if f and (kind == "score" or i % 2) else s
+        for i, (f, s) in enumerate(zip(faults, scores, strict=True))
+    ]
+    return Calibration.fit(counted, kind)
+
+
+def _guaranteed(
+    known: Calibration, faults: Sequence[_Faults], settings: Settings, sensors: Sequence[str]
+) -> GuaranteedAlarm:
+    """Return the alarm; `UsageError` names what is at fault where nothing could exceed it."""
+    threshold = known.threshold(settings.alpha, settings.confidence)
+    if math.isinf(threshold) and any(faults):
+        raise UsageError(
+            f"alpha={settings.alpha!r} cannot be promised, as {_faults_note(faults, sensors)}: no "
+            "threshold would be exceeded then; leave out what was not nominal, train on what is, "
+            "declare baseline rows, let readings leave training's range by more (margin=), or "
+            "promise less"
+        )
+    return known.rule(settings.alpha, settings.confidence)
+
+
+def _faults_note(faults: Sequence[_Faults], sensors: Sequence[str]) -> str:
+    """Name the calibration episodes, sensors and rows at fault."""
+
+    def in_words(what: int | str, seen: StreamFault) -> str:
+        name = sensors[what] if isinstance(what, int) else what
+        return f"{name} {seen.fault} in rows {seen.first} to {seen.last}"
+
+    listed = [
+        f"episode {i}: {', '.join(itertools.starmap(in_words, [*seen.items()][:_LISTED]))}"
+        for i, seen in enumerate(faults)
+        if seen
+    ]
+    more = f", and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    return (
+        f"{len(listed)} of {len(faults)} calibration episodes have faults of their sensors, and "
+        f"count as episodes with an alarm ({'; '.join(listed[:_LISTED])}{more})"
+    )

@@ -8,12 +8,13 @@ scores and however they depend on one another within an episode.
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.errors import UsageError
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
@@ -23,6 +24,8 @@ Floats = NDArray[np.float64]
 
 AlarmKind = Literal["cusum", "score"]
 """Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself."""
+
+STATISTICS: Final[tuple[AlarmKind, ...]] = get_args(AlarmKind)
 
 _ROUNDING: Final = 1e-9  # share of an episode that levels may be off: (n + 1) x 0.05 is whole
 
@@ -36,8 +39,7 @@ class GuaranteedAlarm:
     standardization
         Of the scores, for the CUSUM; None where the score itself is the statistic.
     threshold
-        An episode alarms at the first row whose statistic is larger; infinite where no number of
-        episodes could promise the level.
+        An episode alarms at the first row whose statistic is larger.
 
     Examples
     --------
@@ -76,7 +78,12 @@ class GuaranteedAlarm:
         Returns
         -------
         GuaranteedAlarm
-            Its threshold is infinite where there are too few episodes for the level.
+
+        Raises
+        ------
+        UsageError
+            Where no statistic could exceed the threshold, because there are too few episodes for
+            the level, or too many of them have an infinite statistic.
         """
         return cls.fits(calibration, [level], kind, confidence)[0]
 
@@ -89,19 +96,8 @@ class GuaranteedAlarm:
         confidence: float | None = None,
     ) -> "list[GuaranteedAlarm]":
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
-        unbounded, episodes = cls(None, math.inf), calibration
-        if kind == "cusum":
-            unbounded = cls(Standardization.fit(calibration[0::2]), math.inf)
-            episodes = calibration[1::2]
-        largest = np.sort([unbounded.largest(scores) for scores in episodes])
-        ranks = [quantile_rank(len(largest), level, confidence) for level in levels]
-        return [
-            cls(
-                unbounded.standardization,
-                float(largest[rank - 1]) if rank <= len(largest) else math.inf,
-            )
-            for rank in ranks
-        ]
+        known = Calibration.fit(calibration, kind)
+        return [known.rule(level, confidence) for level in levels]
 
     def statistic(self, scores: Floats) -> Floats:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
@@ -117,6 +113,212 @@ class GuaranteedAlarm:
         """Return the row of an episode's first alarm; None without one."""
         above = self.statistic(scores) > self.threshold
         return int(above.argmax()) if above.any() else None
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What thresholds are found from: the largest statistics of nominal episodes.
+
+    Parameters
+    ----------
+    kind
+        The statistic.
+    standardization
+        Of the scores, for the CUSUM: from the first calibration, whatever joins it later.
+    largest
+        Largest statistic of each of the n episodes that the quantile is of, as recorded.
+    episodes
+        Number of all episodes, those that standardize the scores included.
+    rolling
+        Whether an episode counts `FADING` to the power of its age, the number of those after it.
+
+    Examples
+    --------
+    >>> known = Calibration.fit([np.array([peak]) for peak in range(1, 20)], "score")
+    >>> known.rule(0.05).threshold, known.joined(25.0).rule(0.10).threshold
+    (19.0, 25.0)
+    """
+
+    kind: AlarmKind
+    standardization: Standardization | None
+    largest: tuple[float, ...]
+    episodes: int
+    rolling: bool = False
+
+    @classmethod
+    def fit(cls, scores: Sequence[Floats], kind: AlarmKind = "cusum") -> "Calibration":
+        """Take the scores of calibration episodes.
+
+        Parameters
+        ----------
+        scores
+            By episode.
+        kind
+            See `GuaranteedAlarm.fit`.
+
+        Returns
+        -------
+        Calibration
+        """
+        standardization, episodes = None, scores
+        if kind == "cusum":
+            standardization, episodes = Standardization.fit(scores[0::2]), scores[1::2]
+        unbounded = GuaranteedAlarm(standardization, math.inf)
+        largest = tuple(unbounded.largest(one) for one in episodes)
+        return cls(kind, standardization, largest, len(scores))
+
+    @property
+    def unbounded(self) -> GuaranteedAlarm:
+        """The statistic, with a threshold that nothing exceeds."""
+        return GuaranteedAlarm(self.standardization, math.inf)
+
+    def joined(self, largest: float) -> "Calibration":
+        """Return a rolling calibration with a further nominal episode.
+
+        Parameters
+        ----------
+        largest
+            Its largest statistic.
+
+        Returns
+        -------
+        Calibration
+        """
+        return replace(
+            self, largest=(*self.largest, largest), episodes=self.episodes + 1, rolling=True
+        )
+
+    def threshold(self, level: float, confidence: float | None = None) -> float:
+        """Return the threshold of a level; infinite where no number could promise it.
+
+        Of a rolling calibration it is the smallest statistic up to which the episodes have a share
+        of at least ``1 - level`` of all weights, to which the episode to come, whose statistic may
+        be anything, adds 1 (Barber et al., "Conformal prediction beyond exchangeability", Ann.
+        Statist. 51, 2023).
+
+        Parameters
+        ----------
+        level, confidence
+            See `GuaranteedAlarm.fit`; a rolling calibration has no confidence.
+
+        Returns
+        -------
+        float
+        """
+        n, ordered = len(self.largest), np.sort(self.largest)
+        if not self.rolling:
+            rank = quantile_rank(n, level, confidence)
+            return float(ordered[rank - 1]) if rank <= n else math.inf
+        weights = FADING ** np.arange(n - 1, -1, -1.0)
+        up_to = np.cumsum(weights[np.argsort(self.largest, kind="stable")])
+        enough = up_to >= (1 - level) * (weights.sum() + 1) - _ROUNDING
+        return float(ordered[enough.argmax()]) if enough.any() else math.inf
+
+    def rule(self, level: float, confidence: float | None = None) -> GuaranteedAlarm:
+        """Return the alarm of a level.
+
+        Parameters
+        ----------
+        level, confidence
+            See `GuaranteedAlarm.fit`.
+
+        Returns
+        -------
+        GuaranteedAlarm
+
+        Raises
+        ------
+        UsageError
+            Where no statistic could exceed the threshold.
+        """
+        threshold = self.threshold(level, confidence)
+        if not math.isinf(threshold):
+            return GuaranteedAlarm(self.standardization, threshold)
+        subject = f"at most {100 * level:.3g} % of nominal episodes with an alarm"
+        if len(self.largest) < (n := least_rolling(level)) and self.rolling:
+            needed = f"takes {n}" if math.isfinite(n) else "is more than any number can promise"
+            raise UsageError(
+                f"{subject} from a rolling calibration, in which an episode counts {FADING} to the "
+                f"power of its age, {needed}, got {len(self.largest)} episodes that the threshold "
+                "is from: keep the first calibration, or promise less"
+            )
+        if self.episodes < least_episodes(level, self.kind, confidence):
+            raise UsageError(too_few(subject, self.episodes, level, self.kind, confidence))
+        infinite = sum(map(math.isinf, self.largest))
+        raise UsageError(
+            f"{subject}: {infinite} of the {len(self.largest)} calibration episodes that the "
+            "threshold is from have an infinite statistic, so that nothing could exceed it: "
+            "calibrate with other episodes, or promise less"
+        )
+
+
+FADING: Final = 0.95
+"""Weight of an episode of a rolling calibration against the one after it."""
+
+
+def least_rolling(level: float) -> float:
+    """Return how many episodes a rolling quantile takes; infinite where no number is enough.
+
+    >>> least_rolling(0.10), least_rolling(0.05), least_rolling(0.01)
+    (12, 59, inf)
+    """
+    # (1 - f^n) / (1 - f), the sum of weights, has to be 1 / level - 1.
+    left = 1 - (1 / level - 1) * (1 - FADING)
+    return math.ceil(math.log(left) / math.log(FADING) - _ROUNDING) if left > 0 else math.inf
+
+
+def too_few(
+    subject: str, episodes: int, level: float, kind: AlarmKind, confidence: float | None = None
+) -> str:
+    """Say how many calibration episodes a level takes, for this statistic and for the other.
+
+    >>> too_few("alpha=0.05", 30, 0.05, "cusum").partition(":")[0]
+    'alpha=0.05 takes 38 calibration episodes, got 30'
+    """
+    needed = {one: least_episodes(level, one, confidence) for one in STATISTICS}
+    names = {
+        "cusum": "a CUSUM of the scores, which half of them standardize",
+        "score": "the detector's own score as the statistic",
+    }
+    return (
+        f"{subject} takes {needed[kind]} calibration episodes, got {episodes}: "
+        f"{needed['cusum']} for {names['cusum']}, {needed['score']} for {names['score']}; "
+        "record more, or promise less"
+    )
+
+
+def rolling_rules(
+    calibration: Calibration, nominal: Sequence[Floats], level: float
+) -> list[GuaranteedAlarm]:
+    """Return the alarms of a rolling calibration, one for each nominal episode and one for after.
+
+    Episode i is judged with the calibration and the i episodes before it, which were confirmed to
+    be nominal, whether they alarmed or not.
+
+    Parameters
+    ----------
+    calibration
+        Of the episodes before all of these.
+    nominal
+        Scores of the m nominal episodes, in the order in which they were recorded.
+    level
+        Largest share of nominal episodes with an alarm.
+
+    Returns
+    -------
+    list of GuaranteedAlarm
+        m + 1 of them; the last is for what comes after all.
+
+    Raises
+    ------
+    UsageError
+        Where a threshold would be infinite.
+    """
+    rules = [calibration.rule(level)]
+    for scores in nominal:
+        calibration = calibration.joined(calibration.unbounded.largest(scores))
+        rules.append(calibration.rule(level))
+    return rules
 
 
 def quantile_rank(n: int, level: float, confidence: float | None = None) -> int:
@@ -214,14 +416,14 @@ def guaranteed_contributions(
     contributions = {"false_episodes": mean_of(alarms)}
     lengths = [[len(scores) for scores in part] for part in (anomalous, twins)]
     ends = list(map(min, *lengths))
-    nulls = _from_effect(quiet, lengths[1], ends, effects)
-    for name, contribution in _from_effect(loud, lengths[0], ends, effects).items():
+    nulls = from_starts(quiet, lengths[1], ends, effects)
+    for name, contribution in from_starts(loud, lengths[0], ends, effects).items():
         contributions[name] = contribution
         contributions[f"{name}_null"] = nulls[name]
-    return {name: contributions[name] for name in GUARANTEED}
+    return {name: contributions[name] for name in GUARANTEED if name in contributions}
 
 
-def _from_effect(
+def from_starts(
     firsts: Sequence[int | None],
     lengths: Sequence[int],
     ends: Sequence[int],
@@ -229,7 +431,21 @@ def _from_effect(
 ) -> dict[str, Contribution]:
     """Return the share of early episodes, and delays and shares of all others.
 
-    `ends` are the numbers of rows that an episode and its partner both have.
+    Parameters
+    ----------
+    firsts
+        The row of each episode's first alarm; None without one.
+    lengths
+        The number of rows of each episode.
+    ends
+        The number of rows that an episode and its partner both have.
+    effects
+        The row of each episode from which delays count.
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
     """
     nothing = math.nan
     early, delays, missed, censored = [], [], [], []

@@ -186,6 +186,12 @@ class DetectorSpec:
     alarm
         The statistic of the guaranteed alarms: the CUSUM of standardized scores, or the score
         itself, for a detector that accumulates by itself.
+    adapts
+        ``"baseline"`` for a detector that learns from the first rows of each episode by itself,
+        where these are declared nominal. Its factory is then called with their number, too, as
+        ``baseline=B``, and it is handed whole episodes as they were recorded, whose first B scores
+        count for nothing. Others are handed the rows behind them, brought to training's mean and
+        spread (`oodd_eval.data.baseline`).
     parameters
         A frozen dataclass whose fields are the parameters that ``--param`` may set, each declared
         with `oodd_eval.plugins.parameters.parameter`. None when there are none.
@@ -211,6 +217,7 @@ class DetectorSpec:
     inputs: Literal["observations", "observations+actions"] = "observations"
     deterministic: bool = False
     alarm: Literal["cusum", "score"] = "cusum"
+    adapts: Literal["", "baseline"] = ""
     parameters: type | None = None
     other_parameters: bool = False
     requires: tuple[str, ...] = ()
@@ -221,10 +228,19 @@ class DetectorSpec:
 
 
 def make_detector(
-    factory: Callable[..., Detector], *, seed: int, horizon: int, parameters: Mapping[str, Any]
+    factory: Callable[..., Detector],
+    *,
+    seed: int,
+    horizon: int,
+    parameters: Mapping[str, Any],
+    baseline: int = 0,
 ) -> Detector:
-    """Return an unfitted detector; raise `ContractError` for anything without `fit` and `score`."""
-    detector = factory(seed=seed, horizon=horizon, **parameters)
+    """Return an unfitted detector; raise `ContractError` for anything without `fit` and `score`.
+
+    `baseline` is the number of baseline rows for one that adapts to them.
+    """
+    adapting = {"baseline": baseline} if baseline else {}
+    detector = factory(seed=seed, horizon=horizon, **adapting, **parameters)
     if not isinstance(detector, Detector):
         expected = "an object with the methods fit(nominal) and score(trajectory)"
         raise ContractError(f"the factory returned {type(detector).__name__}, expected {expected}")
@@ -258,6 +274,7 @@ def check_scores(
     warm_up: object,
     detector: str,
     where: str,
+    baseline: int = 0,
 ) -> Scores:
     """Return the scores as a float64 array if they honour the contract.
 
@@ -271,6 +288,8 @@ def check_scores(
         Rows: NaN may stand in the leading ``max(horizon, warm_up)`` only.
     detector, where : str
         Names for messages, such as ``"rf"`` and ``"hopper/test/iid[7]"``.
+    baseline : int
+        Rows more at the start, of which a detector that adapts learns.
 
     Returns
     -------
@@ -288,7 +307,7 @@ def check_scores(
         expected = f"expected an int between 0 and {MAX_WARM_UP}"
         raise ContractError(f"detector {detector!r} declares warm_up = {warm_up!r}, {expected}")
     rows = trajectory if isinstance(trajectory, int) else len(trajectory)
-    block = max(horizon, warm_up)
+    block = baseline + max(horizon, warm_up)
     if not isinstance(scores, np.ndarray):
         wrong = f"{type(scores).__name__} for {where}, expected a numpy array of float64"
     elif scores.ndim != 1:
@@ -300,7 +319,8 @@ def check_scores(
         wrong = f"{scores.dtype} scores for {where}, expected float64"
     elif (bad := ~np.isfinite(scores) & ~(np.isnan(scores) & (np.arange(rows) < block))).any():
         t = int(bad.argmax())
-        allowed = f"t < {block} (the larger of horizon and declared warm-up)"
+        behind = f", behind {baseline} baseline rows" if baseline else ""
+        allowed = f"t < {block} (the larger of horizon and declared warm-up{behind})"
         wrong = f"{scores[t]} at t = {t} of {where}, expected finite scores, or NaN for {allowed}"
     elif (late := np.flatnonzero(np.diff(np.isnan(scores).astype(int)) > 0)).size:
         wrong = f"NaN at t = {late[0] + 1} of {where}, expected it in one leading block only"

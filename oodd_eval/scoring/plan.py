@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
@@ -52,6 +53,7 @@ class Unit:
     source: str = ""
     inputs: str = ""
     alarm: Literal["cusum", "score"] = "cusum"
+    adapts: Literal["", "baseline"] = ""
     deterministic: bool = False
     scores_key: str = ""
     fit_key: str = ""
@@ -108,11 +110,12 @@ class Plan:
             inputs=unit.inputs,
             alarm=unit.alarm,
             deterministic=unit.deterministic,
+            rolling=unit.setting.rolling,
             environment=unit.environment,
             anomaly=condition.anomaly,
             strength=condition.strength,
             magnitude=self.strengths.get(unit.environment, {}).get(condition),
-            group=self.groups[condition.anomaly],
+            group=self.groups.get(condition.anomaly, ""),
             split=self.split,
             split_digest=self.split_digest,
             limit=self.limit,
@@ -134,19 +137,23 @@ def make_plan(
     parameters: Mapping[str, Any] | None = None,
     limit: int | None = None,
     device: str | None = None,
+    rolling: bool = False,
 ) -> Plan:
     """Lay out every unit, environments outermost; the cells are the product of all names.
 
     `anomalies` are kinds or conditions, as `Split.anomalies` has them; by default all. `device` is
-    the value of the parameter ``device`` for those detectors that have it. What is
+    the value of the parameter ``device`` for those detectors that have it. With `rolling`
+    calibration, nominal test episodes in recorded order join it once they are judged. What is
     unknown or refused, and a device that no detector has, raises `UsageError`.
     """
+    if rolling:
+        _check_rolling(split, environments)
     offers = [plugins.offer(name) for name in detectors]
     values = [dict(parameters or {}) for _ in offers]
     if device is not None:
         _set_device(device, offers, values)
     units = tuple(
-        make_unit(offer, chosen, split, environment, conditions, horizon, seed, limit)
+        make_unit(offer, chosen, split, environment, conditions, horizon, seed, limit, rolling)
         for environment in environments
         if (conditions := _chosen(split.conditions(environment), anomalies))
         for offer, chosen in zip(offers, values, strict=True)
@@ -155,6 +162,18 @@ def make_plan(
     )
     strengths = {environment: split.strengths(environment) for environment in environments}
     return Plan(split.name, split.digest, units, split.groups, limit, strengths)
+
+
+def _check_rolling(split: Split, environments: Sequence[str]) -> None:
+    """Raise `UsageError` where test episodes have no order in which they could be confirmed."""
+    for name in environments:
+        facts = layout.log_facts(split.manifest["environments"][name])
+        if facts is None or facts.paired or facts.order != "recorded":
+            raise UsageError(
+                f"{name} of split {split.name} has no nominal test episodes in recorded order, "
+                "which a rolling calibration needs: expected logs that were imported without twins "
+                'and with order = "recorded"'
+            )
 
 
 def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str, Any]]) -> None:
@@ -187,6 +206,7 @@ def make_unit(
     horizon: int,
     seed: int,
     limit: int | None,
+    rolling: bool = False,
 ) -> Unit:
     """Resolve one unit: its parameters, its setting and its keys."""
     spec = offer.spec
@@ -222,11 +242,13 @@ def make_unit(
         }
         if not spec.horizon_decides_fit:
             same["horizon"] = None
+        if rows := split.baseline(environment):
+            same["baseline"] = rows
         # It tells nothing of the environment, since the worker sees it.
         fit = _digest(identity | same)[:32]
     return Unit(
         environment=environment,
-        setting=Setting.of(spec.name, horizon, overrides),
+        setting=Setting.of(spec.name, horizon, overrides, rolling=rolling),
         seed=seed,
         conditions=tuple(conditions),
         parameters=resolved,
@@ -237,6 +259,7 @@ def make_unit(
         source=source,
         inputs=spec.inputs,
         alarm=spec.alarm,
+        adapts=spec.adapts,
         deterministic=spec.deterministic,
         scores_key=scores,
         fit_key=fit,

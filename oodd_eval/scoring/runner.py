@@ -18,7 +18,7 @@ from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
-from oodd_eval.results.evaluate import evaluated
+from oodd_eval.results.evaluate import counts_of, evaluated
 from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
@@ -76,7 +76,7 @@ def run(
                     notify("oodd_unit_started", unit=plan.units[index])
                     continue
                 done += 1
-                records = _records(jobs[index], scored, origin)
+                records = _records(jobs[index], scored, origin, settings)
                 writer.add(index, records)
                 for record in records:
                     notify("oodd_cell_finished", record=record, resumed=scored.resumed)
@@ -175,10 +175,11 @@ def _in_dependence(
     return graph
 
 
-def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Record]:
+def _records(
+    job: UnitJob, scored: Scored, origin: dict[str, object], settings: RunSettings
+) -> list[Record]:
     """Return the records of a unit's cells, in the order of its conditions."""
     plan, unit, cost = job.plan, job.unit, scored.file.cost
-    counts = {"train": job.data.train, "calibration": job.data.calibration, "test": job.data.twins}
     # A whole number, also when it was read back from a file of floats.
     steps = int(cost["steps_scored"]) if "steps_scored" in cost else None
     device = {name: v for name, v in unit.parameters.items() if name not in unit.recorded}
@@ -186,9 +187,14 @@ def _records(job: UnitJob, scored: Scored, origin: dict[str, object]) -> list[Re
         "status": scored.status,
         "reason": scored.reason,
         "steps_scored": steps,
-        "counts": {part: len(known.lengths[: plan.limit]) for part, known in counts.items()},
+        "paired": job.data.paired,
         "provenance": {**origin, **device},
         **{name: cost[name] for name in COSTS if name in cost},
     }
-    records = [plan.blank(unit, condition, **outcome) for condition in unit.conditions]
-    return evaluated(records, scored.file, job.data) if scored.status == "ok" else records
+    records = [
+        plan.blank(unit, c, counts=counts_of(job.data, c, plan.limit), **outcome)
+        for c in unit.conditions
+    ]
+    if scored.status != "ok":
+        return records
+    return evaluated(records, scored.file, job.data, row_metrics=settings.row_metrics)

@@ -4,12 +4,13 @@ import copy
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from itertools import islice
 from typing import Final
 
 import numpy as np
 
+from oodd_eval.data.baseline import Baseline, check_baseline
 from oodd_eval.data.parts import (
     CALIBRATION,
     TWINS,
@@ -31,6 +32,9 @@ from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
 _NOMINAL: Final = (CALIBRATION, TWINS)
+LEAST_GROUP: Final = 8
+"""Trajectories of a group where test parts differ in size: each group takes a process."""
+
 COSTS: Final = ("seconds_fit", "seconds_score", "peak_rss_mb")
 
 
@@ -97,16 +101,27 @@ class GroupedScoring:
     """The trajectories of one unit, the groups in which they are scored, and the checks of scores.
 
     A group holds no two trajectories of one seed: as many calibration trajectories as there are
-    test seeds, the twins, one anomaly, or prefixes of other trajectories. It is scored apart from
-    all others. The order of groups, and which prefixes there are, follow from a number drawn from
-    the system's randomness, which is stored with the scores. Within a group the order is that of
-    the split, so that scores are the same bit for bit. A detector that explains is asked to in the
-    same way, when all is scored: only the anomalous trajectories, and prefixes of some of these.
+    test seeds, the twins, one anomaly, or prefixes of other trajectories (without twins: a part of
+    any of these). It is scored apart from all others. The order of groups, and which prefixes there
+    are, follow from a number drawn from the system's randomness, which is stored with the scores.
+    Within a group the order is that of the split, so that scores are the same bit for bit. A
+    detector that explains is asked to in the same way, when all is scored: only the anomalous
+    trajectories, and prefixes of some of these.
     """
 
     def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
         self._job, self._sets = job, sets
         self._lengths = lengths_of(sets, job.plan.limit)
+        self._adapts = bool(job.unit.adapts)
+        # Rows at the start of each episode that a detector is not shown, or learns from.
+        self._rows = rows = job.data.baseline
+        self._baseline: Baseline | None = None
+        if rows:
+            for part, lengths in self._lengths.items():
+                check_baseline(lengths, rows, f"{job.unit.environment}/{part}")
+        if rows and not self._adapts:
+            self._baseline = Baseline.fit(islice(job.data.train, job.plan.limit), rows)
+            self._lengths = {p: [n - rows for n in ns] for p, ns in self._lengths.items()}
         self._order = secrets.randbits(ORDER_BITS)
         self._probes = contract.probes(self._lengths, self._order)
         self._ordered = [*groups(self._lengths), self._probes]
@@ -128,6 +143,7 @@ class GroupedScoring:
             "seed": unit.seed,
             "horizon": unit.setting.horizon,
             "parameters": dict(unit.parameters),
+            "baseline": self._adapting,
             "train": train,
             "load": load,
             "save": save,
@@ -154,7 +170,7 @@ class GroupedScoring:
         cost = {name: getattr(outcome, name) for name in COSTS}
         known = {name: value for name, value in cost.items() if value is not None}
         cost = {**known, "steps_scored": steps}
-        return Scored(file=ScoreFile(parts, cost, self._order, explained))
+        return Scored(file=self._whole(ScoreFile(parts, cost, self._order, explained)))
 
     def in_process(self) -> Scored:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
@@ -164,6 +180,7 @@ class GroupedScoring:
             seed=unit.seed,
             horizon=unit.setting.horizon,
             parameters=unit.parameters,
+            baseline=self._adapting,
         )
         detector.fit([*map(self._visible, islice(self._job.data.train, limit))])
         chunks = ([*self._members(group)] for group in self._groups)
@@ -177,15 +194,39 @@ class GroupedScoring:
                 copy.deepcopy(detector), [*self._members(group)]
             )
         ]
-        return Scored(file=ScoreFile(parts, {}, self._order, self._explanations(explained, parts)))
+        scores = ScoreFile(parts, {}, self._order, self._explanations(explained, parts))
+        return Scored(file=self._whole(scores))
+
+    @property
+    def _adapting(self) -> int:
+        """The number of baseline rows for a detector that adapts to them, else 0."""
+        return self._rows if self._adapts else 0
+
+    def _whole(self, scores: ScoreFile) -> ScoreFile:
+        """Return scores and explanations of whole episodes, undefined in their baseline rows."""
+        rows = self._rows
+        if not rows:
+            return scores
+        # Of a detector that adapts these rows were scored, too.
+        start = rows if self._adapts else 0
+        parts = {
+            part: [np.concatenate([np.full(rows, np.nan), one[start:]]) for one in arrays]
+            for part, arrays in scores.parts.items()
+        }
+        explained = {
+            part: [_behind(one[:, start:], rows, rows - start) for one in arrays]
+            for part, arrays in scores.explained.items()
+        }
+        return replace(scores, parts=parts, explained=explained)
 
     def _members(self, group: Sequence[Probe]) -> Iterator[Trajectory]:
-        return (self._visible(self._sets[p.part][p.index][: p.rows]) for p in group)
+        return (self._visible(self._sets[p.part][p.index])[: p.rows] for p in group)
 
     def _visible(self, trajectory: Trajectory) -> Trajectory:
         """Return what the detector may see: no actions, unless it declares that it uses them."""
         withheld = self._job.unit.inputs == "observations"
-        return trajectory.without_actions() if withheld else trajectory
+        judged = self._baseline.judged(trajectory) if self._baseline else trajectory
+        return judged.without_actions() if withheld else judged
 
     def _placed(self, returned: list[list[object]], warm_up: object) -> dict[str, list[Scores]]:
         """Check the scores of all groups; raise `ContractError`, or return them by part."""
@@ -198,7 +239,13 @@ class GroupedScoring:
             for (part, i, rows), array in zip(map(astuple, group), scores[k], strict=True):
                 where = f"{unit.environment}/{part}[{i}]"
                 checked = contract.check_scores(
-                    array, rows, horizon=horizon, warm_up=warm_up, detector=detector, where=where
+                    array,
+                    rows,
+                    horizon=horizon,
+                    warm_up=warm_up,
+                    detector=detector,
+                    where=where,
+                    baseline=self._adapting,
                 )
                 if group is self._probes:
                     contract.check_prefix(
@@ -256,11 +303,23 @@ def _with_kept_fit(
     return outcome
 
 
+def _behind(explained: Named, rows: int, shift: int) -> Named:
+    """Return an explanation behind undefined rows; what it calls onsets are `shift` rows later."""
+    onsets = np.where(explained[1] < 0, -1, explained[1] + shift)
+    known = np.stack([explained[0], onsets])
+    return np.concatenate([np.full((2, rows), -1), known], axis=1).astype(np.int32)
+
+
 def groups(lengths: Mapping[str, Sequence[int]]) -> list[list[Probe]]:
     """Return whole trajectories in groups of one part, at most as many as there are twins.
 
-    All have that size but the last one of calibration, where the twins do not divide it.
+    All have that size but the last one of calibration, where the twins do not divide it. Without
+    twins test parts have sizes of their own: the smallest of these is the most, but for small ones
+    `LEAST_GROUP`. So no size tells calibration from test.
     """
-    size = max(1, len(lengths.get(TWINS, ())))
+    sizes = {len(ns) for part, ns in lengths.items() if part.startswith("test/") and ns}
+    size = min(sizes, default=1)
+    if len(sizes) > 1:
+        size = max(size, LEAST_GROUP)
     every = [[Probe(part, i, n) for i, n in enumerate(ns)] for part, ns in lengths.items()]
     return [part[i : i + size] for part in every for i in range(0, len(part), size)]

@@ -31,7 +31,13 @@ from oodd_eval.plugins.conformance.trial import (
     shared_trial,
     trial,
 )
-from oodd_eval.plugins.contract import TOLERANCE, Detector, StorableDetector, check_scores
+from oodd_eval.plugins.contract import (
+    TOLERANCE,
+    Detector,
+    StorableDetector,
+    check_scores,
+    difference,
+)
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
@@ -41,6 +47,7 @@ __all__ = ["shared_trial", "trial"]  # fixtures
 LEAST_AUC = 0.75  # least probability that a gross anomaly scores above its nominal twin
 
 _OTHER_SENSORS = 7
+_BASELINE = 20
 
 
 def test_factory(trial: Trial) -> None:
@@ -135,6 +142,22 @@ def test_warm_up(trial: Trial) -> None:
     )
 
 
+def test_baseline(trial: Trial) -> None:
+    """A detector that adapts takes the number of baseline rows, and learns from them."""
+    if trial.spec.adapts != "baseline":
+        pytest.skip("does not adapt to baseline rows")
+    trial.fitted()
+    rows, trajectories = _BASELINE + trial.horizon, trial.nominal(2)
+    detector = trial.fit(baseline=rows)
+    _check_scores(trial, detector, trial.horizon, trajectories, rows)
+    assert any(
+        difference(trial.scores(x, detector)[rows:], trial.scores(x)[rows:]) for x in trajectories
+    ), (
+        f"scores with baseline={rows} are those without it: learn from the first rows, or leave "
+        "adapts out of the spec"
+    )
+
+
 def test_horizon(trial: Trial) -> None:
     """Another horizon is honoured: undefined for no more rows than it, scores beyond them."""
     # Not the one of all the other checks, and long enough to tell from a fixed block.
@@ -144,7 +167,11 @@ def test_horizon(trial: Trial) -> None:
 
 
 def _check_scores(
-    trial: Trial, detector: Detector, horizon: int, trajectories: Sequence[Trajectory]
+    trial: Trial,
+    detector: Detector,
+    horizon: int,
+    trajectories: Sequence[Trajectory],
+    baseline: int = 0,
 ) -> None:
     """Check scores as a run does."""
     for trajectory in trajectories:
@@ -155,6 +182,7 @@ def _check_scores(
             warm_up=getattr(detector, "warm_up", 0),
             detector=trial.spec.name or type(detector).__name__,
             where=f"an episode, fitted with horizon {horizon}",
+            baseline=baseline,
         )
 
 

@@ -64,10 +64,10 @@ def run_isolated(
 
     A detector that explains is asked to explain the groups `explained` in the same way, last.
 
-    The request names ``plugin`` and ``detector``, its ``parameters``, ``seed`` and ``horizon``, and
-    the number of trajectories to ``train`` on. ``load`` is the directory of a kept fit, which
-    replaces fitting; ``save`` is an empty directory where the detector may save its fit. One of the
-    two may be empty.
+    The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
+    perhaps ``baseline`` (see `make_detector`), and the number of trajectories to ``train`` on.
+    ``load`` is the directory of a kept fit, which replaces fitting; ``save`` is an empty directory
+    where the detector may save its fit. One of the two may be empty.
     Each iterable is read once, lazily and from another thread, the next one when the one before is
     exhausted. Scores come back in the order of the groups. When `stop` says True, the worker is
     killed and the status is ``"error"``. Only errors of reading the trajectories are raised.

@@ -178,7 +178,7 @@ def _make_detector(request: dict[str, Any]) -> Detector:
     gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
     spec = offer_of(request["plugin"], request["detector"]).spec
     arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    detector = make_detector(spec.factory, **arguments)
+    detector = make_detector(spec.factory, **arguments, baseline=request.get("baseline", 0))
     gc.enable()
     return detector
 

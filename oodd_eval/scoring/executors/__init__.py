@@ -17,12 +17,12 @@ LOCAL: Final = "local"  # the executor where none is named
 
 @dataclass(frozen=True, slots=True)
 class RunSettings:
-    """Settings of a run that have no influence on any metric.
+    """Settings of a run that change no metric.
 
     `jobs` are units at a time (None: one per core, or per thread of a cluster), `limits` those of
     each worker. `fresh` fits again what the results directory has. `executor` is ``"local"`` or
     ``"dask://HOST:PORT"``. After `deadline` seconds nothing new is begun. `command` is the command
-    line, for the provenance of records.
+    line, for the provenance of records. `row_metrics` adds metrics that are computed on request.
     """
 
     jobs: int | None = None
@@ -32,6 +32,7 @@ class RunSettings:
     executor: str = LOCAL
     deadline: float | None = None
     command: str = ""
+    row_metrics: bool = False
 
 
 class Executor:

@@ -1,0 +1,122 @@
+"""Share of nominal test episodes with an alarm beside the promise, on splits that were imported.
+
+``python benchmarks/promises.py SPLIT [...] [--detector NAMES] [--level 0.1] [--baseline B]
+[--shuffles 20]`` takes every environment of the splits that was imported from logs. Its nominal
+episodes, training, calibration and test as they follow one another, are judged in recorded order:
+as they are, with baseline rows (the split's, or B), with a rolling calibration, and with both.
+Then they are shuffled, split into parts of the same sizes and judged anew, which keeps the promise:
+printed is the mean share and how many standard errors it is above the level. Exit code 1 where that
+is more than 3.
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+from oodd_eval import load_split
+from oodd_eval.data.baseline import Baseline
+from oodd_eval.errors import OoddError
+from oodd_eval.metrics.alarms import Calibration, rolling_rules
+from oodd_eval.metrics.drift import drift_test
+from oodd_eval.plugins.contract import make_detector, score_chunk
+from oodd_eval.plugins.discovery import discover
+
+ROWS = "clock,comb,random,persistence,range,mahalanobis,mewma,mewma-a"
+SETTINGS = {"as it is": (False, False), "baseline": (True, False), "rolling": (False, True),
+            "both": (True, True)}  # fmt: skip
+
+
+def alarmed(spec, parts, level, *, rows=0, rolling=False, seed=0):
+    """Return whether each test episode alarms; parts are training, calibration and test."""
+    if rows:
+        base = Baseline.fit(parts[0], rows)
+        parts = [[base.judged(x) for x in part] for part in parts]
+    if spec.inputs == "observations":
+        parts = [[x.without_actions() for x in part] for part in parts]
+    detector = make_detector(spec.factory, seed=seed, horizon=1, parameters={})
+    detector.fit(parts[0])
+    calibration, test = (score_chunk(detector, part) for part in parts[1:])
+    known = Calibration.fit(calibration, spec.alarm)
+    rules = rolling_rules(known, test, level) if rolling else [known.rule(level)] * len(test)
+    return [rule.first(scores) is not None for rule, scores in zip(rules, test, strict=False)]
+
+
+def recorded_shares(spec, parts, level, rows):
+    """Return the share of test episodes with an alarm by setting; the reason where it is none."""
+    shares = {}
+    for name, (baseline, rolling) in SETTINGS.items():
+        if baseline and not rows:
+            continue
+        try:
+            found = alarmed(spec, parts, level, rows=rows if baseline else 0, rolling=rolling)
+            shares[name] = f"{100 * np.mean(found):.0f}"
+        except OoddError:
+            shares[name] = "-"
+    return shares
+
+
+def shuffled_share(spec, parts, level, rows, shuffles):
+    """Return the mean share over random orders, and its standard errors above the level.
+
+    The orders are drawn independently from the same episodes, so that their spread is what it is.
+    """
+    pool, ends = [x for part in parts for x in part], np.cumsum([len(part) for part in parts])[:-1]
+    shares = []
+    for draw in range(shuffles):
+        order = np.random.default_rng(draw).permutation(len(pool))
+        drawn = [[pool[k] for k in part] for part in np.split(order, ends)]
+        shares.append(np.mean(alarmed(spec, drawn, level, rows=rows, seed=draw)))
+    spread = np.std(shares, ddof=1) / np.sqrt(shuffles)
+    # Equal shares tell nothing of their spread; a promise that is kept has at least the binomial's.
+    error = max(spread, np.sqrt(level * (1 - level) / (shuffles * len(parts[2]))))
+    return np.mean(shares), (np.mean(shares) - level) / error
+
+
+def report(name, parts, rows, specs, level, shuffles):
+    """Print one environment; return whether every shuffled promise was kept."""
+    means = np.stack([x.observations.mean(axis=0) for part in parts for x in part])
+    drift = drift_test(means.astype(np.float64))
+    sizes = ", ".join(str(len(part)) for part in parts)
+    print(f"\n{name}: {sizes} episodes; drift {drift.statistic:.2f}, p = {drift.p:.3f}; B = {rows}")
+    kept = True
+    for spec in specs:
+        shares = recorded_shares(spec, parts, level, rows)
+        line = ", ".join(f"{setting} {share}" for setting, share in shares.items())
+        try:
+            share, errors = shuffled_share(spec, parts, level, rows, shuffles)
+        except OoddError as error:
+            print(f"  {spec.name:12} {line}; shuffled: {error}")
+            continue
+        kept &= errors <= 3
+        print(f"  {spec.name:12} {line}; shuffled {100 * share:.1f} ({errors:+.1f} s.e.)")
+    return kept
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("splits", nargs="+")
+    parser.add_argument("--detector", default=ROWS)
+    parser.add_argument("--level", type=float, default=0.10)
+    parser.add_argument("--baseline", type=int)
+    parser.add_argument("--shuffles", type=int, default=20)
+    options = parser.parse_args()
+    plugins = discover()
+    specs = [plugins.offer(name).spec for name in plugins.select(options.detector)]
+    kept = True
+    for name in options.splits:
+        split = load_split(name)
+        with split.opened() as opened:
+            for environment in split.environments:
+                data = opened(environment)
+                if data.logs is None:
+                    continue
+                rows = data.baseline if options.baseline is None else options.baseline
+                parts = [list(data.train), list(data.calibration), list(data.twins)]
+                label = f"{split.name}/{environment}"
+                kept &= report(label, parts, rows, specs, options.level, options.shuffles)
+    return 0 if kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,252 @@
+"""What speaks for and against a promise on false alarms, before anything has alarmed.
+
+The promise holds for episodes that are exchangeable with those of the calibration: for as many as
+the level takes, of a machine that does not drift, as long as those that are judged.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.metrics.alarms import (
+    STATISTICS,
+    AlarmKind,
+    Calibration,
+    least_episodes,
+    offered_levels,
+)
+from oodd_eval.metrics.catalogue import HEADLINE, LEVELS
+from oodd_eval.metrics.drift import SIGNIFICANT, PermutationTest, drift_test, two_sample_test
+
+Floats = NDArray[np.float64]
+
+Subject = Literal["episodes", "drift", "difference", "length", "achieved"]
+
+_NAMES: Final = {"cusum": "a CUSUM of the scores", "score": "a detector's own score"}
+
+_REMEDY: Final = (
+    "more episodes than promised may alarm; baseline rows, a rolling calibration, or calibration "
+    "episodes of the days that are judged help"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PromiseFinding:
+    """What was found out about a promise.
+
+    Attributes
+    ----------
+    subject
+        ``"episodes"``: how many the levels take. ``"drift"``: whether episodes follow their order.
+        ``"difference"`` and ``"length"``: whether calibration is like the nominal test episodes.
+        ``"achieved"``: the share of alarms among calibration episodes themselves.
+    text
+        One sentence, for users.
+    doubt
+        Whether it puts the promise in doubt.
+    p
+        Chance of as much in exchangeable episodes; NaN where nothing was tested.
+    sensor
+        The sensor that shows it most; empty where it is none.
+    """
+
+    subject: Subject
+    text: str
+    doubt: bool
+    p: float = math.nan
+    sensor: str = ""
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return self.text
+
+
+class EpisodeMeans(NamedTuple):
+    """Of n episodes the mean of each of D sensors, and the number of rows that are judged.
+
+    Attributes
+    ----------
+    means
+        Float64 array of shape (n, D).
+    lengths
+        Int64 array of shape (n,).
+    """
+
+    means: Floats
+    lengths: NDArray[np.int64]
+
+
+NO_EPISODES: Final = EpisodeMeans(np.empty((0, 0)), np.empty(0, np.int64))
+
+
+def promises(
+    train: EpisodeMeans,
+    calibration: EpisodeMeans,
+    nominal: EpisodeMeans = NO_EPISODES,
+    *,
+    sensors: Sequence[str] = (),
+    recorded: bool = True,
+    kinds: Sequence[AlarmKind] = STATISTICS,
+) -> list[PromiseFinding]:
+    """Return what speaks for and against promises that are calibrated with these episodes.
+
+    Parameters
+    ----------
+    train, calibration, nominal
+        Nominal episodes: of training, of the calibration, and further ones that are to be judged.
+    sensors
+        Names of the sensors.
+    recorded
+        Whether training, calibration and the others follow one another as they were recorded.
+    kinds
+        Statistics that are to be thresholds of.
+
+    Returns
+    -------
+    list of PromiseFinding
+        The number of episodes first, then what was tested.
+    """
+    findings = [enough_episodes(len(calibration.lengths), kinds)]
+    if recorded:
+        parts = [part.means for part in (train, calibration, nominal) if len(part.means)]
+        every = np.concatenate(parts) if parts else NO_EPISODES.means
+        findings.append(_drift(drift_test(every), len(every), sensors))
+    if len(calibration.means) and len(nominal.means):
+        test = two_sample_test(calibration.means, nominal.means)
+        findings.append(_difference(test, sensors))
+        findings.append(_length(calibration.lengths, nominal.lengths))
+    return findings
+
+
+def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseFinding:
+    """Tell which levels a number of calibration episodes is enough for.
+
+    Parameters
+    ----------
+    n
+        Number of calibration episodes.
+    kinds
+        Statistics.
+
+    Returns
+    -------
+    PromiseFinding
+        In doubt where the headline's level is out of reach.
+
+    Examples
+    --------
+    >>> print(enough_episodes(30))
+    30 calibration episodes: at 5 % 38 are needed for a CUSUM of the scores, 19 for a detector's \
+own score
+    """
+    offered = [offered_levels(n, kind) for kind in kinds]
+    missing = next((s for s in LEVELS if not all(s in levels for levels in offered)), None)
+    text = f"{n} calibration episodes: enough for all levels"
+    if missing is not None:
+        level = LEVELS[missing]
+        needed = [f"{least_episodes(level, kind)} {{}}for {_NAMES[kind]}" for kind in kinds]
+        listed = ", ".join(needed).replace("{}", "are needed ", 1).replace("{}", "")
+        text = f"{n} calibration episodes: at {100 * level:g} % {listed}"
+    return PromiseFinding("episodes", text, not all(HEADLINE in levels for levels in offered))
+
+
+def achieved_share(
+    calibration: Sequence[Floats], kind: AlarmKind, name: str = ""
+) -> PromiseFinding | None:
+    """Tell how many later calibration episodes alarm at a threshold from the earlier ones.
+
+    Parameters
+    ----------
+    calibration
+        Scores by episode, as recorded.
+    kind
+        The statistic.
+    name
+        Of the detector.
+
+    Returns
+    -------
+    PromiseFinding or None
+        None where half of the episodes are too few for any level.
+    """
+    half = len(calibration) // 2
+    offered = offered_levels(half, kind)
+    if not offered:
+        return None
+    level = next(iter(offered.values()))
+    earlier = Calibration.fit(calibration[:half], kind)
+    threshold = earlier.threshold(level)
+    later = [earlier.unbounded.largest(scores) for scores in calibration[half:]]
+    alarms = sum(statistic > threshold for statistic in later)
+    n = len(earlier.largest)
+    p = _beta_binomial_tail(alarms, len(later), math.floor((n + 1) * level + 1e-9), n)
+    return PromiseFinding(
+        "achieved",
+        f"{name}{': ' if name else ''}{alarms} of the {len(later)} later calibration episodes alarm"
+        f" at the threshold that the {half} earlier ones give for {100 * level:g} % (p = {p:.2g})",
+        p <= SIGNIFICANT,
+        p,
+    )
+
+
+def _sensor(column: int, sensors: Sequence[str]) -> str:
+    if column < 0:
+        return ""
+    return sensors[column] if column < len(sensors) else f"sensor {column}"
+
+
+def _drift(test: PermutationTest, n: int, sensors: Sequence[str]) -> PromiseFinding:
+    sensor, figures = _sensor(test.column, sensors), _figures(test)
+    text = f"no drift seen in {n} nominal episodes: most in the mean of {sensor} ({figures})"
+    if test.significant:
+        text = (
+            f"nominal episodes drift: the mean of {sensor} follows the order of all {n} ({figures})"
+            f", so that {_REMEDY}"
+        )
+    elif test.column < 0:
+        text = f"no drift: no sensor's mean varies over {n} nominal episodes"
+    return PromiseFinding("drift", text, test.significant, test.p, sensor)
+
+
+def _difference(test: PermutationTest, sensors: Sequence[str]) -> PromiseFinding:
+    sensor, figures = _sensor(test.column, sensors), _figures(test)
+    text = f"calibration is like the nominal test episodes ({figures})"
+    if test.significant:
+        text = (
+            f"calibration differs from the nominal test episodes, most in the mean of {sensor} "
+            f"({figures}), so that {_REMEDY}"
+        )
+    return PromiseFinding("difference", text, test.significant, test.p, sensor)
+
+
+def _figures(test: PermutationTest) -> str:
+    return f"rank correlation {test.statistic:.2f}, p = {test.p:.2g}"
+
+
+def _length(known: NDArray[np.int64], others: NDArray[np.int64]) -> PromiseFinding:
+    test = two_sample_test(*(n[:, None].astype(np.float64) for n in (known, others)))
+    rows = f"{np.median(known):g} rows in the median, nominal test episodes {np.median(others):g}"
+    shorter = test.significant and bool(known.mean() < others.mean())
+    text = f"calibration episodes have {rows}"
+    if shorter:
+        text += f" (p = {test.p:.2g}): longer ones have more time to alarm than was promised for"
+    return PromiseFinding("length", text, shorter, test.p)
+
+
+def _beta_binomial_tail(least: int, trials: int, above: int, n: int) -> float:
+    """Return the chance that at least so many of further episodes exceed n's (above)-th largest."""
+
+    def orders(first: int, second: int) -> float:
+        return math.lgamma(first + second + 1) - math.lgamma(first + 1) - math.lgamma(second + 1)
+
+    # Of all orders of n + trials, those with k of the trials above that one.
+    every = orders(n, trials)
+    logs = [
+        orders(above - 1, k) + orders(n - above, trials - k) - every
+        for k in range(least, trials + 1)
+    ]
+    return math.fsum(map(math.exp, logs))
