@@ -45,6 +45,10 @@ _SINGLE_THREAD: Final = (
     "LOKY_MAX_CPU_COUNT",
 )
 
+# Where pyarrow is installed, pandas and scikit-learn import it, and its allocator keeps a thread
+# that would run on after a fit: a process with threads cannot be forked.
+_QUIET_ALLOCATOR: Final = {"JE_ARROW_MALLOC_CONF": "background_thread:false"}
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:
@@ -249,4 +253,4 @@ def _environment(box: Sandbox | None) -> dict[str, str]:
     variables = {n: value for n, value in os.environ.items() if not n.startswith(steering)}
     kept = box.environment() if box else variables
     single = dict.fromkeys(_SINGLE_THREAD, "1")
-    return {**kept, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
+    return {**kept, **single, **_QUIET_ALLOCATOR, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
