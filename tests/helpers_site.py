@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from helpers_records import make_record
+from helpers_records import PAIRED, make_record
 
 from oodd_eval.data.condition import rungs_of
 from oodd_eval.leaderboard import site
@@ -23,7 +23,7 @@ from oodd_eval.leaderboard.entry import (
 )
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.auc import AlarmRule, Contribution
-from oodd_eval.metrics.catalogue import GUARANTEED, METRICS, RANKING
+from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.curve_file import write_curves
@@ -126,7 +126,7 @@ def describe(record, *, inputs="observations", **fields):
 
 def values(rng, level, n=4):
     """Numerators per metric over n trajectories; AUCs about a level."""
-    found = {name: list(np.round(rng.uniform(0, 0.2, n), 3)) for name in METRICS}
+    found = {name: list(np.round(rng.uniform(0, 0.2, n), 3)) for name in PAIRED}
     for name in ("auc", "auc_matched", "auc_smoothed", "auc_unpaired"):
         found[name] = [float(v) for v in np.clip(rng.normal(level, 0.05, n), 0, 1)]
     for name in ("delay", "delay_null", "delay_censored"):

@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from helpers_docs import parse
-from helpers_records import make_record
+from helpers_records import PAIRED, make_record
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +17,7 @@ from oodd_eval import load_split
 from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
 from oodd_eval.errors import UsageError
-from oodd_eval.metrics.catalogue import METRICS, NAMES
+from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import (
@@ -184,7 +184,7 @@ def test_what_failed_in_the_reference_already_does_not_fail():
 def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():
     changed = record(auc=0.4, auc_null=0.9, delay=0.4, far=0.6)
     found = against([changed], [record()])
-    judged = {m for m in METRICS if worse_side(m) != "±"}
+    judged = {m for m in PAIRED if worse_side(m) != "±"}
     assert {d.tolerance.metric for d in found.differences} == judged
     assert {d.tolerance.metric for d in found.failures} == {"auc", "far"}
 
@@ -309,7 +309,7 @@ def run(tmp_path, capsys, monkeypatch):
 def test_identical_results_are_exit_code_0_and_one_line(run, results, reference):
     code, out, err = run(results, "--against", reference)
     assert (code, err) == (0, "")
-    judged = sum(worse_side(m) != "±" for m in METRICS)
+    judged = sum(worse_side(m) != "±" for m in PAIRED)
     assert out == f"3 cells compared in {judged} metrics: {3 * judged} same.\n"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_records import example, make_record
+from helpers_records import PAIRED, example, make_record
 from helpers_site import submitted as entry
 
 from oodd_eval.cli.main import main
@@ -22,7 +22,7 @@ from oodd_eval.leaderboard.build import cells, page
 from oodd_eval.leaderboard.entry import read_entries, sections
 from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.metrics import catalogue
-from oodd_eval.metrics.catalogue import METRICS, UNDEFINED
+from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import board as results_board
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, expected_cells
@@ -37,7 +37,7 @@ SEEDS = 12
 
 def record(detector, matched, *, environment="hopper", anomaly="iid", **more):
     """A record of twelve test seeds with all metrics a board may show."""
-    values = {name: [0.5] * SEEDS for name in METRICS}
+    values = {name: [0.5] * SEEDS for name in PAIRED}
     values |= {"auc_matched": matched, "delay": [3.0] * (SEEDS - 1) + [None]}
     one = make_record(detector, environment, anomaly, values=values, **more)
     one = dataclasses.replace(one, counts={"test": SEEDS})

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from oodd_recording.calibrate import setup_of
 from oodd_recording.environments import Bullet, Simulator, make, quiet_streams
-from oodd_recording.record import SHORTEST_TWIN, Episode, record_anomalous
+from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, record_anomalous
 from oodd_recording.values import VALUES, spread_of
 
 from oodd_eval.data.facts import ENVIRONMENTS
@@ -45,7 +45,7 @@ def draw_pictures(
         yield f"{environment}/{kind}.svg", plot(environment, title, episode, twin).encode()
 
 
-def frame(environment: str, episode: Episode) -> Image:
+def frame(environment: str, episode: RecordedEpisode) -> Image:
     """Return the picture half-way through a nominal episode, of shape (height, width, 3)."""
     actions = episode.trajectory.actions[: episode.trajectory.transitions // 2]
     simulator = make(environment)
@@ -91,7 +91,7 @@ def png(image: Image) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
+def telling_sensor(environment: str, episode: RecordedEpisode, twin: RecordedEpisode) -> int:
     """Return the sensor that differs most from the twin's in the rows that are plotted, in spreads.
 
     Among the corrupted ones, or for an anomaly of the dynamics among all that may break.
@@ -104,7 +104,7 @@ def telling_sensor(environment: str, episode: Episode, twin: Episode) -> int:
     return max(among, key=lambda i: float(gap[i] / spread_of(environment)[i]))
 
 
-def plot(environment: str, title: str, episode: Episode, twin: Episode) -> str:
+def plot(environment: str, title: str, episode: RecordedEpisode, twin: RecordedEpisode) -> str:
     """Return an SVG picture of one sensor of an episode and of its twin around the onset."""
     sensor = telling_sensor(environment, episode, twin)
     onset, effect = episode.onset or 0, episode.effect or 0  # which may come much later

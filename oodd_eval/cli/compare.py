@@ -8,7 +8,7 @@ import click
 from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
-from oodd_eval.metrics.catalogue import NAMES, RANKING
+from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import expression, select
 from oodd_eval.results import compare as regression
 from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
@@ -28,7 +28,7 @@ LOG_WIDTH: Final = 160
 )
 @click.argument("results", type=FILE, help="results directory or file of records")
 @click.argument("rows", nargs=-1, metavar="[ROW ROW]", help="compare these, such as pe and rf")
-@click.option("--metric", default=RANKING, type=Name("metrics"), help="metric of that comparison")
+@click.option("--metric", type=Name("metrics"), help="metric of that comparison")
 @click.option("--against", type=FILE, help="likewise: what the results should come up to")
 @click.option(
     "--fail",
@@ -90,7 +90,7 @@ def _rows(now: RecordSet, options: Options) -> int:
     unknown: UnknownNameError | None = None
     for conditions, cells in now.boards.items():
         try:
-            compared = compare_rows(list(cells.values()), first, second, options.metric)
+            compared = compare_rows(list(cells.values()), first, second, options.metric or "")
             lines.append(f"{conditions}\n{compared}")
         except UnknownNameError as error:
             unknown = unknown or error

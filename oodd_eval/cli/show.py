@@ -1,5 +1,6 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
+from collections.abc import Mapping
 from typing import Final
 
 import click
@@ -11,13 +12,14 @@ from oodd_eval.cli import (
     Options,
     command,
     expression_option,
+    row_metrics_option,
     say,
     say_notes,
     together,
 )
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.split import load_split
+from oodd_eval.data.split import Split, load_split
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
@@ -44,10 +46,11 @@ _format_options: Final = together(
 @click.option("--split", type=Name("splits"), help="where the split is, if not at its usual place")
 @click.option("--stored", is_flag=True, help="print stored metrics without recomputing them")
 @click.option("--intervals", is_flag=True, help="print 95 % intervals")
+@row_metrics_option
 @click.option(
     "--detector", type=Name("detectors"), help="print the table by anomaly of one detector"
 )
-@click.option("--metric", default="auc_matched", type=Name("metrics"), help="metric of that table")
+@click.option("--metric", type=Name("metrics"), help="metric of that table")
 @click.option("--wide", is_flag=True, help="print all metrics, with nulls and all alarm levels")
 @_format_options
 @click.option("--env", default="all", type=Names("envs"), help="only these environments")
@@ -57,15 +60,19 @@ def show(options: Options) -> int:
 
     The exit code is 1 when one of the cells failed.
     """
-    check_known("metric", NAMES, options.metric)
+    if options.metric:
+        check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()
     known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
     chosen = select("environment", options.env, known)
     passes = expression(options.expression)
     records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
+    units: dict[str, str] = {}
     if not options.stored:
-        records = _recomputed(records, results, options.split)
+        splits = _splits(records, options.split)
+        records = _recomputed(records, results, splits, rows=options.row_metrics)
+        units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}
     say_notes(results.notes)
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
@@ -78,7 +85,8 @@ def show(options: Options) -> int:
         intervals=options.intervals,
         detail="full" if layout else "wide" if options.wide else "brief",
         detector=options.detector or "",
-        metric=options.metric,
+        metric=options.metric or "",
+        units=units,
     )
     if layout:
         print(layout.render(report), end="")
@@ -91,12 +99,20 @@ def show(options: Options) -> int:
     return code
 
 
-def _recomputed(records: list[Record], results: ResultsDirectory, at: str | None) -> list[Record]:
+def _splits(records: list[Record], at: str | None) -> dict[str, Split]:
+    """Open the splits of records, by their digests."""
+    # A split that is not the published one carries its digest behind its name.
+    names = {r.split_digest: at or r.split.partition("@")[0] for r in records}
+    return {digest: load_split(name) for digest, name in names.items()}
+
+
+def _recomputed(
+    records: list[Record], results: ResultsDirectory, splits: Mapping[str, Split], *, rows: bool
+) -> list[Record]:
     """Rescore each split's records, and keep the order of all."""
     fresh: dict[object, Record] = {}
-    for name, digest in dict.fromkeys((r.split, r.split_digest) for r in records):
-        # A split that is not the published one carries its digest behind its name.
-        split = load_split(at or name.partition("@")[0])
+    for digest, split in splits.items():
         of_split = [r for r in records if r.split_digest == digest]
-        fresh |= {r.identity: r for r in rescore(of_split, results, split)}
+        again = rescore(of_split, results, split, row_metrics=rows)
+        fresh |= {r.identity: r for r in again}
     return [fresh[r.identity] for r in records]

@@ -29,9 +29,10 @@ from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
-from oodd_eval.results.report import Section
+from oodd_eval.results.report import Section, findings_of
 from oodd_eval.results.standings import primary_settings
 from oodd_eval.results.tables import Table
+from oodd_eval.results.unpaired import UnpairedTables
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -182,12 +183,15 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
+    of_scores = [tables.separability(board), *tables.alarms(ranks)]
+    if not board.paired:
+        unpaired = UnpairedTables(board, intervals=True, standings=ranks.standings)
+        of_scores = unpaired.overview(whole=True)
     body_tables = [
-        tables.separability(board),
-        *tables.alarms(ranks),
+        *of_scores,
         tables.attribution(board, intervals=True, standings=ranks.standings),
         tables.cost(ranks),
-        *_as_in_the_paper(board),
+        *(_as_in_the_paper(board) if board.paired else ()),
         tables.all_metrics(board),
         *tables.all_alarms(board),
         tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
@@ -195,7 +199,7 @@ def _section(section: LeaderboardSection) -> str:
     ]
     body = Section(
         _title(board),
-        findings=tables.findings(board),
+        findings=findings_of(board),
         tables=[table for table in body_tables if table],
         notes=tables.notes(board),
     )
@@ -205,7 +209,7 @@ def _section(section: LeaderboardSection) -> str:
         f"{size} As CSV: {files}.\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
         markdown_table(tables.ranking(ranks, section.trust)),
-        TEXTS["legend"],
+        TEXTS["legend" if board.paired else "unpaired-legend"],
         *markdown_list(tables.ranking_notes(ranks)),
         "",
         markdown_body(body),

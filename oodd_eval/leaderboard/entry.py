@@ -38,6 +38,7 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
 from oodd_eval.results.tables import Table
+from oodd_eval.results.unpaired import UnpairedTables
 
 _T = TypeVar("_T")
 
@@ -300,7 +301,8 @@ class LeaderboardSection:
         board = self.ranks.board
         split = re.sub(r"[^A-Za-z0-9-]+", "-", board.split.partition("@")[0])
         limit = f"-limit{board.limit}" if board.limit is not None else ""
-        return f"{split}-{board.digest[:12]}-protocol{board.protocol}{limit}"
+        twins = "" if board.paired else "-unpaired"
+        return f"{split}-{board.digest[:12]}-protocol{board.protocol}{limit}{twins}"
 
     def file(self, kind: str) -> str:
         """Return the relative name of the section's CSV file of a kind."""
@@ -335,8 +337,10 @@ def suite_sections(directory: Path) -> list[SuiteSection]:
     suites = []
     for path in filter(Path.is_dir, sorted((directory / SUITES).glob("*"))):
         for board in boards(ResultsDirectory(path).records()):
-            graded = strengths.strength_tables(board)
+            graded = strengths.strength_tables(board) if board.paired else []
             suite_tables = graded or [tables.separability(board)]
+            if not board.paired:
+                suite_tables = UnpairedTables(board).overview()
             suites.append(SuiteSection(path.name, board, suite_tables, graded=bool(graded)))
     return suites
 

@@ -14,16 +14,17 @@ from typing import Final, NamedTuple
 from oodd_eval.data.files import compress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import LeaderboardSection, SuiteSection
-from oodd_eval.metrics.catalogue import (
-    ALARM_RANKING,
-    FOUND_WITHIN,
-    HEADLINE,
-    RANKING,
-    UNDEFINED,
-    metric_info,
-)
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
-from oodd_eval.results.board import Board, Conditions, boards, expected_cells, grouped
+from oodd_eval.results.board import (
+    Board,
+    Conditions,
+    boards,
+    expected_cells,
+    grouped,
+    level_of,
+    ranked_by,
+)
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record, same_terms
@@ -40,13 +41,20 @@ from oodd_eval.results.tables import Mean, Table, texts
 
 PUBLISHED: Final = "published.jsonl.gz"
 
-ALARMS: Final = tuple(
-    f"{name}_{HEADLINE}" for name in (f"found_within_{FOUND_WITHIN[0]}", "missed", "false_episodes")
-)
-"""Metrics of guaranteed alarms that stand beside the one that ranks."""
+_SOON: Final = f"found_within_{FOUND_WITHIN[0]}"
 
-RANKED_BY: Final = (RANKING, ALARM_RANKING, *ALARMS)
-"""Metrics that the file has: those of the rankings, and those beside them."""
+_BESIDE: Final = {
+    _SOON: f"found in {FOUND_WITHIN[0]}",
+    "missed": "missed",
+    "false_episodes": "false",
+}
+"""Metrics of guaranteed alarms that stand beside the one that ranks, and their headings."""
+
+
+def kept_metrics(records: Sequence[Record]) -> tuple[str, ...]:
+    """Return the metrics that the file has of a board: those of its rankings, and those beside."""
+    return *ranked_by(records), *(f"{name}_{level_of(records)}" for name in _BESIDE)
+
 
 _OF_SUITE: Final = '"provenance": {"suite": '  # in the line of a record of a further suite
 
@@ -100,7 +108,7 @@ def published_bytes(
     records = [
         slim(
             record,
-            RANKED_BY,
+            kept_metrics(section.ranks.board.records),
             entry=section.sources[row.entry].meta.id,
             trust=section.trust[row.entry],
             primary=row.primary,
@@ -160,6 +168,11 @@ def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> Publ
     listed = "; ".join(map(str, by_conditions)) or "none"
     if any(known.split_digest == conditions.split_digest for known in by_conditions):
         advice = "run again with this version, without --limit, into another directory"
+    elif not conditions.paired and all(known.paired for known in by_conditions):
+        advice = (
+            "logs of your own have no board there: `oodd-eval compare` tells which of your rows is "
+            "better"
+        )
     else:
         name = conditions.split.partition("@")[0]
         advice = "run on a published split, such as --split mini"
@@ -171,7 +184,7 @@ def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> Publ
     )
 
 
-def slim(record: Record, metrics: Iterable[str] = RANKED_BY, **provenance: object) -> Record:
+def slim(record: Record, metrics: Iterable[str], **provenance: object) -> Record:
     """Return a record with the terms of some metrics alone, from which their values follow."""
     terms = {name: record.per_trajectory[name] for name in metrics if name in record.per_trajectory}
     return replace(
@@ -220,7 +233,8 @@ def placement(
     the same name takes the place of the board's. `primary` are the rows that an entry declares
     for its detectors. `UsageError`: the rows of the run have no cell in common.
     """
-    by_row = grouped(map(slim, records), lambda r: r.setting)
+    kept = kept_metrics(board.records)
+    by_row = grouped((slim(r, kept) for r in records), lambda r: r.setting)
     on_board = grouped(board.records, lambda r: r.setting)
     same = {r for r, records in by_row.items() if r in on_board and _within(records, on_board[r])}
     new = {row: records for row, records in by_row.items() if row not in same}
@@ -291,6 +305,9 @@ def rankings(
     Trust is by row; a row without is of no entry. Letters of tie groups stand behind a rank.
     """
     over = ranks.board.environments, ranks.board.anomalies
+    by_scores, by_alarms = (
+        metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
+    )
 
     def rows(
         standings: Iterable[Standing], ranking: Ranking, *metrics: str
@@ -304,30 +321,43 @@ def rankings(
             lines.append((row.entry, [rank, name, *texts(ranks.board, row.entry, columns)]))
         return lines
 
-    by_separability = rows(ranks.standings, ranks.ranking, RANKING)
+    by_separability = rows(ranks.standings, ranks.ranking, by_scores.name)
     order = {row: i for i, row in enumerate(ranks.alarms.ranks)}
     standings = sorted(
         ranks.standings, key=lambda row: (row.below, order.get(str(row.entry), len(order)))
     )
-    by_alarms = rows(standings, ranks.alarms, ALARM_RANKING, *ALARMS)
-    level = metric_info(ALARM_RANKING).level
+    level, suffix = f"at {by_alarms.level}", ranks.board.level
+    names = [f"{name}_{suffix}" for name in _BESIDE]
+    if not ranks.board.paired:
+        names = ranks.board.present(names)
+    lines = rows(standings, ranks.alarms, by_alarms.name, *names)
+    censored = by_alarms.unit == "steps"
+    what = "censored delay (steps)" if censored else f"{by_alarms.title.removesuffix(level)}(%)"
+    header = [
+        "delay" if censored else "found",
+        *(_BESIDE[n.removesuffix(f"_{suffix}")] for n in names),
+    ]
     return [
         Table(
-            "Ranking by separability: matched AUC (%), higher is better",
-            ["rank", "row", "matched AUC", "trust"],
+            f"Ranking by separability: {by_scores.title} (%), higher is better",
+            ["rank", "row", by_scores.title, "trust"],
             [[*line, trust.get(entry, UNDEFINED)] for entry, line in by_separability],
             labels=2,
         ),
         Table(
-            f"Ranking by guaranteed alarms at {level}: censored delay (steps), lower is better",
-            ["rank", "row", "delay", f"found in {FOUND_WITHIN[0]}", "missed", "false"],
-            [line for _, line in by_alarms],
+            f"Ranking by guaranteed alarms {level}: {what}, {by_alarms.better} is better",
+            ["rank", "row", *header],
+            [line for _, line in lines],
             labels=2,
-            note="The delay counts a miss as the rest of its episode. The shares (%) are of "
-            "episodes found within so many steps, of those missed, and of nominal episodes with "
-            "an alarm.",
+            note=_DELAYS if censored else "",
         ),
     ]
+
+
+_DELAYS: Final = (
+    "The delay counts a miss as the rest of its episode. The shares (%) are of episodes found "
+    "within so many steps, of those missed, and of nominal episodes with an alarm."
+)
 
 
 def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
@@ -337,9 +367,12 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
     """
     lines = []
     near = {str(s.entry) for s in ranks.standings if s.primary and not s.below}
-    for ranked_by, ranking, metric in (
-        ("matched AUC", ranks.ranking, RANKING),
-        ("delay", ranks.alarms, ALARM_RANKING),
+    by_scores, by_alarms = (
+        metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
+    )
+    for title, ranking, metric in (
+        (by_scores.title, ranks.ranking, by_scores.name),
+        ("delay" if by_alarms.unit == "steps" else "found", ranks.alarms, by_alarms.name),
     ):
         pairs = (c for c in ranking.comparisons if c.first == str(row) and c.second in near)
         tests = {c.second: c for c in pairs}
@@ -352,7 +385,7 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
             better = "better" if tests[neighbour].better else "tie"
             verdict = "worse" if neighbour in worse else better
             difference = _difference(tests[neighbour], metric)
-            lines.append([ranked_by, neighbour, str(ranking.ranks[neighbour]), difference, verdict])
+            lines.append([title, neighbour, str(ranking.ranks[neighbour]), difference, verdict])
     header = ["metric", "against", "rank", "difference", "verdict"]
     note = "Paired differences over the same test episodes, this row minus the other."
     title = f"{row} and the rows next to it"

@@ -11,11 +11,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from oodd_eval.data.condition import Condition, conditions_of
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, in_order
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, SPLITS, in_order
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells
-from oodd_eval.metrics.catalogue import NAMES, metric_info
+from oodd_eval.metrics.catalogue import ALARM_RANKING, HEADLINE, LEVELS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
@@ -26,17 +26,21 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions under which records can be compared; of the split, the digest decides."""
+    """Conditions under which records can be compared; of the split, the digest decides.
+
+    Environments with twins and without have other metrics, so `paired` tells them apart.
+    """
 
     split: str = field(compare=False)
     split_digest: str
     protocol: int
     limit: int | None
+    paired: bool = True
 
     @classmethod
     def of(cls, record: Record) -> "Conditions":
         """Return the conditions of a record."""
-        return cls(record.split, record.split_digest, record.protocol, record.limit)
+        return cls(record.split, record.split_digest, record.protocol, record.limit, record.paired)
 
     def __str__(self) -> str:
         limit = f", limit {self.limit}" if self.limit is not None else ""
@@ -61,7 +65,7 @@ class Value(NamedTuple):
 
 
 class Board:
-    """Records of one split digest, protocol and limit, see `boards`.
+    """Records of one split digest, protocol and limit, with twins or without, see `boards`.
 
     Parameters
     ----------
@@ -69,6 +73,16 @@ class Board:
         At least one.
     expected
         Environments and conditions that every row should have; by default `expected_cells`.
+
+    Attributes
+    ----------
+    paired
+        Whether each anomalous episode has a nominal twin.
+    level
+        Suffix of the level of guaranteed alarms that rows are ranked at: 5 %, or without twins
+        10 % where more rows have that.
+    ranking, alarm_ranking
+        Names of the metrics that rows are ordered and ranked by.
     """
 
     def __init__(self, records: Sequence[Record], expected: Collection[Position] = ()) -> None:
@@ -76,6 +90,9 @@ class Board:
         self.conditions = Conditions.of(self.records[0])
         self.split, self.digest = self.conditions.split, self.conditions.split_digest
         self.protocol, self.limit = self.conditions.protocol, self.conditions.limit
+        self.paired = self.conditions.paired
+        self.level = level_of(self.records)
+        self.ranking, self.alarm_ranking = ranked_by(self.records)
         self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
         cells = expected or expected_cells(self.records)
         self._expected = {(e, Condition.parse(condition).anomaly) for e, condition in cells}
@@ -95,6 +112,15 @@ class Board:
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
         return [a for a in self.anomalies if self._groups[a] == group]
+
+    @property
+    def groups(self) -> dict[str, list[str]]:
+        """The anomalies of each group that some have; without twins there are two groups or none.
+
+        Logs name groups where they like to: one alone tells nothing.
+        """
+        groups: dict[str, list[str]] = {g: kinds for g in GROUPS if (kinds := self.in_group(g))}
+        return groups if self.paired or len(groups) > 1 else {}
 
     def test_seeds(self) -> list[int]:
         """Return the numbers of test trajectories per cell that occur."""
@@ -167,6 +193,43 @@ class Board:
         return list(reversed(units.values()))
 
 
+def ranked_by(records: Sequence[Record]) -> tuple[str, str]:
+    """Return the metrics that the rows of a board are ranked by: of separability, and of alarms.
+
+    Without twins they are those of anomalous rows, or where only outcomes are known those of these.
+
+    Parameters
+    ----------
+    records
+        Of one board.
+    """
+    if records[0].paired:
+        return RANKING, ALARM_RANKING
+    level = level_of(records)
+    present = {name for record in records for name in record.metrics}
+    if "auc_outcome" in present and f"delay_censored_{level}" not in present:
+        return "auc_outcome", f"found_outcome_{level}"
+    return "auc_pool", f"delay_censored_{level}"
+
+
+def level_of(records: Sequence[Record]) -> str:
+    """Return the suffix of the level that a board's tables show: the headline's, or a weaker one.
+
+    With twins it is the headline's; without, the one that most records have.
+    """
+    if records[0].paired:
+        return HEADLINE
+    usual = usual_levels()
+    counts = [sum(f"false_episodes_{s}" in r.metrics for r in records) for s in usual]
+    return usual[counts.index(max(counts))]
+
+
+def usual_levels() -> list[str]:
+    """Return the suffixes of the headline's level and of weaker ones, the strictest first."""
+    weaker = (suffix for suffix, share in LEVELS.items() if share >= LEVELS[HEADLINE])
+    return sorted(weaker, key=LEVELS.__getitem__)
+
+
 def expected_cells(records: Sequence[Record]) -> set[Position]:
     """Return the environments and conditions in which a row of a board has to have a result.
 
@@ -186,6 +249,12 @@ def expected_cells(records: Sequence[Record]) -> set[Position]:
     return {cell for cell, n in counts.items() if 2 * n >= len(rows)}
 
 
+def cells_with(metric: str, records: Iterable[Record]) -> set[Position]:
+    """Return the environments and conditions in which any of some records has a metric's value."""
+    with_terms = (r for r in records if metric in r.per_trajectory)
+    return {r.position for r in with_terms if not math.isnan(contribution(r, metric).value)}
+
+
 def boards(records: Sequence[Record]) -> list[Board]:
     """Sort records into boards: no table mixes split digests, protocols or limits."""
     return [Board(group) for group in grouped(records, Conditions.of).values()]
@@ -201,8 +270,13 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's numerators and denominators of a metric."""
-    numerators, denominators = record.per_trajectory[metric]
-    return Contribution(numerators, denominators, _is_median(metric))
+    terms, nominal = record.per_trajectory[metric], _nominal(record)
+    return Contribution(terms[0], terms[1], _is_median(metric), nominal=nominal)
+
+
+def _nominal(record: Record) -> int | None:
+    """Return with how many nominal test episodes terms begin; None where episodes have twins."""
+    return None if record.paired else record.counts["nominal"]
 
 
 def _is_median(metric: str) -> bool:
@@ -216,21 +290,24 @@ def _mean_of(
 
     Thresholds are no ratios of sums, and have no terms.
     """
-    by_shape: dict[tuple[str, int], list[Record]] = {}
+    by_shape: dict[tuple[str, str, int | None, int], list[Record]] = {}
     values = []
     for r in records:
         if metric in r.per_trajectory:
-            shape = r.environment, len(r.per_trajectory[metric][0])
-            by_shape.setdefault(shape, []).append(r)
+            # Each condition without twins has a sample of its own.
+            condition = "" if r.paired else str(r.condition)
+            size = len(r.per_trajectory[metric][0])
+            by_shape.setdefault((r.environment, condition, _nominal(r), size), []).append(r)
         else:
             values.append((r.seed, r.value(metric)))
     cells = []
-    for (environment, _), group in by_shape.items():
+    for (environment, condition, nominal, _), group in by_shape.items():
         terms = np.array([r.per_trajectory[metric] for r in group])
         seeds = [r.seed for r in group]
-        median = _is_median(metric)
-        cells.append(DrawnCells(environment, seeds, terms[:, 0], terms[:, 1], median=median))
-        values += zip(seeds, cells[-1].values, strict=True)
+        both = terms[:, 0], terms[:, 1]
+        drawn = DrawnCells(environment, seeds, *both, _is_median(metric), nominal, condition)
+        cells.append(drawn)
+        values += zip(seeds, drawn.values, strict=True)
     ends = NAN, NAN
     if intervals and cells:
         ends = mean_interval(cells, kind=metric_info(metric).interval)

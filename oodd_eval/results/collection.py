@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
-from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData
+import numpy as np
+
+from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, LabelledSet
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
-from oodd_eval.metrics.catalogue import HEADLINE, RANKING, metric_info
+from oodd_eval.metrics.alarms import GuaranteedAlarm
+from oodd_eval.metrics.catalogue import LEVELS, metric_info
 from oodd_eval.names import check_known, select
 from oodd_eval.results import plots
-from oodd_eval.results.board import boards
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.board import Conditions, boards, level_of
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
-from oodd_eval.results.strengths import DETECTION, Point, curve, threshold_rows
+from oodd_eval.results.strengths import DETECTION, NO_UNITS, Point, curve, threshold_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,7 +81,8 @@ class Results(Sequence[Record]):
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""
         failures = (f"{r.status}: {r.cell}: {r.reason}" for b in boards(self) for r in b.failures())
-        tables = FORMATS["html"].render(Report(self.records, detail="brief"))
+        units = self._split.units if self._split else NO_UNITS
+        tables = FORMATS["html"].render(Report(self.records, detail="brief", units=units))
         return "".join(f"<p>{escape(text)}</p>\n" for text in (repr(self), *failures)) + tables
 
     @property
@@ -92,13 +95,14 @@ class Results(Sequence[Record]):
         """True if no cell failed."""
         return all(r.ok for r in self.records)
 
-    def mean(self, metric: str = RANKING, row: str = "") -> float:
+    def mean(self, metric: str = "", row: str = "") -> float:
         """Return a row's mean of a metric over all cells, as the tables have it.
 
         Parameters
         ----------
         metric
-            See ``oodd-eval list metrics``.
+            See ``oodd-eval list metrics``; by default the one that tables order rows by:
+            ``auc_matched``, or ``auc_pool`` where episodes have no twins.
         row
             Name of the row.
 
@@ -112,12 +116,14 @@ class Results(Sequence[Record]):
         UnknownNameError, UsageError
             For an unknown metric or row, or without a name where there are several rows.
         """
-        metric_info(metric)
+        if metric:
+            metric_info(metric)
         setting = self._row(row)
         (board,) = boards([r for r in self.records if r.setting == setting])
-        return board.mean(setting, board.environments, board.anomalies, metric).value
+        name = metric or board.ranking
+        return board.mean(setting, board.environments, board.anomalies, name).value
 
-    def compare(self, first: str, second: str, metric: str = RANKING) -> PairedComparison:
+    def compare(self, first: str, second: str, metric: str = "") -> PairedComparison:
         """Tell whether one row is better than another, by the paired bootstrap over test seeds.
 
         Parameters
@@ -125,7 +131,7 @@ class Results(Sequence[Record]):
         first, second
             Names of the rows.
         metric
-            Any metric that is a mean over trajectories.
+            Any metric that is a mean over trajectories; by default the one of `mean`.
 
         Returns
         -------
@@ -232,6 +238,9 @@ class Results(Sequence[Record]):
     ) -> Figure:
         """Draw an episode: the sensors that leave their twin's course, and the statistic.
 
+        Without a twin they are the sensors that are farthest from nominal episodes, and the rows
+        that are known to be anomalous are shaded.
+
         Parameters
         ----------
         environment, anomaly, i, row, seed
@@ -250,6 +259,8 @@ class Results(Sequence[Record]):
 
     def plot_power(self, *rows: str) -> Figure:
         """Draw which share of episodes has an alarm at 5 % by how many rows after the effect.
+
+        Without twins it is at the level that tables show, from the start of the first interval.
 
         Parameters
         ----------
@@ -330,20 +341,59 @@ class Results(Sequence[Record]):
                 must_be_of(split, record)
                 data: EnvironmentData = opened(split)(record.environment)
                 file = stored_scores([record], self._directory, data)
-                anomalous = data.anomalous(record.condition)
                 sensors = tuple(sensor.name for sensor in data.sensors)
-                rule = Rules.fit(file.parts[CALIBRATION], record.alarm).guaranteed.get(HEADLINE)
-                episodes = zip(
-                    itertools.repeat(record.cell),
-                    itertools.count(),
-                    file.parts[record.condition.part],
-                    file.parts[TWINS],
-                    anomalous,
-                    data.twins,
-                    anomalous.onsets.tolist(),
-                    anomalous.effects.tolist(),
-                    itertools.repeat(sensors),
-                    itertools.repeat(rule),
-                    strict=False,  # under a limit there are scores of the first episodes only
-                )
-                yield list(itertools.starmap(ScoredEpisode, episodes))
+                of_board = [r for r in self.records if Conditions.of(r) == Conditions.of(record)]
+                joining = file.parts[TWINS] if record.rolling else None
+                rules = Rules.fit(file.parts[CALIBRATION], record.alarm, joining)
+                level = level_of(of_board)
+                rule = rules.guaranteed.get(level)
+                if not data.paired:
+                    yield _without_twins(record, file, data, rule, level)
+                    continue
+                anomalous = data.anomalous(record.condition)
+                yield [
+                    ScoredEpisode(
+                        record.cell,
+                        i,
+                        scores,
+                        file.parts[TWINS][i],
+                        anomalous[i],
+                        data.twins[i],
+                        int(anomalous.onsets[i]),
+                        int(anomalous.effects[i]),
+                        sensors,
+                        rule,
+                    )
+                    for i, scores in enumerate(file.parts[record.condition.part])
+                ]
+
+
+def _without_twins(
+    record: Record, file: ScoreFile, data: EnvironmentData, rule: GuaranteedAlarm | None, level: str
+) -> list[ScoredEpisode]:
+    """Return the episodes of a cell whose environment has no twins."""
+    episodes = data.test_set(record.condition)
+    intervals = episodes.intervals if isinstance(episodes, LabelledSet) else [()] * len(episodes)
+    reference = data.twins if len(data.twins) else data.train
+    rows = np.concatenate([episode.observations for episode in reference])
+    nominal = np.array([rows.mean(axis=0, dtype=float), rows.std(axis=0, dtype=float)])
+    starts = [next((start for start, _ in one[:1] if start >= 0), None) for one in intervals]
+    sensors = tuple(sensor.name for sensor in data.sensors)
+    return [
+        ScoredEpisode(
+            record.cell,
+            i,
+            scores,
+            None,
+            episodes[i],
+            None,
+            starts[i],
+            starts[i],
+            sensors,
+            rule,
+            intervals[i],
+            nominal,
+            LEVELS[level],
+        )
+        for i, scores in enumerate(file.parts[record.condition.part])
+    ]

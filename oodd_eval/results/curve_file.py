@@ -13,15 +13,16 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, conlist, create_model
 
 from oodd_eval.data import files
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
+from oodd_eval.data.condition import NOMINAL
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, NAME_PATTERN
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import AlarmRule
-from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
+from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds, unpaired_curves
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.evaluate import must_be_of, stored_scores
+from oodd_eval.results.evaluate import must_be_of, stored_scores, unpaired_scores
 from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1  # version of the layout; a reader refuses others
@@ -40,24 +41,29 @@ def make_curves(
             must_be_of(split, record)
             data = environment(record.environment)
             scores = stored_scores([record], results, data).parts
+            if record.condition == NOMINAL or not scores[TWINS]:
+                continue  # there is nothing to find, or nothing to compare with
             if record.scores not in fitted:
                 rule = AlarmRule(Standardization.fit(scores[CALIBRATION]))
                 at = thresholds(scores[TWINS], rule)
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
-            anomalous = scores[record.condition.part]
-            known = data.anomalous(record.condition)
-            onsets, effects = (
-                part[: len(anomalous)].tolist() for part in (known.onsets, known.effects)
-            )
-            curves = cell_curves(sweep, rule, anomalous, onsets, effects)
+            if data.paired:
+                anomalous, known = scores[record.condition.part], data.anomalous(record.condition)
+                onsets, effects = (
+                    part[: len(anomalous)].tolist() for part in (known.onsets, known.effects)
+                )
+                curves = cell_curves(sweep, rule, anomalous, onsets, effects)
+            else:
+                curves = unpaired_curves(unpaired_scores(record, scores, data), sweep, rule)
             units.append({"cell": str(record.cell), **identity(record), **curves})
     return {"schema": SCHEMA, "units": units}
 
 
 def identity(record: Record) -> dict[str, Any]:
     """Return the fields of a cell's curves that its record has, too."""
-    names = ("detector", "horizon", "seed", "overrides", "environment", "anomaly")
+    names = ["detector", "horizon", "seed", "overrides", "environment", "anomaly"]
+    names += ["paired"] * (not record.paired)
     return {name: getattr(record, name) for name in names}
 
 
@@ -80,15 +86,11 @@ def read_curves(path: Path | str) -> dict[str, Any]:
 
 def check_curves(plain: Any, where: str) -> dict[str, Any]:
     """Return a JSON value if it is the content of ``curves.json``; see `read_curves`."""
-    try:
-        _layout().validate_python(plain)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        # A field that does not belong there may have any name.
-        path = "".join(
-            f"[{p}]" if isinstance(p, int) else f".{ascii(p)[1:-1]:.60}" for p in first["loc"]
-        )
-        raise _wrong(f"{where}: {path.removeprefix('.')}", first["input"], first["msg"]) from None
+    layout, of_twins, of_logs = _layouts()
+    _hold_to(layout, plain, where)
+    for i, unit in enumerate(plain["units"]):
+        unpaired = isinstance(unit, dict) and unit.get("paired") is False
+        _hold_to(of_logs if unpaired else of_twins, unit, where, f"units[{i}]")
     whole: dict[str, Any] = plain
     if whole["schema"] != SCHEMA:
         problem = f"expected {SCHEMA}: it was written by another version of oodd-eval"
@@ -111,6 +113,19 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
     return whole
 
 
+def _hold_to(layout: TypeAdapter[Any], plain: Any, where: str, at: str = "") -> None:
+    """Raise `ResultsError` for the first field of a value that is not as a layout has it."""
+    try:
+        layout.validate_python(plain)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        # A field that does not belong there may have any name.
+        path = at + "".join(
+            f"[{p}]" if isinstance(p, int) else f".{ascii(p)[1:-1]:.60}" for p in first["loc"]
+        )
+        raise _wrong(f"{where}: {path.removeprefix('.')}", first["input"], first["msg"]) from None
+
+
 def strict_model(**types: Any) -> Any:
     """Return a model of JSON objects that have these fields, no others, and only finite numbers.
 
@@ -124,8 +139,11 @@ def strict_model(**types: Any) -> Any:
 
 
 @functools.cache
-def _layout() -> TypeAdapter[Any]:
-    """Return the reader of the layout: fields, types and ranges of single values."""
+def _layouts() -> tuple[TypeAdapter[Any], TypeAdapter[Any], TypeAdapter[Any]]:
+    """Return readers of the file, of a cell with twins, and of one without.
+
+    They know fields, types and ranges of single values.
+    """
 
     def numbers(item: Any) -> Any:
         return conlist(item, max_length=LONGEST)
@@ -136,29 +154,44 @@ def _layout() -> TypeAdapter[Any]:
     amounts = numbers(Annotated[float, Field(ge=0, le=LARGEST)])
     scores = numbers(Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None)
     # fmt: off
+    common = {
+        "cell": str, "detector": str, "horizon": int, "seed": int, "overrides": dict[str, Any],
+        "roc": strict_model(fpr=rates, tpr=rates),
+    }
+    example = {"index": row, "length": row, "start": row, "scores": scores, "cusum": amounts,
+        "alarms": numbers(row)}
     unit = strict_model(
-        cell=str, detector=str, horizon=int, seed=int, overrides=dict[str, Any],
-        environment=Literal[*ENVIRONMENTS], anomaly=Literal[*ANOMALIES],
-        roc=strict_model(fpr=rates, tpr=rates),
+        **common, environment=Literal[*ENVIRONMENTS], anomaly=Literal[*ANOMALIES],
         delay_far=strict_model(threshold=amounts, far=rates, delay_censored=amounts, missed=rates,
             null_censored=amounts),
-        example=strict_model(index=row, auc_matched=rate | None, onset=row, length=row, start=row,
-            scores=scores, twin=scores, cusum=amounts, twin_cusum=amounts,
-            alarms=numbers(row), twin_alarms=numbers(row)),
+        example=strict_model(**example, auc_matched=rate | None, onset=row, twin=scores,
+            twin_cusum=amounts, twin_alarms=numbers(row)),
+    )
+    name = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$")]
+    end: Any = Annotated[int, Field(ge=-1, le=10**9)]
+    interval = conlist(end, min_length=2, max_length=2)
+    unpaired = strict_model(
+        **common, paired=Literal[False], environment=name, anomaly=name,
+        delay_far=strict_model(threshold=amounts, far=rates, delay_censored=amounts, missed=rates),
+        example=strict_model(**example, auc_pool=rate | None, intervals=numbers(interval)),
     )
     # fmt: on
     # `schema` is a name that pydantic's models have taken.
     version = Annotated[int, Field(alias="schema")]
-    return TypeAdapter(strict_model(version=version, units=conlist(unit)))
+    layout = strict_model(version=version, units=list[Any])
+    return TypeAdapter(layout), TypeAdapter(unit), TypeAdapter(unpaired)
 
 
 def _check_example(example: Mapping[str, Any], where: str) -> None:
-    start, onset, length = example["start"], example["onset"], example["length"]
-    if onset >= length:
+    """Check how the numbers of an example fit one another; one without a twin has intervals."""
+    start, length = example["start"], example["length"]
+    if (onset := example.get("onset", start)) >= length:
         raise _wrong(f"{where}.onset", onset, f"expected less than length, {length}")
     if start > onset:
         raise _wrong(f"{where}.start", start, f"expected at most onset, {onset}")
     for prefix, scores in (("", "scores"), ("twin_", "twin")):
+        if scores not in example:
+            continue
         rows = range(start, start + len(example[f"{prefix}cusum"]))
         _check_length(example[scores], rows, f"{where}.{scores}")
         for i, row in enumerate(example[f"{prefix}alarms"]):
@@ -169,6 +202,10 @@ def _check_example(example: Mapping[str, Any], where: str) -> None:
         actual = f"{len(example['scores'])} numbers"
         problem = f"expected at most length - start, {length - start}"
         raise _wrong(f"{where}.scores", actual, problem)
+    for i, (first, stop) in enumerate(example.get("intervals", ())):
+        if not first < stop <= length:
+            problem = f"expected a first row before the end, of at most {length}"
+            raise _wrong(f"{where}.intervals[{i}]", [first, stop], problem)
 
 
 def _check_length(values: Sequence[Any], like: Sequence[Any], where: str) -> None:

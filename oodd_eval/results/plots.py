@@ -9,6 +9,7 @@ import numpy as np
 
 from oodd_eval.errors import MissingExtraError, ResultsError
 from oodd_eval.metrics.catalogue import MetricInfo
+from oodd_eval.metrics.unpaired import anomalous_rows
 from oodd_eval.results.evaluate import ScoredEpisode
 from oodd_eval.results.strengths import Point
 
@@ -37,31 +38,29 @@ def _subplots(rows: int, height: float, columns: int = 1) -> tuple[Figure, Any]:
 
 
 def trajectory(episode: ScoredEpisode) -> Figure:
-    """Draw sensors over the statistic of the alarm, the nominal twin dashed."""
+    """Draw sensors over the statistic of the alarm, the nominal twin dashed.
+
+    Without a twin the anomalous rows are shaded.
+    """
     figure, (upper, lower) = _subplots(2, 4.4)
-    rows, twin = episode.trajectory.observations, episode.twin.observations
-    common = min(len(rows), len(twin))
-    spread = np.maximum(twin.std(axis=0), 1e-6)
-    apart = np.abs(rows[:common] - twin[:common]).mean(axis=0) / spread
-    for colour, d in zip(COLOURS, np.argsort(-apart, kind="stable")[:SENSORS], strict=False):
-        nominal, anomalous = ((part[:, d] - twin[:, d].mean()) / spread[d] for part in (twin, rows))
-        upper.plot(nominal, "--", color=colour, linewidth=0.8, alpha=0.5)
-        upper.plot(anomalous, color=colour, linewidth=0.8, label=episode.sensors[d])
-    upper.set_ylabel("sensor (std. of twin)")
-    upper.axvline(episode.onset, color="0.5", linewidth=1)
+    _sensors(upper, episode)
+    _shade(upper, episode, label=False)
     _beside(upper)
     upper.set_title(str(episode.cell), fontsize="medium")
     rule = episode.rule
-    for scores, style in ((episode.twin_scores, "--"), (episode.scores, "-")):
-        statistic = scores if rule is None else rule.statistic(scores)
-        name = "nominal twin" if style == "--" else "anomalous"
-        finite = np.where(np.isfinite(statistic), statistic, np.nan)
-        lower.plot(finite, style, color=COLOURS[0], alpha=0.5 if style == "--" else 1, label=name)
+    solid = "episode" if episode.twin is None else "anomalous"
+    drawn = (episode.twin_scores, "--", 0.5, "nominal twin"), (episode.scores, "-", 1, solid)
+    for scores, style, alpha, name in drawn:
+        if scores is not None:
+            statistic = scores if rule is None else rule.statistic(scores)
+            finite = np.where(np.isfinite(statistic), statistic, np.nan)
+            lower.plot(finite, style, color=COLOURS[0], alpha=alpha, label=name)
     lower.set_ylabel("score" if rule is None else "statistic")
     lower.set_xlabel("row")
-    lower.axvline(episode.onset, color="0.5", linewidth=1, label="onset")
+    _shade(lower, episode, label=True)
     if rule is not None and np.isfinite(rule.threshold):
-        lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label="threshold at 5 %")
+        level = f"threshold at {100 * episode.level:g} %"
+        lower.axhline(rule.threshold, color=COLOURS[1], linewidth=1, label=level)
         # The first rows beyond the threshold matter, not how far it goes.
         lower.set_yscale("symlog", linthresh=abs(rule.threshold) or 1.0)
         if (alarm := episode.alarm) is not None:
@@ -69,6 +68,45 @@ def trajectory(episode: ScoredEpisode) -> Figure:
             lower.plot(alarm, height, "v", color=COLOURS[1], label=f"alarm at row {alarm}")
     _beside(lower)
     return figure
+
+
+def _sensors(axis: Any, episode: ScoredEpisode) -> None:
+    """Draw the sensors that leave the course of their twin most, dashed that course.
+
+    Without a twin, those that are farthest from nominal episodes in the anomalous rows.
+    """
+    rows = episode.trajectory.observations.astype(np.float64)
+    if episode.twin is not None:
+        course = episode.twin.observations
+        common, spread = min(len(rows), len(course)), np.maximum(course.std(axis=0), 1e-6)
+        apart, what = np.abs(rows[:common] - course[:common]) / spread, "twin"
+        rows, course = ((part - course.mean(axis=0)) / spread for part in (rows, course))
+    else:
+        mean, spread = (0.0, 1.0) if episode.nominal is None else episode.nominal
+        rows, what = (rows - mean) / np.maximum(spread, 1e-6), "nominal"
+        apart = np.abs(rows[anomalous_rows(episode.intervals, len(rows))])
+    order = np.argsort(-apart.mean(axis=0), kind="stable")[:SENSORS]
+    for colour, d in zip(COLOURS, order, strict=False):
+        if episode.twin is not None:
+            axis.plot(course[:, d], "--", color=colour, linewidth=0.8, alpha=0.5)
+        axis.plot(rows[:, d], color=colour, linewidth=0.8, label=episode.sensors[d])
+    axis.set_ylabel(f"sensor (std. of {what})")
+
+
+def _shade(axis: Any, episode: ScoredEpisode, *, label: bool) -> None:
+    """Mark the onset, or without a twin the anomalous rows."""
+    if episode.twin is not None:
+        axis.axvline(episode.onset, color="0.5", linewidth=1, label="onset" if label else None)
+        return
+    names: set[str] = set()
+    for start, stop in episode.intervals:
+        known = start >= 0
+        name = "anomalous rows" if known else "anomalous, start unknown"
+        # Each name stands in the legend once.
+        text = name if label and name not in names else None
+        look = {"color": "0.5", "alpha": 0.2, "linewidth": 0, "hatch": None if known else "//"}
+        axis.axvspan(max(start, 0), stop, label=text, **look)
+        names.add(name)
 
 
 def _beside(axis: Any) -> None:
@@ -81,18 +119,26 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
 
     Episodes with an alarm before the effect, or without a row after it, are left out.
     """
-    if not any(e.rule for episodes in curves.values() for e in episodes):
-        raise ResultsError("no row has an alarm at 5 %: more calibration episodes are needed")
+    everything = [e for episodes in curves.values() for e in episodes]
+    levels = sorted({100 * e.level for e in everything}) or [5.0]
+    if not any(e.rule for e in everything):
+        raise ResultsError(
+            f"no row has an alarm at {levels[-1]:g} %: more calibration episodes are needed"
+        )
     figure, axis = _subplots(1, 3.6)
     rows = np.arange(LONGEST + 1)
     for (name, episodes), colour in zip(curves.items(), COLOURS * 9, strict=False):
         for twins, style in ((False, "-"), (True, ":")):
             delays = np.array([e.delay(of_twin=twins) for e in episodes])
+            if np.isnan(delays).all():
+                continue
             share = (delays[~np.isnan(delays), None] <= rows).mean(axis=0)
             label = None if twins else name
             axis.step(rows + 1, 100 * share, style, where="post", color=colour, label=label)
     axis.set_xscale("log")
-    axis.set_xlabel("rows from the effect on (dotted: alarms of the nominal twins)")
+    paired = any(e.twin is not None for e in everything)
+    dotted = " (dotted: alarms of the nominal twins)" * paired
+    axis.set_xlabel(f"rows from the {'effect' if paired else 'first anomalous row'} on{dotted}")
     axis.set_ylabel("episodes with an alarm (%)")
     axis.set_ylim(0, 100)
     _beside(axis)

@@ -3,17 +3,18 @@
 import functools
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-from oodd_eval.metrics.catalogue import NAMES, RANKING, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
 from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, grouped
 from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.strengths import thresholds
 from oodd_eval.results.tables import Table
+from oodd_eval.results.unpaired import UnpairedTables, phase_findings
 
 Detail = Literal["brief", "wide", "full"]
 
@@ -63,14 +64,17 @@ class Report:
     detector
         Name of a detector, for its cells alone.
     metric
-        The metric of these cells.
+        The metric of these cells; by default the one that their board ranks by.
+    units
+        Units of strengths by kind of anomaly, where the split names them.
     """
 
     records: Sequence[Record]
     intervals: bool = False
     detail: Detail = "full"
     detector: str = ""
-    metric: str = RANKING
+    metric: str = ""
+    units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     title: str = field(default="Results", kw_only=True)
 
     @functools.cached_property
@@ -85,23 +89,31 @@ class Report:
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
-            tables.findings(board),
+            findings_of(board),
             [table for table in self._tables(board) if table],
             notes=tables.notes(board),
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         intervals, full = self.intervals, self.detail == "full"
-        yield tables.separability(board, intervals=intervals)
-        yield tables.guaranteed(board, intervals=intervals)
+        if board.paired:
+            yield tables.separability(board, intervals=intervals)
+            yield tables.guaranteed(board, intervals=intervals)
+        else:
+            of_board = UnpairedTables(board, intervals)
+            yield from of_board.overview(whole=self.detail != "brief")
         yield tables.attribution(board, intervals=intervals)
-        yield from strengths.strength_tables(board, intervals=intervals, places=full)
-        yield from tables.anomaly_groups(board, intervals=intervals)
+        yield from strengths.strength_tables(
+            board, intervals=intervals, places=full, units=self.units
+        )
+        if board.paired:
+            yield from tables.anomaly_groups(board, intervals=intervals)
         if self.detail != "brief":
             yield tables.all_metrics(board, intervals=intervals)
             yield from tables.all_alarms(board, intervals=intervals)
         if full:
-            yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
+            if len(board.environments) * len(board.anomalies) > 1:  # one figure stands above
+                yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
             yield tables.failures(board)
 
     def _of_detector(self, board: Board) -> Section:
@@ -113,7 +125,19 @@ class Report:
             yield tables.by_anomaly(board, entry, self.metric, intervals=self.intervals)
             by_row = thresholds([r for r in board.records if r.setting == entry])
             if by_row.get(entry):
-                yield strengths.by_place(board, entry, by_row, intervals=self.intervals)
+                yield strengths.by_place(
+                    board, entry, by_row, intervals=self.intervals, units=self.units
+                )
+
+
+def findings_of(board: Board) -> list[str]:
+    """Return the sentences on a board that nobody should miss."""
+    return [
+        *tables.withheld(board),
+        *tables.findings(board),
+        *phase_findings(board),
+        *tables.missing_levels(board),
+    ]
 
 
 def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
@@ -126,12 +150,15 @@ def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
         "environment",
         "anomaly",
         "strength",
+        "magnitude",
         "group",
+        "paired",
         "detector",
         "horizon",
         "seed",
         "status",
         "reason",
+        "note",
         "brief",
     )
     costs = ("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb")

@@ -9,9 +9,17 @@ from typing import Any, Final, NamedTuple
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import ALARM_RANKING, RANKING, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import ALPHA, Position, Ranking, Row, rank, win_rates
-from oodd_eval.results.board import Board, Conditions, contribution, expected_cells, grouped
+from oodd_eval.results.board import (
+    Board,
+    Conditions,
+    cells_with,
+    contribution,
+    expected_cells,
+    grouped,
+    ranked_by,
+)
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 
@@ -146,20 +154,25 @@ def ranked(
         )
     first = primary_settings(records) if primary is None else set(primary)
     cells = set(expected or expected_cells(records))
-    counted = {e: [r for r in rows if r.position in cells] for e, rows in by_row.items()}
     below = set(by_row).difference(rerun) if rerun else set()
 
     def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row], dict[Setting, str]]:
-        states = {e: _state(rows, cells, metric, e in first) for e, rows in counted.items()}
+        # Without twins a metric is one of some cells, such as those whose anomalous rows are known.
+        compared = cells if records[0].paired else cells & cells_with(metric, records)
+        counted = {e: [r for r in rows if r.position in compared] for e, rows in by_row.items()}
+        states = {e: _state(rows, compared, metric, e in first) for e, rows in counted.items()}
         rows = {str(e): terms_of(counted[e], metric) for e, state in states.items() if not state}
         return rank(rows, set(map(str, first - below))), rows, states
 
-    ranking, rows, states = ranking_by(RANKING)
-    alarms, _, alarm_states = ranking_by(ALARM_RANKING)
+    by_scores, by_alarms = ranked_by(records)
+    ranking, rows, states = ranking_by(by_scores)
+    alarms, _, alarm_states = ranking_by(by_alarms)
     seeds = {label: rows[label].values() for label in ranking.ranks}
     rates = win_rates(
         {
-            label: {c: nan_mean(seed[c].value for seed in of_row) for c in sorted(cells)}
+            label: {
+                c: nan_mean(seed[c].value for seed in of_row) for c in sorted(next(iter(of_row)))
+            }
             for label, of_row in seeds.items()
         }
     )
@@ -205,7 +218,9 @@ def terms_of(records: Iterable[Record], metric: str) -> Row:
         cells = row.setdefault(r.seed, {})
         if r.ok and metric in r.per_trajectory:
             terms = contribution(r, metric)
-            cells[r.position] = Contribution(sign * terms.numerator, terms.denominator)
+            cells[r.position] = Contribution(
+                sign * terms.numerator, terms.denominator, nominal=terms.nominal
+            )
     return row
 
 
@@ -226,6 +241,8 @@ def _state(
     records: Sequence[Record], cells: Collection[Position], metric: str, primary: bool
 ) -> str:
     """Return why a row is not ranked by a metric; empty if it is."""
+    if not cells:
+        return f"no cell has {metric_info(metric).title}"
     seeds = len({r.seed for r in records}) or 1
     expected = len(cells) * seeds
     failed = Counter(r.status for r in records if not r.ok)
@@ -300,7 +317,8 @@ class PairedComparison:
         unit = " %" if info.unit == "percent" else ""
         return (
             f"{info.title}: {self.first} {first}, {self.second} {second}{unit}, difference "
-            f"{difference} [{low}, {high}], p = {self.p:.2g}, {self.cells} cells: {self.verdict}"
+            f"{difference} [{low}, {high}], p = {self.p:.2g}, {self.cells} "
+            f"cell{'s' * (self.cells != 1)}: {self.verdict}"
         )
 
 
@@ -324,11 +342,12 @@ def row_named(records: Sequence[Record], name: str) -> Setting:
 
 
 def compare_rows(
-    records: Sequence[Record], first: str, second: str, metric: str = RANKING
+    records: Sequence[Record], first: str, second: str, metric: str = ""
 ) -> PairedComparison:
     """Compare two rows of one board over the cells in which both have a value.
 
-    Rows are named as tables print them; the metric is any that is a mean over trajectories.
+    Rows are named as tables print them; the metric is any that is a mean over trajectories, by
+    default the one that the board ranks by.
 
     Raises
     ------
@@ -337,14 +356,15 @@ def compare_rows(
     ResultsError
         When the rows have no cell in common, or records of several boards.
     """
-    info = metric_info(metric)
+    if len({Conditions.of(r) for r in records}) > 1:
+        raise ResultsError("records of several splits or limits cannot be compared: select some")
+    usual = ranked_by(records)[0] if records else RANKING
+    info = metric_info(metric := metric or usual)
     if info.interval == "" or info.median or not info.better:
         raise UsageError(
             f"rows cannot be compared by {metric!r}: expected a mean over trajectories with a "
-            "better side, such as auc_matched"
+            f"better side, such as {usual}"
         )
-    if len({Conditions.of(r) for r in records}) > 1:
-        raise ResultsError("records of several splits or limits cannot be compared: select some")
     settings = [row_named(records, name) for name in (first, second)]
     if settings[0] == settings[1]:
         raise UsageError(f"{first!r} and {second!r} are the same row")

@@ -7,6 +7,7 @@ records that say their number, or whose strength is a rung of the benchmark's la
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from oodd_eval.data.condition import PAPER, RUNGS, Rung, rungs_of
 from oodd_eval.data.facts import title_of
 from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, RANKING, UNDEFINED
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, UNDEFINED, metric_info
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
@@ -140,12 +141,12 @@ def thresholds(records: Sequence[Record]) -> Thresholds:
     -------
     dict
         Thresholds by row and pair, in the unit of the kind of anomaly. A row has one where all its
-        detector seeds have a result at every strength of the pair.
+        detector seeds have a result at every strength of the pair, and episodes have twins.
     """
     rungs = Strengths.of(records).rungs
     cells: dict[Setting, dict[Pair, dict[tuple[int, str], Record]]] = {}
     for r in records:
-        if r.strength in rungs.get(_pair(r), {}):
+        if r.paired and r.strength in rungs.get(_pair(r), {}):
             pairs = cells.setdefault(r.setting, {})
             pairs.setdefault(_pair(r), {})[r.seed, r.strength] = r
     return {
@@ -254,24 +255,44 @@ _COLUMNS: Final = {
 _COSTS: Final = "the strength that costs 1 % of the return"
 
 
-def strength_tables(board: Board, *, intervals: bool = False, places: bool = False) -> list[Table]:
+NO_UNITS: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def strength_tables(
+    board: Board,
+    *,
+    intervals: bool = False,
+    places: bool = False,
+    units: Mapping[str, str] = NO_UNITS,
+) -> list[Table]:
     """Return all tables of a board's records at strengths; none where it has no such records.
 
     With `intervals`, means by kind and thresholds of single places have their 95 % intervals. With
-    `places`, each row has a table with its threshold in every environment.
+    `places`, each row has a table with its threshold in every environment. Where `units` has the
+    unit of a kind, it stands in the kind's heading.
     """
     by_row = thresholds(board.records)
     strengths = Strengths.of(board.records)
-    separability = [_separability(board, by_row, strengths)] if by_row else []
+    if not board.paired:  # episodes of two strengths have nothing in common
+        return [_separability(board, board.entries, strengths)] if strengths.names else []
+    order = [entry for entry in board.entries if entry in by_row]
+    separability = [_separability(board, order, strengths)] if by_row else []
     if not any(by_row.values()):  # no level of 5 %, with few calibration episodes
         return separability
-    by_kind = _by_kind(board, by_row, strengths, intervals=intervals)
+    by_kind = _by_kind(board, by_row, strengths, intervals=intervals, units=units)
     rows = [e for e in board.entries if places and by_row.get(e)]
-    single = [by_place(board, e, by_row, intervals=intervals) for e in rows]
+    single = [by_place(board, e, by_row, intervals=intervals, units=units) for e in rows]
     return [overview(board, by_row), *separability, by_kind, *single]
 
 
-def by_place(board: Board, entry: Setting, by_row: Thresholds, *, intervals: bool = False) -> Table:
+def by_place(
+    board: Board,
+    entry: Setting,
+    by_row: Thresholds,
+    *,
+    intervals: bool = False,
+    units: Mapping[str, str] = NO_UNITS,
+) -> Table:
     """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
     by_pair = by_row[entry]
     kinds = [k for k in board.anomalies if any(k == kind for _, kind in by_pair)]
@@ -281,7 +302,7 @@ def by_place(board: Board, entry: Setting, by_row: Thresholds, *, intervals: boo
     ]
     title = f"{entry}: detection thresholds by anomaly, each in its own unit"
     note = f"{_RULE} ≤ and > mark thresholds beyond the weakest and the strongest rung."
-    return Table(title, ["Environment", *kinds], rows, note=note)
+    return Table(title, ["Environment", *_with_units(kinds, units)], rows, note=note)
 
 
 def overview(board: Board, by_row: Thresholds) -> Table:
@@ -317,16 +338,23 @@ def overview(board: Board, by_row: Thresholds) -> Table:
     return Table(title, header, rows, note=note)
 
 
-def _separability(board: Board, by_row: Thresholds, strengths: Strengths) -> Table:
-    """Return matched AUC by strength."""
-    order = [e for e in board.entries if e in by_row]
-    texts = _by_strength(board, order, strengths, RANKING)
+def _separability(board: Board, order: list[Setting], strengths: Strengths) -> Table:
+    """Return the metric that ranks by strength."""
+    texts = _by_strength(board, order, strengths, board.ranking)
     rows = [[str(e), *texts[e]] for e in order]
     header, note = ["detector", *strengths.names], _COLUMNS[strengths.calibrated]
-    return Table("Matched AUC (%) by strength", header, rows, note=note)
+    title = metric_info(board.ranking).title
+    return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
 
 
-def _by_kind(board: Board, by_row: Thresholds, strengths: Strengths, *, intervals: bool) -> Table:
+def _by_kind(
+    board: Board,
+    by_row: Thresholds,
+    strengths: Strengths,
+    *,
+    intervals: bool,
+    units: Mapping[str, str],
+) -> Table:
     """Return thresholds by kind of anomaly, means over environments."""
     kinds = [k for k in board.anomalies if any(k == kind for p in by_row.values() for _, kind in p)]
     rows = []
@@ -335,13 +363,19 @@ def _by_kind(board: Board, by_row: Thresholds, strengths: Strengths, *, interval
         means = (_mean(by_pair, {}, strengths) for by_pair in of_kind)
         texts = (mean.text(interval=intervals) if mean else "" for mean in means)
         rows.append([str(entry), *texts])
-    units = f"in units of {_COSTS}" if strengths.calibrated else "each in its own unit"
-    title = f"Detection thresholds by anomaly, {units}"
+    over = f"in units of {_COSTS}" if strengths.calibrated else "each in its own unit"
+    title = f"Detection thresholds by anomaly, {over}"
     note = (
         f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts as "
         f"its end. {_SIDES}"
     )
-    return Table(title, ["detector", *kinds], rows, note=note)
+    # Calibrated thresholds are multiples of what costs 1 % of the return.
+    titles = kinds if strengths.calibrated else _with_units(kinds, units)
+    return Table(title, ["detector", *titles], rows, note=note)
+
+
+def _with_units(kinds: Iterable[str], units: Mapping[str, str]) -> list[str]:
+    return [f"{kind} ({units[kind]})" if kind in units else kind for kind in kinds]
 
 
 def _by_strength(

@@ -6,11 +6,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from oodd_eval.data.condition import NOMINAL
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
+from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
-from oodd_eval.results.board import Board, Value
+from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
+from oodd_eval.metrics.promise import enough_episodes
+from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.standings import RankedBoard, Standing
 
@@ -22,7 +25,8 @@ BRIEF: Final = "\N{DAGGER}"
 class Table:
     """A titled table of texts, the first `labels` columns set to the left, with a note below it.
 
-    On a terminal each row has the colour of its position in `colours`, if there are any.
+    On a terminal each row has the colour of its position in `colours`, if there are any, and
+    `wrap` lets headings and names take several lines where the table is too wide.
     """
 
     title: str
@@ -31,6 +35,7 @@ class Table:
     labels: int = 1
     note: str = ""
     colours: Sequence[str] = ()
+    wrap: bool = False
 
     @property
     def alignment(self) -> tuple[str, ...]:
@@ -43,9 +48,16 @@ class Table:
         return replace(self, header=[self.header[i] for i in indices], rows=rows)
 
     def transposed(self) -> "Table":
-        """Return the table with rows and columns exchanged."""
+        """Return the table with rows and columns exchanged.
+
+        Of several labels a first one stands where it changes: a group of columns has its name once.
+        """
         whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
-        return replace(self, header=whole[0], rows=whole[1:], labels=1, colours=())
+        header = whole[0]
+        if self.labels > 1:
+            pairs = itertools.pairwise(header)
+            header = [header[0], *("" if text == before else text for before, text in pairs)]
+        return replace(self, header=header, rows=whole[1:], labels=1, colours=())
 
 
 def show_value(value: Value, metric: str) -> str:
@@ -80,9 +92,9 @@ def texts(board: Board, entry: Setting, columns: Iterable[Mean]) -> list[str]:
     ]
 
 
-_BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
+BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
-_SIMPLE: Final = ("random", "persistence", *_BLIND, "range", "mahalanobis", "rf", "rf-ewma")
+_SIMPLE: Final = ("random", "persistence", *BLIND, "range", "mahalanobis", "rf", "rf-ewma")
 """Rows that a detector with a learned model of the dynamics should beat."""
 
 _FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
@@ -104,14 +116,15 @@ _LABELS: Final = ("rank", "detector", "settings")
 
 
 def _by_group(board: Board, title: str, *, intervals: bool) -> list[Mean]:
-    """Return matched AUC over all cells, and over each group of anomalies."""
-    chosen = {title: board.anomalies} | {g: board.in_group(g) for g in GROUPS if board.in_group(g)}
-    return [Mean(t, RANKING, board.environments, a, intervals) for t, a in chosen.items()]
+    """Return the metric that ranks over all cells, and over each group of anomalies."""
+    chosen = {title: board.anomalies} | board.groups
+    return [Mean(t, board.ranking, board.environments, a, intervals) for t, a in chosen.items()]
 
 
-def _overall(
+def over_all(
     board: Board, names: Iterable[str], intervals: Collection[str] = (), *, level: bool = True
 ) -> list[Mean]:
+    """Return columns of means over all cells; without `level` their titles do not name it."""
     titles = {n: metric_info(n).title for n in names}
     titles |= {} if level else {n: t.partition(" at ")[0].lower() for n, t in titles.items()}
     over = board.environments, board.anomalies
@@ -126,12 +139,17 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     columns = _by_group(board, "mean", intervals=intervals)
     over = board.environments, board.anomalies
     columns += [Mean(n, f"auc_{n}", *over, intervals) for n in ("smoothed", "unpaired")]
-    columns += [Mean(e, RANKING, [e], board.anomalies, intervals) for e in board.environments]
-    means = {entry: board.mean(entry, *over, RANKING).value for entry in board.entries}
-    order = sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
-    rows = [[str(entry), *texts(board, entry, columns)] for entry in order]
+    columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
+    rows = [[str(entry), *texts(board, entry, columns)] for entry in best_first(board)]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
     return Table(title, ["detector", *(c.title for c in columns)], rows)
+
+
+def best_first(board: Board) -> list[Setting]:
+    """Return the rows of a board by their mean of the metric that ranks them, the best first."""
+    over = board.environments, board.anomalies
+    means = {entry: board.mean(entry, *over, board.ranking).value for entry in board.entries}
+    return sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
 
 
 def guaranteed(
@@ -156,14 +174,19 @@ def guaranteed(
     if not names:
         return None
     with_ends = [n for n in names if intervals or metric_info(n).interval == "exact"]
-    columns = _overall(board, names, with_ends, level=False)
+    columns = over_all(board, names, with_ends, level=False)
     level = f"{100 * catalogue.LEVELS[suffix]:g} %"
-    title = f"Guaranteed alarms at {level} (delays in steps, the rest in %)"
+    hours = f"false_alarms_per_hour_{suffix}"
+    hourly = f"{metric_info(hours).title.partition(' at ')[0].lower()}, " * (hours in names)
+    steps = "delays in steps, " * any(name.startswith("delay") for name in names)
+    units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
+    title = f"Guaranteed alarms at {level} ({units})"
+    episodes = "nominal twins" if board.paired else "nominal test episodes"
     note = (
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
-        "is the share of this split's nominal twins that raised one."
+        f"is the share of this split's {episodes} that raised one."
     )
-    return _by_metric(board, title, columns, standings, note)
+    return by_metric(board, title, columns, standings, note)
 
 
 def attribution(
@@ -176,7 +199,7 @@ def attribution(
     names = catalogue.ATTRIBUTION
     if not standings:
         board = Board([r for r in board.records if r.setting in explaining])
-    columns = _overall(board, names, names if intervals else (), level=False)
+    columns = over_all(board, names, names if intervals else (), level=False)
     title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
     note = (
         "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
@@ -184,7 +207,7 @@ def attribution(
         "onset that they name is from the effect, the median of a cell."
     )
     ranks = [standing for standing in standings if standing.entry in explaining]
-    return _by_metric(board, title, columns, ranks, note)
+    return by_metric(board, title, columns, ranks, note)
 
 
 def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -219,9 +242,11 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric without a level, mean over all cells, with nulls and the placebo."""
-    names = board.present(catalogue.METRICS) or [*catalogue.METRICS]
-    columns = _overall(board, names, names if intervals else ())
-    return _by_metric(board, "All metrics, mean over cells", columns)
+    usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
+    names = board.present(catalogue.METRICS) or usual
+    names = [name for name in names if not metric_info(name).request]
+    columns = over_all(board, names, names if intervals else ())
+    return by_metric(board, "All metrics, mean over cells", columns)
 
 
 def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -230,10 +255,9 @@ def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
     return [table for table in tables if table]
 
 
-def by_anomaly(
-    board: Board, entry: Setting, metric: str = RANKING, *, intervals: bool = False
-) -> Table:
-    """Return one detector's metric by environment and anomaly."""
+def by_anomaly(board: Board, entry: Setting, metric: str = "", *, intervals: bool = False) -> Table:
+    """Return one detector's metric by environment and anomaly, by default the one that ranks."""
+    metric = metric or board.ranking
     rows = []
     for e in board.environments:
         columns = [Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
@@ -241,7 +265,7 @@ def by_anomaly(
     info = metric_info(metric)
     unit = " (%)" if info.unit == "percent" else ""
     title = f"{entry}: {info.title}{unit} by anomaly"
-    return Table(title, ["Environment", *board.anomalies], rows)
+    return Table(title, ["Environment", *board.anomalies], rows, wrap=not board.paired)
 
 
 def failures(board: Board) -> Table | None:
@@ -252,9 +276,13 @@ def failures(board: Board) -> Table | None:
 
 
 def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
-    """Return ranks by matched AUC, with what a reader needs to judge them; trust is by row."""
-    columns = _by_group(ranks.board, metric_info(RANKING).title, intervals=True)
-    columns += _overall(ranks.board, ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo"))
+    """Return ranks by separability, with what a reader needs to judge them; trust is by row."""
+    title = metric_info(ranks.board.ranking).title
+    columns = _by_group(ranks.board, title, intervals=True)
+    beside: Sequence[str] = ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo")
+    if not ranks.board.paired:
+        beside = ranks.board.present(n for n in _BESIDE if n != ranks.board.ranking)
+    columns += over_all(ranks.board, beside)
     rows = []
     for row in ranks.standings:
         rank, detector, settings = _labels(row)
@@ -264,15 +292,19 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
         rows.append([*labels, *texts(ranks.board, row.entry, columns), _percent(row.wins)])
     labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust"]
     header = [*labels, *(c.title for c in columns), "win rate"]
-    return Table("Ranking by matched AUC (%)", header, rows, labels=7)
+    return Table(f"Ranking by {title} (%)", header, rows, labels=7)
+
+
+_BESIDE: Final = ("auc_pool_null", "auc_rows", "auc_outcome")
+"""Columns beside the metric that ranks rows without twins."""
 
 
 def alarms(ranks: RankedBoard) -> list[Table]:
     """Return guaranteed alarms at the headline level, and alarms at the paper's threshold."""
     at_level = guaranteed(ranks.board, intervals=True, standings=ranks.standings)
-    columns = _overall(ranks.board, ranks.board.present(_PAPER))
+    columns = over_all(ranks.board, ranks.board.present(_PAPER))
     title = "Alarms at the paper's threshold"
-    by_paper = _by_metric(ranks.board, title, columns, ranks.standings)
+    by_paper = by_metric(ranks.board, title, columns, ranks.standings)
     return [at_level, by_paper] if at_level else [by_paper]
 
 
@@ -288,7 +320,8 @@ def wins(ranks: RankedBoard) -> Table | None:
     labels = list(ranks.ranking.ranks)
     rates = {pair: _percent(rate) for pair, rate in ranks.rates.items()}
     rows = [[row, *(rates.get((row, column), "") for column in labels)] for row in labels]
-    title = "Win rates: share of cells (%) in which the row's matched AUC is above the column's"
+    metric = metric_info(ranks.board.ranking).title
+    title = f"Win rates: share of cells (%) in which the row's {metric} is above the column's"
     return Table(title, ["detector", *labels], rows) if len(labels) > 1 else None
 
 
@@ -296,13 +329,15 @@ def findings(board: Board) -> list[str]:
     """Return a sentence for every detector that a simple row beats, in matched AUC or AUC.
 
     The AUC of what knows the time alone is left out: the clock's is 1 by construction.
+    Without twins it is the metric that ranks.
     """
     sentences = []
     for entry, simple in itertools.product(board.entries, board.entries):
         same_kind = board.is_trivial(entry) or simple.detector == entry.detector
         if simple.detector not in _SIMPLE or simple.horizon != entry.horizon or same_kind:
             continue
-        names = ("auc_matched",) if simple.detector in _BLIND else ("auc_matched", "auc")
+        names = [board.ranking]
+        names += ["auc"] * (board.paired and simple.detector not in BLIND)
         for info in map(metric_info, names):
             value, beaten, cells = board.compare(simple, entry, info.name)
             if value > beaten:
@@ -313,11 +348,43 @@ def findings(board: Board) -> list[str]:
     return sentences
 
 
+def missing_levels(board: Board) -> list[str]:
+    """Return how many calibration episodes the levels of tables take that rows are without."""
+    suffixes = list(catalogue.LEVELS)
+    suffixes = suffixes[: suffixes.index(catalogue.HEADLINE) + 1]
+    rows: dict[int, dict[str, dict[str, None]]] = {}
+    for r in (r for r in board.records if r.ok and "calibration" in r.counts):
+        n = r.counts["calibration"]
+        for suffix in (s for s in suffixes if s not in offered_levels(n, r.alarm)):
+            rows.setdefault(n, {}).setdefault(suffix, {})[str(r.setting)] = None
+    sentences = []
+    for n, lacking in rows.items():
+        listed = [
+            f"at {100 * catalogue.LEVELS[s]:g} %: {', '.join(lacking[s])}"
+            for s in suffixes
+            if s in lacking
+        ]
+        sentences.append(f"{enough_episodes(n)}. Without figures {'; '.join(listed)}.")
+    return sentences
+
+
+def withheld(board: Board) -> list[str]:
+    """Return what records say of themselves, such as why they have no matched AUC."""
+    cells = grouped((r for r in board.records if r.note), lambda r: r.note)
+    return [
+        f"{', '.join(dict.fromkeys('/'.join(r.position) for r in records))} "
+        f"({', '.join(dict.fromkeys(str(r.setting) for r in records))}): {note}."
+        for note, records in cells.items()
+    ]
+
+
 def notes(board: Board) -> list[str]:
     """Return what has to stand below the tables of a board."""
     seeds = ", ".join(map(str, board.test_seeds()))
     facts = f"digest {board.digest[:12]}, protocol {board.protocol}"
     lines = [f"Split {board.split}, {facts}, test seeds per environment: {seeds}."]
+    if not board.paired:
+        lines = [f"Split {board.split}, {facts}, episodes without twins.", *_episodes(board)]
     if board.limit is not None:
         lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
     cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
@@ -326,7 +393,7 @@ def notes(board: Board) -> list[str]:
             "Anomalies have several strengths: means are over all of them, but for columns that "
             "are named by strengths."
         )
-    benchmark = {*board.environments} <= {*ENVIRONMENTS}
+    benchmark = board.paired and {*board.environments} <= {*ENVIRONMENTS}
     for group in filter(board.in_group, GROUPS) if benchmark else ():
         of_group = [a for a in TABLE1 if ANOMALIES[a].group == group]
         if missing := [a for a in of_group if a not in board.anomalies]:
@@ -346,6 +413,22 @@ def notes(board: Board) -> list[str]:
     return lines
 
 
+def _episodes(board: Board) -> list[str]:
+    """Return how many episodes each environment without twins has."""
+    lines = []
+    for environment in board.environments:
+        cells = [r for r in board.records if r.environment == environment and r.ok]
+        counts = {name: n for r in cells for name, n in r.counts.items()}
+        tests = {str(r.condition): r.counts.get("test", 0) for r in cells if r.condition != NOMINAL}
+        listed = [f"{n} {name}" for name, n in tests.items()]
+        named = [f"{counts[k]} {text}" for k, text in _PARTS.items() if k in counts]
+        lines.append(f"Episodes of {environment}: {', '.join([*named, *listed])}.")
+    return lines
+
+
+_PARTS: Final = {"train": "training", "calibration": "calibration", "nominal": "nominal test"}
+
+
 def ranking_notes(ranks: RankedBoard) -> list[str]:
     """Return what has to stand below a ranking."""
     rows = ranks.standings
@@ -361,20 +444,22 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
             "stand below, in brackets the rank that they would have, and push no row down."
         )
     if ranks.alarms.ranks:
-        title = metric_info(catalogue.ALARM_RANKING).title
-        lines.append(f"Alarm rank: the same by {title[0].lower()}{title[1:]}, lower is better.")
+        info = metric_info(ranks.board.alarm_ranking)
+        title = info.title[0].lower() + info.title[1:]
+        lines.append(f"Alarm rank: the same by {title}, {info.better} is better.")
         without = (row for row in rows if row.alarm_state and not row.state)
         lines += [f"Without an alarm rank: {row.entry}, {row.alarm_state}." for row in without]
     seeds = ranks.board.test_seeds()
     if seeds and seeds[0] < _FEW and len(ranks.ranking.ranks) > 1:
+        episodes = "test seeds per environment" if ranks.board.paired else "anomalous episodes"
         lines.append(
-            f"With {seeds[0]} test seeds per environment small differences stay hidden: rows that "
+            f"With {seeds[0]} {episodes} small differences stay hidden: rows that "
             "share a letter may well differ."
         )
     return lines
 
 
-def _by_metric(
+def by_metric(
     board: Board,
     title: str,
     columns: Sequence[Mean],
@@ -385,7 +470,8 @@ def _by_metric(
     labels = {row.entry: _labels(row) for row in standings} or {e: [str(e)] for e in board.entries}
     rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
     first = _LABELS if standings else ("detector",)
-    return Table(title, [*first, *(c.title for c in columns)], rows, labels=len(first), note=note)
+    header = [*first, *(c.title for c in columns)]
+    return Table(title, header, rows, labels=len(first), note=note, wrap=not board.paired)
 
 
 def _labels(row: Standing) -> list[str]:

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Quantity, paper_tables
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, Quantity, paper_tables
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.leaderboard.entry import (
@@ -32,6 +32,7 @@ from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.record import NAN, Record
+from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import DETECTION, curve
 
@@ -65,9 +66,15 @@ SUMMARIES: Final = ("all|all", "all|sensor", "all|dynamics")
 ENTRY_FIELDS: Final = ("id", "title", "submitter", "created", "citation", "url", "caption")
 """Fields of an entry that the site shows."""
 
-RANKING_PLACE: Final = WITH_INTERVALS.index(RANKING)
-
-_ORDER: Final = {cell: i for i, cell in enumerate(product(ENVIRONMENTS, ANOMALIES))}
+_OF_LOGS: Final = ("auc_pool", "auc_pool_null", "auc_rows", "auc_outcome")
+_ALARMS_OF_LOGS: Final = (
+    *_COMPARED,
+    "events_found",
+    "false_alarms_per_hour",
+    "found_outcome",
+    "found_outcome_null",
+)
+"""Metrics with intervals where episodes have no twins; those of alarms at the board's level."""
 
 MOST_SENSORS: Final = 3  # sensors of an episode: those that leave their twin's course most
 STEPS: Final = 250  # steps between the least and the largest value: one a pixel
@@ -91,8 +98,10 @@ def site_data(
     units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
     parts: dict[str, Json] = {}
     on_site = [_board(section, units, parts) for section in sections]
-    names = dict.fromkeys(name for board in on_site for name in board["metrics"])
-    used = {*TABLE1, *(name for board in on_site for name in board["anomalies"])}
+    names = dict.fromkeys(
+        name for board in on_site for name in (*board["metrics"], board["ranking"])
+    )
+    used = {*TABLE1, *(name for board in on_site for name in board["anomalies"] if board["paired"])}
     kinds = [a for a in ANOMALIES.values() if a.id in used]
     data = {
         "threshold": THRESHOLD,
@@ -156,23 +165,25 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
     ranks, board = section.ranks, section.ranks.board
     present = {name for r in board.records for name in r.metrics}
     # Where every cell has failed, the page still shows the metrics without a level.
-    names = [name for name in NAMES if name in present] or [*METRICS]
+    usual = [name for name, info in METRICS.items() if info.cells != "unpaired"]
+    names = [name for name in NAMES if name in present] or (usual if board.paired else [])
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
-    chosen = selections(cells)
+    names_of_logs = None if board.paired else _names_of_logs(board)
+    chosen = selections(cells, names_of_logs)
     rows, ends, by_cell = [], {}, {}
     for standing in ranks.standings:
         row, part = _row(section, standing, names, chosen, units)
         rows.append(row)
         parts[row["part"]] = part
-        ends[row["part"]] = _ranking_intervals(part)
+        ends[row["part"]] = _ranking_intervals(part, board, names)
         by_cell[row["part"]] = _by_cell(standing, cells)
     metric_parts = {name: part_name(f"{section.name}/{name}") for name in names}
     for metric, name in metric_parts.items():
         values = {
             part: [_mean(records, metric) for records in of_row] for part, of_row in by_cell.items()
         }
-        parts[name] = {"values": values, "intervals": ends if metric == RANKING else {}}
+        parts[name] = {"values": values, "intervals": ends if metric == board.ranking else {}}
     return {
         "id": section.name,
         "episodes": _episodes(section, parts, rows),
@@ -181,10 +192,24 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         **_fields(board, "split", "digest", "protocol", "limit"),
         "tests": board.test_seeds(),
         **_fields(board, "environments", "anomalies"),
+        **_fields(board, "paired", "ranking", "level"),
+        "own": names_of_logs,
+        "about": [] if board.paired else findings_of(board),
         "metrics": names,
-        "intervals": _with_intervals(names),
+        "intervals": _with_intervals(names, board),
         "rows": rows,
         "resamples": ranks.ranking.resamples,
+    }
+
+
+def _names_of_logs(board: Board) -> Json:
+    """Return environments and anomalies of logs, whose names may be the benchmark's for others."""
+    groups = {kind: group for group in GROUPS for kind in board.in_group(group)}
+    return {
+        "environments": {e: {"title": e, "family": ""} for e in board.environments},
+        "anomalies": {
+            a: {"title": a, "group": groups.get(a, ""), "summary": ""} for a in board.anomalies
+        },
     }
 
 
@@ -215,7 +240,8 @@ def _row(
     """Return a row's line of the index, and its part."""
     row, records = standing.entry, standing.records
     source, label, ranks = section.sources[row], str(row), section.ranks
-    in_order = sorted(records, key=lambda r: (_ORDER[r.environment, r.anomaly], r.seed))
+    order = {cell: i for i, cell in enumerate(chosen["all|all"])}
+    in_order = sorted(records, key=lambda r: (order[r.environment, r.anomaly], r.seed))
     intervals = _intervals(ranks.board, standing, names, chosen)
     identity = f"{section.name}/{label}"
     have = {(r.environment, r.anomaly) for r in records}
@@ -249,7 +275,7 @@ def _row(
         "parameters": records[0].parameters,
         "command": " && ".join(commands_of(records)),
         "entry": _entry(source, records[0].plugin),
-        "cells": [_cell(r, names) for r in in_order],
+        "cells": [_cell(r, names, _with_intervals(names, ranks.board)) for r in in_order],
         "intervals": intervals,
         "comparisons": [
             [c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
@@ -278,11 +304,12 @@ def _summaries(
     for key in (key for key in SUMMARIES if key in chosen):
         means = [board.mean(standing.entry, *_sides(chosen[key]), name) for name in names]
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
-        ends_of = intervals.get(key, [None] * len(_with_intervals(names)))
+        with_ends = _with_intervals(names, board)
+        ends_of = intervals.get(key, [None] * len(with_ends))
         ends = [
             [
                 _digits(NAN if pair is None or pair[i] is None else pair[i], name)
-                for pair, name in zip(ends_of, _with_intervals(names), strict=True)
+                for pair, name in zip(ends_of, with_ends, strict=True)
             ]
             for i in (0, 1)
         ]
@@ -302,13 +329,22 @@ def _mean(records: Sequence[Record], metric: str) -> float | None:
     return _short(nan_mean(r.metrics[metric].value for r in records if metric in r.metrics))
 
 
-def _ranking_intervals(part: Json) -> dict[str, list[float | None]]:
-    """Return a row's intervals of matched AUC by selection; a cell of one record has its pair."""
-    intervals = {key: ends[RANKING_PLACE] for key, ends in part["intervals"].items()}
+def _ranking_intervals(
+    part: Json, board: Board, names: Sequence[str]
+) -> dict[str, list[float | None]]:
+    """Return a row's intervals of the metric that ranks by selection.
+
+    A cell of one record has its pair.
+    """
+    with_ends = _with_intervals(names, board)
+    if board.ranking not in with_ends:
+        return {}
+    index = with_ends.index(board.ranking)
+    intervals = {key: ends[index] for key, ends in part["intervals"].items()}
     once = grouped(part["cells"], lambda cell: (cell["environment"], cell["anomaly"]))
     for (environment, anomaly), cells in once.items():
         if len(cells) == 1 and "values" in cells[0]:
-            pair = [cells[0][end][RANKING_PLACE] for end in ("low", "high")]
+            pair = [cells[0][end][index] for end in ("low", "high")]
             intervals[f"{environment}|{anomaly}"] = pair
     return {key: pair for key, pair in intervals.items() if pair and None not in pair}
 
@@ -323,13 +359,13 @@ def _entry(entry: SubmittedEntry, plugin: str) -> Json:
     }
 
 
-def _cell(record: Record, names: Sequence[str]) -> Json:
+def _cell(record: Record, names: Sequence[str], with_ends: Sequence[str]) -> Json:
     """One record: its values, and its intervals, in the orders of the board's lists of names."""
     plain = _fields(record, "environment", "anomaly", "seed")
     if not record.ok:
         return plain | _fields(record, "status", "reason")
     metrics = [record.metrics.get(name) for name in names]
-    bounds = [(record.metrics.get(name), metric_info(name).unit) for name in _with_intervals(names)]
+    bounds = [(record.metrics.get(name), metric_info(name).unit) for name in with_ends]
     return plain | {
         "values": [m and _short(m.value) for m in metrics],
         "low": [m and _printed(m.low, kind) for m, kind in bounds],
@@ -347,11 +383,11 @@ def _intervals(
 
     A single record has its own.
     """
-    metrics = _with_intervals(names)
+    metrics = _with_intervals(names, board)
     intervals: dict[str, list[list[float | None] | None]] = {}
     few = {key: cells for key, cells in chosen.items() if key in SUMMARIES}
     for i, metric in enumerate(metrics):
-        selected = chosen if metric == RANKING else few
+        selected = chosen if metric == board.ranking else few
         several = {
             k: cells for k, cells in selected.items() if len(cells) > 1 or standing.seeds > 1
         }
@@ -363,8 +399,9 @@ def _intervals(
     return intervals
 
 
-def _with_intervals(names: Sequence[str]) -> list[str]:
-    return [name for name in WITH_INTERVALS if name in names]
+def _with_intervals(names: Sequence[str], board: Board) -> list[str]:
+    of_logs = (*_OF_LOGS, *(f"{name}_{board.level}" for name in _ALARMS_OF_LOGS))
+    return [name for name in (WITH_INTERVALS if board.paired else of_logs) if name in names]
 
 
 def _curves(units: Sequence[Json], records: Sequence[Record]) -> Json:
@@ -390,10 +427,11 @@ def gridded(example: Json) -> Json:
         ("score_step", 1.0, ("scores", "twin")),
         ("cusum_step", THRESHOLD, ("cusum", "twin_cusum")),
     ):
-        step = _step((v for name in names for v in example[name] if v is not None), unit)
+        known = [name for name in names if name in example]
+        step = _step((v for name in known for v in example[name] if v is not None), unit)
         steps[step_name] = step
         if step is not None:
-            for name in names:
+            for name in known:
                 steps[name] = [None if v is None else round(v / step) for v in example[name]]
     return steps
 
@@ -441,18 +479,27 @@ def _sides(cells: Sequence[SelectedCell]) -> tuple[list[str], list[str]]:
     return list(dict.fromkeys(environments)), list(dict.fromkeys(anomalies))
 
 
-def selections(cells: Sequence[SelectedCell]) -> dict[str, list[SelectedCell]]:
+def selections(
+    cells: Sequence[SelectedCell], logs: Json | None = None
+) -> dict[str, list[SelectedCell]]:
     """Return the selections of cells that filters can make, by key.
 
     A key is ``environments|anomalies``: for the one ``all``, a family or an environment, for the
-    other ``all``, a group or an anomaly.
+    other ``all``, a group or an anomaly. `logs` has what logs say of theirs; they have no families.
     """
+
+    def family(environment: str) -> str:
+        return environment if logs else ENVIRONMENTS[environment].family
+
+    def group(anomaly: str) -> str:
+        return logs["anomalies"][anomaly]["group"] or anomaly if logs else ANOMALIES[anomaly].group
+
     environments: dict[str, set[str]] = {}
     anomalies: dict[str, set[str]] = {}
     for environment, anomaly in cells:
-        for name in ("all", ENVIRONMENTS[environment].family, environment):
+        for name in ("all", family(environment), environment):
             environments.setdefault(name, set()).add(environment)
-        for name in ("all", ANOMALIES[anomaly].group, anomaly):
+        for name in ("all", group(anomaly), anomaly):
             anomalies.setdefault(name, set()).add(anomaly)
     selected = {
         f"{some}|{others}": [(e, a) for e, a in cells if e in environments[some] and a in named]

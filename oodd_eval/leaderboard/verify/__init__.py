@@ -50,7 +50,7 @@ from oodd_eval.leaderboard.verify.recompute import (
     check_together,
 )
 from oodd_eval.leaderboard.verify.rerun import Rerun, RerunOrder, compare_rerun
-from oodd_eval.metrics.catalogue import RANKING
+from oodd_eval.results.board import ranked_by
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 
@@ -316,7 +316,8 @@ class Neighbours:
         """
         cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
         for record in records.values():
-            terms, row = record.per_trajectory.get(RANKING, np.zeros((2, 0))), str(record.setting)
+            metric, row = ranked_by([record])[0], str(record.setting)
+            terms = record.per_trajectory.get(metric, np.zeros((2, 0)))
             numbers = tuple(round(term, 3) for term in terms[0].tolist())
             if len(set(numbers)) > 1:
                 cells[row] += 1

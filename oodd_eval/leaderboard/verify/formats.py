@@ -9,14 +9,15 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from datetime import date
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, TypeAdapter
 from pydantic_core import ValidationError
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, PROTOCOL
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, PROTOCOL
 from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo
 from oodd_eval.leaderboard.verify.files import MB, Findings, find_text, parse_json, plain, short
+from oodd_eval.metrics.alarms import AlarmKind
 from oodd_eval.names import PARAMETER_NAME, SPEC_NAME
 from oodd_eval.results import record as record_format
 from oodd_eval.results.curve_file import strict_model
@@ -112,6 +113,8 @@ SplitName = Annotated[str, _matching(
     r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[0-9a-f]{8})?",
     "a split's name of letters, digits, '.', '_', '-', with '@' and the start of its digest where "
     "it is not the published one")]
+LogName = Annotated[str, _matching(
+    NAME_PATTERN, "a name of lower-case letters, digits, '-' and '_', at most 64")]
 Strength = Annotated[str, _matching(r"[A-Za-z0-9._-]{0,64}", "a strength's name, or nothing")]
 Digest = Annotated[str, _matching(r"[0-9a-f]{64}", "a SHA-256 digest in 64 hexadecimal digits")]
 ScoreKey = Annotated[str, _matching(r"[a-z0-9][a-z0-9._-]{0,159}", "a score file's name, bare")]
@@ -152,6 +155,7 @@ def _schema(version: int) -> Any:
 
 
 _COUNT: Final = Annotated[int, Field(ge=1, le=LARGEST)]
+_TESTS: Final = Annotated[int, Field(ge=0, le=MOST_TEST // 2)]
 _PROTOCOL: Final = Literal[PROTOCOL]
 
 # fmt: off
@@ -171,25 +175,36 @@ _ENTRY: Final = strict_model(
     files=dict[FileName, strict_model(sha256=Digest, bytes=Whole)],  # type: ignore[misc]
 )
 
-_RECORD: Final = strict_model(
-    layout=_schema(record_format.SCHEMA), protocol=_PROTOCOL,
-    detector=DetectorName, detector_version=Version, plugin=PluginName, plugin_source=Digest,
-    parameters=Parameters, overrides=Parameters,
-    inputs=Literal["observations", "observations+actions", ""], alarm=Literal["cusum", "score"],
-    deterministic=bool, environment=Literal[*ENVIRONMENTS],
-    anomaly=Literal[*ANOMALIES], strength=Strength,
-    magnitude=(Annotated[float, Field(ge=0)] | None, None),
-    group=Literal[*GROUPS], horizon=Annotated[int, Field(ge=1, le=100_000)],
-    seed=Whole, split=SplitName, split_digest=Digest, limit=None,
-    status=Status, reason=Annotated[str, _text(1000)],
-    metrics=dict[str, strict_model(  # type: ignore[misc]
+_FIELDS: Final = {
+    "layout": _schema(record_format.SCHEMA), "protocol": _PROTOCOL,
+    "detector": DetectorName, "detector_version": Version, "plugin": PluginName,
+    "plugin_source": Digest, "parameters": Parameters, "overrides": Parameters,
+    "inputs": Literal["observations", "observations+actions", ""],
+    "alarm": Literal[get_args(AlarmKind)],
+    "deterministic": bool, "strength": Strength,
+    "magnitude": (Annotated[float, Field(ge=0)] | None, None),
+    "horizon": Annotated[int, Field(ge=1, le=100_000)],
+    "seed": Whole, "split": SplitName, "split_digest": Digest, "limit": None,
+    "status": Status, "reason": Annotated[str, _text(1000)],
+    "metrics": dict[str, strict_model(  # type: ignore[misc]
         value=Finite | None, low=Finite | None, high=Finite | None,
         n=Annotated[int, Field(ge=0, le=MOST_TEST)])],
-    brief=bool, counts=strict_model(
+    "brief": bool,
+    "per_trajectory": dict[str, Pair], "scores": ScoreKey,
+    "seconds_fit": Cost, "seconds_score": Cost, "steps_scored": Whole | None, "peak_rss_mb": Cost,
+    "provenance": _Provenance,
+}
+
+_RECORD: Final = strict_model(
+    **_FIELDS, environment=Literal[*ENVIRONMENTS], anomaly=Literal[*ANOMALIES],
+    group=Literal[*GROUPS], counts=strict_model(
         train=_COUNT, calibration=_COUNT, test=Annotated[int, Field(ge=1, le=MOST_TEST)]),
-    per_trajectory=dict[str, Pair], scores=ScoreKey,
-    seconds_fit=Cost, seconds_score=Cost, steps_scored=Whole | None, peak_rss_mb=Cost,
-    provenance=_Provenance,
+)
+
+_UNPAIRED: Final = strict_model(
+    **_FIELDS, paired=Literal[False], environment=LogName, anomaly=LogName,
+    group=Literal[*GROUPS, ""], note=(Annotated[str, _text(1000)], ""), counts=strict_model(
+        train=_COUNT, calibration=_COUNT, nominal=_TESTS, test=_TESTS),
 )
 # fmt: on
 
@@ -225,13 +240,21 @@ def _path(parts: tuple[int | str, ...]) -> str:
     return text.removeprefix(".")
 
 
-def _holds_to(model: type[BaseModel], text: str, where: str, findings: Findings) -> bool:
-    """Tell whether a JSON text has a format; every field that has not is a problem."""
+def _record_model(plain: Any) -> type[BaseModel]:
+    """Return the format of a record: with twins, or without."""
+    unpaired = isinstance(plain, dict) and plain.get("paired") is False
+    model: type[BaseModel] = _UNPAIRED if unpaired else _RECORD
+    return model
+
+
+def _holds_to(
+    model: Callable[[Any], type[BaseModel]], text: str, where: str, findings: Findings
+) -> bool:
+    """Tell whether a JSON text has its format; every field that has not is a problem."""
     before = findings.count
     try:
         with findings.reading(where):
-            parse_json(text)
-            model.model_validate_json(text)
+            model(parse_json(text)).model_validate_json(text)
     except ValidationError as error:
         for one in error.errors(include_url=False):
             findings.refuse(where, _path(one["loc"]), _message(one))
@@ -241,7 +264,7 @@ def _holds_to(model: type[BaseModel], text: str, where: str, findings: Findings)
 def read_info(contents: Mapping[str, bytes], findings: Findings) -> EntryInfo | None:
     """Read ``entry.json``; None when a field is wrong, so that nothing can be compared with it."""
     name, text = find_text(contents, ENTRY, findings)
-    sound = name and _holds_to(_ENTRY, text, name, findings)
+    sound = name and _holds_to(lambda _: _ENTRY, text, name, findings)
     return EntryInfo(**parse_json(text)) if sound else None
 
 
@@ -262,7 +285,7 @@ def read_records(contents: Mapping[str, bytes], findings: Findings) -> dict[str,
         if len(line) > MOST_LINE or not line.isprintable():
             expected = f"one record in plain JSON of at most {MOST_LINE} characters"
             findings.refuse(where, "", f"is {short(line)}, expected {expected}")
-        elif _holds_to(_RECORD, line, where, findings):
+        elif _holds_to(_record_model, line, where, findings):
             record = Record.from_json(line, where)
             records[f"{where} ({record.cell})"] = record
     return records

@@ -37,9 +37,9 @@ from oodd_eval.metrics.catalogue import (
 )
 from oodd_eval.plugins.contract import MAX_WARM_UP
 from oodd_eval.results import curve_file
-from oodd_eval.results.board import contribution
+from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.directory import EXPLAINED, RECORDS, ResultsDirectory
-from oodd_eval.results.evaluate import metric_of, rescore
+from oodd_eval.results.evaluate import counts_of, metric_of, rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric, Record
 
@@ -49,7 +49,7 @@ MOST_ROWS: Final = 64  # rows of one entry; the paper's comparisons are some twe
 BOUNDS: Final = Bounds(2**28, ResultsError, kinds="fi")  # of the arrays of a score file
 
 PARTS: Final = (CALIBRATION, TWINS, *(f"test/{anomaly}" for anomaly in TABLE1))
-"""Groups of a score file."""
+"""Groups of a score file of the benchmark's environments."""
 
 _DTYPES: Final = {"scores": np.dtype(np.float64), "offsets": np.dtype(np.int64)}
 _EXPLAINED: Final = dict.fromkeys(EXPLAINED, np.dtype(np.int32))  # of anomalous parts, if at all
@@ -67,7 +67,7 @@ def check_record(where: str, record: Record, findings: Findings) -> None:
         findings.refuse(where, field, message)
     if findings.count == before:
         terms = {name: contribution(record, name) for name in record.per_trajectory}
-        fresh = {name: metric_of(name, c, record.environment) for name, c in terms.items()}
+        fresh = {name: metric_of(name, c, *record.position) for name, c in terms.items()}
         fresh |= {n: Metric(m.value) for n, m in record.metrics.items() if n not in fresh}
         compare_metrics(where, record, fresh, "per_trajectory gives", findings)
 
@@ -77,8 +77,9 @@ def _check_fields(where: str, record: Record, findings: Findings) -> None:
     for name, value in record.overrides.items():
         expected, why = _exact(record.parameters.get(name)), f"as parameters.{name}"
         findings.expect(where, f"overrides.{name}", expected, _exact(value), why)
-    group = ANOMALIES[record.anomaly].group
-    findings.expect(where, "group", group, record.group, f"that of {record.anomaly}")
+    if record.paired:
+        group = ANOMALIES[record.anomaly].group
+        findings.expect(where, "group", group, record.group, f"that of {record.anomaly}")
     if record.ok == bool(record.reason):
         message = f"is {short(record.reason)}, expected one if and only if status is not 'ok'"
         findings.refuse(where, "reason", message)
@@ -102,8 +103,10 @@ def _metric_complaints(record: Record) -> Complaints:
     """
     levels = offered_levels(record.counts["calibration"], record.alarm)
     possible = {*METRICS, *(name for name in NAMES if name.endswith(tuple(levels)))}
+    other = "unpaired" if record.paired else "paired"
+    possible = {name for name in possible if metric_info(name).cells != other}
     needed = {RANKING, ALARM_RANKING} if HEADLINE in levels else {RANKING}
-    for name in sorted(needed - record.metrics.keys()):
+    for name in sorted(needed - record.metrics.keys()) if record.paired else ():
         yield f"metrics.{name}", "is missing: boards rank by it"
     for name in sorted(record.metrics.keys() - possible):
         yield f"metrics.{plain(name)}", "is no metric that is expected here"
@@ -112,11 +115,17 @@ def _metric_complaints(record: Record) -> Complaints:
         yield f"per_trajectory.{name}", "is missing"
     for name in sorted(record.per_trajectory.keys() - with_terms):
         yield f"per_trajectory.{plain(name)}", "is of no metric with terms that the record has"
+    for name in () if record.paired else sorted(with_terms):
+        (least, largest), value = metric_info(name).range, record.metrics[name].value
+        if not math.isnan(value) and not least <= value <= largest:
+            yield f"metrics.{name}.value", f"is {value:g}, expected {least:g} to {largest:g}"
     for name in sorted(with_terms & record.per_trajectory.keys()):
         numerators, denominators = record.per_trajectory[name]
-        least, largest = metric_info(name).range
-        if len(numerators) != record.counts["test"]:
-            expected = f"expected counts.test, {record.counts['test']}"
+        # An AUC of two samples has terms beyond its range.
+        least, largest = metric_info(name).range if record.paired else (-math.inf, math.inf)
+        trajectories = record.counts["test"] + record.counts.get("nominal", 0)
+        if len(numerators) != trajectories:
+            expected = f"expected {trajectories} by counts"
             yield f"per_trajectory.{name}", f"is of {len(numerators)} trajectories, {expected}"
             continue
         with np.errstate(invalid="ignore"):  # infinity times a denominator of 0
@@ -155,7 +164,10 @@ def _exact(value: Any) -> str:
 
 
 def check_together(entry: EntryInfo, records: Records, findings: Findings) -> None:
-    """Check that records are of the entry's split, each cell once, with all anomalies, and few."""
+    """Check that records are of the entry's split, each cell once, with all anomalies, and few.
+
+    Without the split the anomalies of environments without twins are those that any row here has.
+    """
     seen: dict[Any, str] = {}
     cells: dict[tuple[Setting, int], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for where, record in records.items():
@@ -167,15 +179,19 @@ def check_together(entry: EntryInfo, records: Records, findings: Findings) -> No
         cells[record.setting, record.seed][record.environment].add(record.anomaly)
     if (rows := len({setting for setting, _ in cells})) > MOST_ROWS:
         findings.refuse(RECORDS, "rows", f"are {rows}, expected at most {MOST_ROWS} of one entry")
+    expected_of: dict[str, Collection[str]] = dict.fromkeys(ENVIRONMENTS, TABLE1)
+    if not all(record.paired for record in records.values()):
+        by_environment = grouped(records.values(), lambda r: r.environment)
+        expected_of = {e: {r.anomaly: e for r in rows} for e, rows in by_environment.items()}
     for (setting, seed), environments in cells.items():
         label = setting.label(seed)
         for environment, present in environments.items():
-            if missing := [a for a in TABLE1 if a not in present]:
+            if missing := [a for a in expected_of[environment] if a not in present]:
                 why = "an environment counts with all; run them, or leave out what is not complete"
                 message = f"{environment} lacks {', '.join(missing)}: {why}"
                 findings.refuse(f"records of {label}", "anomaly", message)
-        if absent := [e for e in ENVIRONMENTS if e not in environments]:
-            partial = f"{len(environments)} of {len(ENVIRONMENTS)} environments"
+        if absent := [e for e in expected_of if e not in environments]:
+            partial = f"{len(environments)} of {len(expected_of)} environments"
             findings.notes.append(
                 f"{label} is partial: {partial} (without {', '.join(absent)}); where other rows "
                 "have them it is listed, but not ranked"
@@ -192,15 +208,21 @@ def check_against_split(records: Records, split: Split, findings: Findings) -> N
                 findings.refuse(where, "environment", f"is {environment!r}, the split has {names}")
             continue
         with closing(split.environment(environment)) as data:
-            parts = {"train": data.train, "calibration": data.calibration, "test": data.twins}
-            counts = {name: len(part) for name, part in parts.items()}
-            conditions = data.anomalies
+            conditions = split.conditions(environment)
+            counts = {condition: counts_of(data, condition, None) for condition in conditions}
+            paired = data.paired
         for where, record in of_environment.items():
-            findings.expect(where, "counts", counts, record.counts, "as the split has")
-            if str(record.condition) not in conditions:
-                names = ", ".join(conditions)
+            findings.expect(where, "paired", paired, record.paired, "as the split has")
+            if record.condition not in counts:
+                names = ", ".join(map(str, counts))
                 message = f"is '{record.condition}', the split has {names}"
                 findings.refuse(where, "anomaly", message)
+                continue
+            expected = counts[record.condition]
+            findings.expect(where, "counts", expected, record.counts, "as the split has")
+            if not paired:
+                group = split.groups.get(record.anomaly, "")
+                findings.expect(where, "group", group, record.group, "as the split has")
 
 
 def check_scores(
@@ -223,21 +245,25 @@ def check_scores(
             findings.refuse(where, "scores", message)
             continue
         with findings.reading(name):
-            for field, message in _complaints(directory / name, record.horizon):
+            for field, message in _complaints(directory / name, unit.values()):
                 findings.refuse(name, field, message)
         if findings.count == before:
             sound |= unit
     return sound
 
 
-def _complaints(path: Path, horizon: int) -> Complaints:
-    """Yield what is wrong with a score file; `ResultsError` where it cannot be read safely."""
+def _complaints(path: Path, unit: Collection[Record]) -> Complaints:
+    """Yield what is wrong with a unit's scores; `ResultsError` where they cannot be read safely."""
+    first = next(iter(unit))
+    expected = {*PARTS}
+    if not first.paired:
+        expected = {CALIBRATION, TWINS, *(record.condition.part for record in unit)}
     with closing(StoredFile(path, BOUNDS)) as file:
         parts = {*file.groups()} - {"test"} | {f"test/{name}" for name in file.groups("test")}
-        for part in sorted(parts ^ {*PARTS}):
+        for part in sorted(parts ^ expected):
             yield plain(part), "is no part of a score file" if part in parts else "is missing"
-        for part in sorted(parts & {*PARTS}):
-            yield from _part(file.part(part), part, horizon)
+        for part in sorted(parts & expected):
+            yield from _part(file.part(part), part, first.horizon)
 
 
 def _part(datasets: Mapping[str, Any], part: str, horizon: int) -> Complaints:
@@ -282,7 +308,10 @@ def check_rescored(records: Records, directory: Path, split: Split, findings: Fi
     """
     before = findings.count
     try:
-        fresh = rescore(list(records.values()), ResultsDirectory(directory), split)
+        requested = {name for name in METRICS if metric_info(name).request}
+        rows = any(requested & record.metrics.keys() for record in records.values())
+        results = ResultsDirectory(directory)
+        fresh = rescore(list(records.values()), results, split, row_metrics=rows)
     except (OoddError, ArithmeticError) as error:
         findings.refuse(SCORES, "", f"cannot be scored again: {error}")
         return False

@@ -189,7 +189,7 @@ def _differences(
         for (environment, _), sides in cells.items():
             by_side = [
                 [
-                    drawn_cell(environment, r.seed, contribution(r, metric))
+                    drawn_cell(environment, r.seed, contribution(r, metric), str(r.condition))
                     for r in side
                     if r.ok and metric in r.per_trajectory
                 ]

@@ -9,12 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from oodd_eval.data.facts import GROUPS
-from oodd_eval.metrics.catalogue import NAMES, RANKING
+from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.results.board import Value
 from oodd_eval.results.compare import MEANINGS, Comparison, Difference
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import NAN, Metric, Record
+from oodd_eval.results.record import NAN, Metric, Record, without_nan
 from oodd_eval.results.render import renders
 from oodd_eval.results.report import Report, by_suite, flat, message
 from oodd_eval.results.standings import RankedBoard, cost_of
@@ -23,21 +22,13 @@ from oodd_eval.results.standings import RankedBoard, cost_of
 @renders("csv", "a line per cell with all metrics")
 def cells_as_csv(report: Report) -> str:
     """Return a report's cells as CSV, their columns first."""
-    return csv_rows(_without_nan(report.records))
+    return csv_rows(without_nan(flat(report.records)))
 
 
 @renders("json", "the same as a JSON array")
 def cells_as_json(report: Report) -> str:
     """Return a report's cells as a JSON array."""
-    return json.dumps(_without_nan(report.records), indent=1) + "\n"
-
-
-def _without_nan(records: Sequence[Record]) -> list[dict[str, object]]:
-    """Return `flat` records with None for NaN, which neither format has."""
-    return [
-        {name: None if v != v else v for name, v in row.items()}  # noqa: PLR0124
-        for row in flat(records)
-    ]
+    return json.dumps(without_nan(flat(report.records)), indent=1) + "\n"
 
 
 def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
@@ -45,7 +36,7 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
     board = ranks.board
     metrics = dict.fromkeys(name for r in board.records for name in r.metrics)
     columns = {name: (name, board.anomalies) for name in metrics}
-    columns |= {f"{RANKING}_{g}": (RANKING, board.in_group(g)) for g in GROUPS if board.in_group(g)}
+    columns |= {f"{board.ranking}_{g}": (board.ranking, kinds) for g, kinds in board.groups.items()}
     lines = []
     for row in ranks.standings:
         means = [
@@ -98,7 +89,10 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
             "group": r.group,
             "anomaly": r.anomaly,
             "strength": r.strength,
+            "magnitude": "" if r.magnitude is None else number(r.magnitude),
+            "paired": str(r.paired).lower(),
             "status": r.status,
+            "note": r.note,
             "brief": str(r.brief).lower(),
             "seconds_fit": number(r.seconds_fit),
             "microseconds_per_step": number(cost_of([r]).step),

@@ -1,6 +1,9 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
+import re
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from html import escape as escape_html
 from typing import Final
 
@@ -139,7 +142,10 @@ def print_sections(sections: Sequence[Section], console: Console) -> None:
 
 def print_table(table: Table, console: Console, width: int = 0) -> None:
     """Print one table within a width, by default the console's: as it is, turned, or in parts."""
-    console.print(Text(table.title, "bold"))
+    if table.wrap:
+        print_prose(table.title, console, "bold")
+    else:
+        console.print(Text(table.title, "bold"))
     for part in _fitting(table, width or console.width):
         lines = grid(part, "simple").splitlines()
         colours = ["", "", *(part.colours or [""] * (len(lines) - 2))]
@@ -159,9 +165,13 @@ def print_prose(text: str, console: Console, style: str = "") -> None:
 
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return the table, the table turned, or parts of its columns, whichever first fits."""
-    for whole in (table, table.transposed()):
-        if _width(whole) <= width:
-            return [whole]
+    whole = [table, table.transposed()]
+    if table.wrap:
+        whole += [_wrapped(one, width) for one in whole]
+        table = whole[-2]
+    for one in whole:
+        if _width(one) <= width:
+            return [one]
     labels = list(range(table.labels))
     parts = [labels]
     for column in range(table.labels, len(table.header)):
@@ -171,6 +181,35 @@ def _fitting(table: Table, width: int) -> list[Table]:
         else:
             parts.append([*labels, column])
     return [table.columns(part) for part in parts]
+
+
+def _wrapped(table: Table, width: int) -> Table:
+    """Return a table whose headings and labels take several lines where they are long."""
+    most = max(_NARROW, width // 3)
+
+    def lines(text: str, room: int) -> str:
+        wrapper = textwrap.TextWrapper(room)
+        wrapper.wordsep_re = _PARTS
+        return "\n".join(wrapper.wrap(text))
+
+    columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
+    longest = [max(map(len, column), default=0) for column in columns]
+    header = [
+        lines(text, most if i < table.labels else max(longest[i], _NARROW))
+        for i, text in enumerate(table.header)
+    ]
+    rows = [
+        [lines(text, most) if i < table.labels else text for i, text in enumerate(row)]
+        for row in table.rows
+    ]
+    return replace(table, header=header, rows=rows)
+
+
+_NARROW: Final = 9
+"""Width of a column that headings are wrapped to where its figures are narrower."""
+
+_PARTS: Final = re.compile(r"(\s+|[^-\[,:.=\s]*[-\[,:.=]+)")
+"""Where lines may end: between words, and in names behind what separates their parts."""
 
 
 def _width(table: Table) -> int:

@@ -1,7 +1,7 @@
 // What the columns of the main table are: one list for each of its views.
 
 /** Values that others are read beside: large or small, they are no merit in a row. */
-const BESIDE = ["auc_null", "auc_placebo", "delay_null", "found_within_100_null", "early_at_"];
+const BESIDE = ["auc_null", "auc_placebo", "auc_pool_null", "delay_null", "found_within_100_null", "found_outcome_null", "early_at_"];
 
 /** Whether a metric's best value is marked: delays at different false-alarm rates do not compare. */
 const isMarked = (metric, kind) =>
@@ -22,7 +22,7 @@ function metricColumn(board, metric, options = {}) {
     marked: isMarked(metric, kind),
     kind,
     interval: options.interval ?? false,
-    needs: (selection) => isSummary({ ...selection, ...options.within }) ? [] : [metric],
+    needs: (selection) => isSummary({ ...selection, ...options.within }) ? [] : known(board, [metric]),
     of: (row, selection) => mean(board, row, metric, { ...selection, ...options.within }),
   };
 }
@@ -57,32 +57,42 @@ const ALARM_RANK = plainColumn(
   (row) => row.alarm_rank,
 );
 
+/** Columns of the metric that ranks for each group that a board has, where all are selected. */
+function groupColumns(board, selection) {
+  if (selection.group !== "all" || selection.anomaly !== "all") return [];
+  const some = (group) => inGroup(board, group).length && (board.paired || inGroup(board, group).length < board.anomalies.length);
+  return Object.keys(GROUP_TITLES).filter(some).map((group) => metricColumn(board, board.ranking, {
+    key: `matched_${group}`, title: GROUP_TITLES[group], within: { group },
+    hint: `${rankingTitle(board)} over ${group} anomalies`, interval: true,
+  }));
+}
+
+/** A column of how often a row is above others. */
+const winsColumn = (board) =>
+  plainColumn("wins", "Wins", "%", `Mean share of cells with a higher ${rankingName(board)} than another row's`,
+    (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", marked: true, text: (share) => isNumber(share) ? share.toFixed(0) : UNDEFINED });
+
+/** Columns of those of some metrics that a board has. */
+const metricColumns = (board, metrics) => known(board, metrics).map((metric) => metricColumn(board, metric, {
+  interval: board.intervals.includes(metric),
+  title: metric.endsWith(board.level) ? DATA.metrics[metric].title.replace(` at ${levelOf(board)}`, "") : undefined,
+}));
+
+const ROW_METRICS = ["f1_rows", "far_rows", "mar_rows", "vus_pr"];
+
 const LISTS = {
   ranking: {
     title: "Separability",
     columns(board, selection) {
-      const columns = [
+      return [
         { ...metricColumn(board, "auc_matched", { interval: true }), whisker: true },
-      ];
-      if (selection.group === "all" && selection.anomaly === "all") {
-        for (const group of Object.keys(GROUP_TITLES)) {
-          if (inGroup(board, group).length) {
-            columns.push(metricColumn(board, "auc_matched", {
-              key: `matched_${group}`, title: GROUP_TITLES[group], within: { group },
-              hint: `Matched AUC over ${group} anomalies`, interval: true,
-            }));
-          }
-        }
-      }
-      columns.push(
+        ...groupColumns(board, selection),
         metricColumn(board, "auc_smoothed"),
         metricColumn(board, "auc_unpaired"),
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
-        plainColumn("wins", "Wins", "%", "Mean share of cells with a higher matched AUC than another row's",
-          (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", marked: true, text: (share) => isNumber(share) ? share.toFixed(0) : UNDEFINED }),
-      );
-      return columns;
+        winsColumn(board),
+      ];
     },
   },
   aucs: {
@@ -125,24 +135,24 @@ const LISTS = {
   environments: {
     title: "By environment",
     columns: (board, selection) => [
-      metricColumn(board, "auc_matched"),
+      metricColumn(board, board.ranking),
       ...board.environments
-        .filter((e) => ["all", DATA.environments[e].family, e].includes(selection.environment))
-        .map((e) => metricColumn(board, "auc_matched", {
-          key: e, title: DATA.environments[e].title, within: { environment: e }, interval: true,
-          hint: `Matched AUC in ${DATA.environments[e].title}`,
+        .filter((e) => ["all", environmentOf(board, e).family, e].includes(selection.environment))
+        .map((e) => metricColumn(board, board.ranking, {
+          key: e, title: environmentOf(board, e).title, within: { environment: e }, interval: true,
+          hint: `${rankingTitle(board)} in ${environmentOf(board, e).title}`,
         })),
     ],
   },
   anomalies: {
     title: "By anomaly",
     columns: (board, selection) => [
-      metricColumn(board, "auc_matched"),
+      metricColumn(board, board.ranking),
       ...inGroup(board, selection.group)
         .filter((a) => ["all", a].includes(selection.anomaly))
-        .map((a) => metricColumn(board, "auc_matched", {
-          key: a, title: DATA.anomalies[a].title, within: { anomaly: a, group: "all" }, interval: true,
-          hint: `Matched AUC under ${DATA.anomalies[a].title}: ${DATA.anomalies[a].summary}`,
+        .map((a) => metricColumn(board, board.ranking, {
+          key: a, title: anomalyOf(board, a).title, within: { anomaly: a, group: "all" }, interval: true,
+          hint: [`${rankingTitle(board)} under ${anomalyOf(board, a).title}`, anomalyOf(board, a).summary].filter(Boolean).join(": "),
         })),
     ],
   },
@@ -157,8 +167,49 @@ const LISTS = {
   },
 };
 
+/** The views of boards whose episodes have no twins. */
+const LISTS_OF_LOGS = {
+  ranking: {
+    title: "Separability",
+    columns: (board, selection) => !board.parts[board.ranking] ? [] : [
+      { ...metricColumn(board, board.ranking, { interval: true }), whisker: true },
+      ...groupColumns(board, selection),
+      ...metricColumns(board, ["auc_pool", "auc_pool_null", "auc_rows", "auc_outcome"].filter((metric) => metric !== board.ranking)),
+      winsColumn(board),
+    ],
+    empty: "This board has nominal episodes alone, so there is nothing to separate: see its alarms.",
+  },
+  guaranteed: {
+    title: "Alarms",
+    rank: { ...ALARM_RANK, hint: "1 plus the number of rows that are significantly better by the first column" },
+    sort: "alarm_rank",
+    level: levelOf,
+    columns: (board) => [
+      ...["delay_censored", "found_outcome", "found_outcome_null", "events_found", "delay", "missed", "found_within_20", "found_within_100",
+        "found_within_100_null", "false_episodes", "early", "false_alarms_per_hour"].map((metric) => `${metric}_${board.level}`),
+      ...["at_5pct", "at_10pct", "at_1pct"].filter((suffix) => suffix !== board.level)
+        .flatMap((suffix) => ["delay", "missed", "false_episodes"].map((metric) => `${metric}_${suffix}`)),
+    ].flatMap((metric) => metricColumns(board, [metric])),
+    empty: LISTS.guaranteed.empty,
+  },
+  environments: LISTS.environments,
+  anomalies: LISTS.anomalies,
+  rows: {
+    title: "Metrics of rows",
+    columns: (board) => metricColumns(board, ROW_METRICS),
+    empty: "No record of this board has metrics of rows: they are computed on request, for comparison with published tables, and rank nothing.",
+  },
+  cost: LISTS.cost,
+};
+
+/** The views that a board has. */
+const listsOf = (board) => board.paired ? LISTS : LISTS_OF_LOGS;
+
+/** The view that is chosen, or the first where a board has no such view. */
+const listOf = (board, view) => listsOf(board)[view] ?? listsOf(board).ranking;
+
 /** Columns of a view that this board has numbers for. */
 function columnsOf(board, state) {
-  const columns = LISTS[state.view].columns(board, state);
+  const columns = listOf(board, state.view).columns(board, state);
   return columns.filter((c) => !c.paper || board.rows.some((row) => isNumber(c.of(row, state).value)));
 }

@@ -23,7 +23,7 @@ function cellSections(board, row, chosen) {
   return [
     section("Cells", "cells", heat(board, row, cell),
       element("p", { class: "note" }, "Choose a cell to see its curves below.")),
-    section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell", cellPart(board, row, cell)),
+    section(cellTitle(board, cell), "cell", cellPart(board, row, cell)),
   ];
 }
 
@@ -46,18 +46,33 @@ function summary(board, row) {
     const { kind } = DATA.metrics[metric];
     return isNumber(low) ? `95 % interval ${show(low, kind)} to ${show(high, kind)}` : "no interval";
   };
+  const rank = card("Rank", row.rank ? rankText(row, row.rank) : UNDEFINED, !row.rank ? row.state : row.below
+      ? "would have: not run again by maintainers"
+      : `of ${board.rows.filter((r) => r.rank && !r.below).length} ranked${row.ties && `, tie groups ${row.ties}`}`);
+  const cost = card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`);
+  if (!board.paired) return element("dl", { class: "cards" }, cardsOfLogs(board, card, text, interval), rank, cost);
   return element("dl", { class: "cards" },
     card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched.meaning),
-    card("Rank", row.rank ? rankText(row, row.rank) : UNDEFINED, !row.rank ? row.state : row.below
-      ? "would have: not run again by maintainers"
-      : `of ${board.rows.filter((r) => r.rank && !r.below).length} ranked${row.ties && `, tie groups ${row.ties}`}`),
+    rank,
     card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc.meaning),
     card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay.meaning),
     card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin.meaning),
-    card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`));
+    cost);
 }
 
-/** Colours of a matched AUC: from the page's own at chance to teal at 1, or to orange at 0. */
+/** Cards of a row whose episodes have no twins: what it separates, and its guaranteed alarms. */
+function cardsOfLogs(board, card, text, interval) {
+  const clock = board.rows.find((r) => r.label === "clock");
+  const beside = (metric) => metric === "auc_rows" && clock
+    ? `the time alone ${meanText(mean(board, clock, metric), "percent")}` : interval(metric);
+  const alarms = ["delay", "missed", "false_episodes"].map((metric) => `${metric}_${board.level}`);
+  return known(board, ["auc_pool", "auc_rows", "auc_outcome", ...alarms]).map((metric) => {
+    const { title, kind, meaning } = DATA.metrics[metric];
+    return card(kind === "rate" ? title : `${title} (${titleOfUnit[kind]})`, text(metric), beside(metric), meaning);
+  });
+}
+
+/** Colours of an AUC: from the page's own at chance to teal at 1, or to orange at 0. */
 function colours(value) {
   if (!isNumber(value)) return {};
   const far = Math.min(1, Math.abs(value - 0.5) * 2);
@@ -77,11 +92,11 @@ function painted(node, value) {
 }
 
 /**
- * Matched AUC by environment and anomaly; every value is a link to its cell at `link`. `of` gives
+ * The metric that ranks by environment and anomaly; every value is a link to its cell at `link`. `of` gives
  * the number of a selection.
  */
-function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, "auc_matched", selection),
-  link = (...cell) => address("detector", row.id, ...cell), caption = "Matched AUC (%): teal is better than chance, orange is worse") {
+function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, board.ranking, selection),
+  link = (...cell) => address("detector", row.id, ...cell), caption = `${rankingTitle(board)} (%): teal is better than chance, orange is worse`) {
   const cellAt = (e, a) => of({ environment: e, group: "all", anomaly: a });
   const shade = (found) => found.gap && isNumber(found.value) ? 0.5 + found.value : found.value;
   const filled = (found, content, extra = {}) => painted(element("td", extra, content), shade(found));
@@ -98,17 +113,19 @@ function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, "auc
     const found = of({ ...EVERYTHING, ...selection });
     return filled(found, text(found), { class: "total", title: tip(found) });
   };
-  const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
+  const groups = [...Object.keys(GROUP_TITLES), ""].filter((g) => inGroup(board, g).length);
   const ordered = groups.flatMap((g) => inGroup(board, g));
   return scroller(element("table", { class: "heat" },
     captionOf(caption),
     element("thead", {},
-      element("tr", {}, element("td", {}), groups.map((g) => element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
+      groups.some(Boolean) && element("tr", {}, element("td", {}), groups.map((g) => g
+        ? element("th", { scope: "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])
+        : element("td", { colspan: inGroup(board, g).length })), element("td", {})),
       element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
-        ordered.map((a) => element("th", { scope: "col", title: DATA.anomalies[a].summary }, DATA.anomalies[a].title)),
+        ordered.map((a) => element("th", { scope: "col", title: anomalyOf(board, a).summary || null }, anomalyOf(board, a).title)),
         element("th", { scope: "col" }, "Mean"))),
     element("tbody", {},
-      board.environments.map((e) => element("tr", {}, element("th", { scope: "row" }, DATA.environments[e].title),
+      board.environments.map((e) => element("tr", {}, element("th", { scope: "row" }, environmentOf(board, e).title),
         ordered.map((a) => one(e, a)), total({ environment: e }))),
       element("tr", { class: "total" }, element("th", { scope: "row" }, "Mean"),
         ordered.map((a) => total({ anomaly: a })), total({})))));
@@ -118,7 +135,7 @@ function heat(board, row, chosen, of = (selection) => meanOfRow(board, row, "auc
 function cellPart(board, row, cell) {
   const selection = { environment: cell.environment, group: "all", anomaly: cell.anomaly };
   const of = (metric) => meanOfRow(board, row, metric, selection);
-  const { state, reason } = of("auc_matched");
+  const { state, reason } = of(board.ranking);
   if (state) return element("p", { class: "failure" }, element("strong", {}, state), `: ${reason}`);
   const text = (metric) => {
     const found = of(metric);
@@ -127,6 +144,7 @@ function cellPart(board, row, cell) {
     const interval = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
     return show(found.value, kind) + unit + interval;
   };
+  if (!board.paired) return cellOfLogs(board, row, cell, of, text);
   const guaranteed = !board.metrics.includes("delay_at_5pct") ? "" :
     `Guaranteed alarms at 5 %: delay ${text("delay_at_5pct")}, missed ${text("missed_at_5pct")}, ` +
     `found within 20 rows ${text("found_within_20_at_5pct")}, false episodes ${text("false_episodes_at_5pct")}. `;
@@ -143,6 +161,25 @@ function cellPart(board, row, cell) {
     trajectoryFigure(curves.example, sensorsOf(board, cell, curves.example))];
 }
 
+/** Numbers and drawings of one cell whose episodes have no twins. */
+function cellOfLogs(board, row, cell, of, text) {
+  const metrics = [
+    "auc_pool", "auc_pool_null", "auc_rows", "auc_outcome",
+    ...["found_outcome", "events_found", "delay", "missed", "false_episodes", "false_alarms_per_hour"].map((m) => `${m}_${board.level}`),
+  ];
+  const defined = known(board, metrics).filter((metric) => isNumber(of(metric).value));
+  const parts = defined.map((metric) => {
+    const { title } = DATA.metrics[metric];
+    return `${/^[A-Z][a-z]/.test(title) ? title[0].toLowerCase() + title.slice(1) : title} ${text(metric)}`;
+  });
+  const sentence = element("p", {}, parts.length ? `This cell: ${parts.join(", ")}. Brackets are 95 % intervals.` : "No metric of this cell has a value.");
+  const curves = curvesOf(row, `${cell.environment}/${cell.anomaly}`);
+  if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
+  return [sentence,
+    element("div", { class: "figures" }, rocFigure(curves.roc, of("auc_pool").value, false), delayFigure(curves.delay_far)),
+    episodeFigure(curves.example)];
+}
+
 /** A promise of what sensors read in an example, where the site has that; null where not. */
 function sensorsOf(board, cell, example) {
   const name = board.episodes[cell.environment];
@@ -154,7 +191,7 @@ function curvesOf(row, name) {
   const cell = PARTS.get(row.part).curves[name];
   if (!cell) return undefined;
   const { scores, twin, score_step, cusum, twin_cusum, cusum_step } = cell.example;
-  const scaled = (values, step) => step === null ? values : values.map((v) => v === null ? null : v * step);
+  const scaled = (values, step) => step === null || !values ? values : values.map((v) => v === null ? null : v * step);
   const example = {
     ...cell.example,
     scores: scaled(scores, score_step),
@@ -172,7 +209,7 @@ function comparisons(board, row) {
   if (!found.length) return null;
   const links = new Map(board.rows.map((r) => [r.label, r.id]));
   return section("Against the others", "comparisons", scroller(element("table", { class: "plain" },
-    captionOf(`Differences in mean matched AUC (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
+    captionOf(`Differences in mean ${rankingName(board)} (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
     element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
       element("th", { scope: "col", class: i ? null : "left" }, t)))),
     element("tbody", {}, found.sort((a, b) => a[1] - b[1]).map(([other, difference, low, high]) => element("tr", {},
@@ -194,7 +231,7 @@ const signed = (share) => isNumber(share) ? `${share < 0 ? "\u2212" : "+"}${Math
 
 /** Ours beside the digits of the paper's Table 5, where it has them. */
 function paperPart(board, row) {
-  if (paperMean(row, "auc") === null) return null;
+  if (!board.paired || paperMean(row, "auc") === null) return null;
   const groups = Object.keys(GROUP_TITLES).filter((g) => inGroup(board, g).length);
   const columns = ["auc", "delay", "far"].flatMap((metric) => groups.map((group) => ({ metric, group })));
   const numbers = (environment) => columns.flatMap(({ metric, group }) => {

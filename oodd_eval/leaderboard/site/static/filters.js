@@ -5,15 +5,17 @@ function drawFilters() {
   const environments = [
     ["all", "All environments"],
     ...["classic", "bullet"]
-      .filter((family) => board.environments.some((e) => DATA.environments[e].family === family))
+      .filter((family) => board.environments.some((e) => environmentOf(board, e).family === family))
       .map((family) => [family, family === "classic" ? "Classic control" : "Bullet"]),
-    ...board.environments.map((e) => [e, DATA.environments[e].title]),
+    ...board.environments.map((e) => [e, environmentOf(board, e).title]),
   ];
-  const groups = [["all", "Both groups"], ...Object.entries(GROUP_TITLES).filter(([g]) => inGroup(board, g).length)];
-  const anomalies = [["all", "All anomalies"], ...inGroup(board, state.group).map((a) => [a, DATA.anomalies[a].title])];
+  const groups = [["all", board.paired ? "Both groups" : "All groups"], ...Object.entries(GROUP_TITLES).filter(([g]) => inGroup(board, g).length)];
+  if (groups.length === 1) state.group = "all";
+  const anomalies = [["all", "All anomalies"], ...inGroup(board, state.group).map((a) => [a, anomalyOf(board, a).title])];
   const horizons = [...new Set(board.rows.map((row) => row.horizon))].sort((a, b) => a - b);
   const inputs = [...new Set(board.rows.map((row) => row.inputs).filter(Boolean))].sort();
-  const views = Object.entries(LISTS).map(([name, list]) => [name, list.title]);
+  if (!listsOf(board)[state.view]) Object.assign(state, { view: "ranking", sort: DEFAULTS.sort, ascending: false });
+  const views = Object.entries(listsOf(board)).map(([name, list]) => [name, list.title]);
   document.getElementById("filters").replaceChildren(
     element("label", {}, element("span", {}, "Search"), element("input", {
       type: "search", name: "search", value: state.search, placeholder: "detector, plug-in, submitter",
@@ -21,7 +23,7 @@ function drawFilters() {
     })),
     select("board", "Split", DATA.boards.map((b) => [b.id, boardTitle(b)])),
     select("environment", "Environment", environments),
-    select("group", "Group", groups),
+    ...(groups.length > 1 ? [select("group", "Group", groups)] : []),
     select("anomaly", "Anomaly", anomalies),
     select("horizon", "Horizon", [["all", "All horizons"], ...horizons.map((h) => [String(h), `\u0394 = ${h}`])]),
     select("inputs", "Inputs", [["all", "All inputs"], ...inputs.map((i) => [i, i.replace("+", " + ")])]),
@@ -48,7 +50,7 @@ function select(name, label, options) {
 function change(name, value) {
   state[name] = value;
   if (name === "group") state.anomaly = "all";
-  if (name === "view") Object.assign(state, { sort: LISTS[value].sort ?? "auc_matched", ascending: Boolean(LISTS[value].sort) });
+  if (name === "view") Object.assign(state, { sort: LISTS[value]?.sort ?? DEFAULTS.sort, ascending: Boolean(LISTS[value]?.sort) });
   if (name === "board" || name === "group") {
     drawFilters();
     document.querySelector(`#filters [name="${name}"]`).focus();

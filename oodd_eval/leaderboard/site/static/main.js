@@ -13,7 +13,7 @@ const PAGES = {
   power: { find: () => DATA.power.length ? {} : null, draw: () => powerPage(), title: () => "Weaker anomalies" },
   cost: { find: () => ({ board: currentBoard() }), draw: ({ board }) => costPage(board), title: () => "Quality and cost" },
   heat: {
-    find: () => ({ board: currentBoard() }), parts: ({ board }) => [board.parts.auc_matched],
+    find: () => ({ board: currentBoard() }), parts: ({ board }) => known(board, [board.ranking]).map((metric) => board.parts[metric]),
     draw: ({ board }) => heatPage(board), title: () => "Detectors by cells",
   },
 };
@@ -127,6 +127,7 @@ document.getElementById("theme").addEventListener("click", () => {
   route();
 });
 if (DATA.project) document.getElementById("project").replaceChildren(element("a", { href: DATA.project, rel: "noopener noreferrer external" }, "Code and documents"));
+if (DATA.boards.every((board) => board.paired)) for (const node of document.querySelectorAll(".of-logs")) node.remove();
 if (!DATA.power.length) document.querySelector("nav.site a[href='#/power']").hidden = true;
 if (DATA.boards.length) {
   window.addEventListener("hashchange", route);

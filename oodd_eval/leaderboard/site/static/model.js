@@ -30,13 +30,27 @@ function load(name) {
 const notLoaded = (error) => element("p", { class: "failure", role: "alert" },
   `Data of this page is missing: ${error.message}. Keep the directory "data" beside index.html, or build the site again with "oodd-eval leaderboard build".`);
 
+/** What is known of an environment or an anomaly: logs have names of their own. */
+const environmentOf = (board, name) => (board.own ?? DATA).environments[name];
+const anomalyOf = (board, name) => (board.own ?? DATA).anomalies[name];
+
+/** The title of a cell. */
+const cellTitle = (board, { environment, anomaly }) => `${environmentOf(board, environment).title}, ${anomalyOf(board, anomaly).title}`;
+
+/** The title of the metric that a board ranks by, as it begins a sentence, or within one. */
+const rankingTitle = (board) => DATA.metrics[board.ranking].title;
+const rankingName = (board) => board.paired ? "matched AUC" : rankingTitle(board).replace(/^P/, "p");
+
+/** The level of a board's guaranteed alarms, such as 5 %. */
+const levelOf = (board) => `${board.level.replace(/\D/g, "")} %`;
+
 /** Whether a cell is among those selected. */
-function selects(selection, cell) {
+function selects(board, selection, cell) {
   const { environment, group, anomaly } = selection;
-  const family = DATA.environments[cell.environment].family;
+  const { family } = environmentOf(board, cell.environment);
   return (
     (environment === "all" || environment === family || environment === cell.environment) &&
-    (group === "all" || group === DATA.anomalies[cell.anomaly].group) &&
+    (group === "all" || group === anomalyOf(board, cell.anomaly).group) &&
     (anomaly === "all" || anomaly === cell.anomaly)
   );
 }
@@ -51,7 +65,7 @@ function cellsOf(board, selection) {
   const key = [board.id, selection.environment, selection.group, selection.anomaly].join("|");
   if (!places.has(key)) {
     places.set(key, board.cells.flatMap(([environment, anomaly], i) =>
-      selects(selection, { environment, anomaly }) ? [i] : []));
+      selects(board, selection, { environment, anomaly }) ? [i] : []));
   }
   return places.get(key);
 }
@@ -64,6 +78,9 @@ const partOf = (board, metric) => PARTS.get(board.parts[metric]);
 
 /** Load what means of metrics over a selection need, beyond the index. */
 const loadMetrics = (board, metrics) => Promise.all(metrics.map((metric) => load(board.parts[metric])));
+
+/** Metrics that a board has data of. */
+const known = (board, metrics) => metrics.filter((metric) => board.parts[metric]);
 
 const wholeDigits = (kind) => kind === "steps" ? 10 : 1000;
 
@@ -101,7 +118,7 @@ function mean(board, row, metric, selection = EVERYTHING) {
 function meanOfRow(board, row, metric, selection = EVERYTHING) {
   if (isSummary(selection)) return mean(board, row, metric, selection);
   const part = PARTS.get(row.part);
-  const cells = part.cells.filter((cell) => selects(selection, cell));
+  const cells = part.cells.filter((cell) => selects(board, selection, cell));
   const found = { value: null, low: null, high: null, state: "", cells: cells.length, partial: false };
   const failed = cells.find((cell) => cell.status);
   if (failed) return { ...found, state: failed.status, reason: failed.reason };
@@ -135,8 +152,8 @@ function paperMean(row, metric, selection = EVERYTHING) {
   return metric === "auc" ? value / 100 : value;
 }
 
-/** Anomalies of a board that belong to a group. */
-const inGroup = (board, group) => board.anomalies.filter((a) => group === "all" || DATA.anomalies[a].group === group);
+/** Anomalies of a board that belong to a group; those of no group belong to "". */
+const inGroup = (board, group) => board.anomalies.filter((a) => group === "all" || anomalyOf(board, a).group === group);
 
 /** A value as text with marks: a state in place of a failed value, a star for a partial mean. */
 function meanText(found, kind) {

@@ -16,24 +16,24 @@ const primaries = (board) => board.rows.filter((row) => row.primary);
 
 const redraw = (draw) => document.getElementById("detector").replaceChildren(...draw.flat().filter(Boolean));
 
-/** Matched AUC against what a detector costs. */
+/** The metric that ranks against what a detector costs. */
 function costPage(board) {
   const cost = COSTS[overview.cost];
-  const drawn = primaries(board).map((row) => ({ row, x: row.cost[overview.cost], y: mean(board, row, "auc_matched") }))
+  const drawn = primaries(board).map((row) => ({ row, x: row.cost[overview.cost], y: mean(board, row, board.ranking) }))
     .filter(({ x, y }) => isNumber(x) && x > 0 && isNumber(y.value));
   const again = (value) => { overview.cost = value; redraw(costPage(board)); };
   const xs = drawn.map(({ x }) => x);
   const ys = drawn.map(({ y }) => 100 * y.value);
   const range = [Math.min(...xs) / 1.5, Math.max(...xs) * 1.5];
   const low = Math.floor(Math.min(50, ...ys) / 10) * 10;
-  const plot = chart(`Matched AUC against ${cost.title}`,
+  const plot = chart(`${rankingTitle(board)} against ${cost.title}`,
     { range, ticks: [-3, -2, -1, 0, 1, 2, 3, 4, 5].map((p) => 10 ** p).filter((t) => t >= range[0] && t <= range[1]), label: cost.label, bend: Math.log10 },
-    { range: [low, 100], ticks: ticks(low, 100), label: "matched AUC (%)" }, { width: 860, height: 480, class: "wide" });
+    { range: [low, 100], ticks: ticks(low, 100), label: `${rankingName(board)} (%)` }, { width: 860, height: 480, class: "wide" });
   plot.drawing.setAttribute("role", "group");
   const taken = [];
   for (const { row, x, y } of drawn) {
     const [left, top] = [plot.sx(x), plot.sy(100 * y.value)];
-    plot.drawing.append(shape("a", { href: address("detector", row.id), class: row.trivial ? "spot trivial" : "spot", "aria-label": `${row.label}: matched AUC ${show(y.value, "percent")} %, ${costText(x)} ${cost.label}` },
+    plot.drawing.append(shape("a", { href: address("detector", row.id), class: row.trivial ? "spot trivial" : "spot", "aria-label": `${row.label}: ${rankingName(board)} ${show(y.value, "percent")} %, ${costText(x)} ${cost.label}` },
       shape("circle", { cx: left, cy: top, r: 5 }),
       shape("text", labelPlace(left, top, row.label, plot, taken), row.label)));
   }
@@ -46,7 +46,7 @@ function costPage(board) {
     figure([plot.drawing], [], "Up and to the left is better: more is found, for less."),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Quality and cost as a table" }, element("table", { class: "plain", id: "costs" },
       captionOf("The same as numbers"),
-      element("thead", {}, element("tr", {}, ["Detector", "Matched AUC (%)", "Score (\u00b5s per step)", "Fit (s)", "Memory (MB)"].map((text, i) =>
+      element("thead", {}, element("tr", {}, ["Detector", `${rankingTitle(board)} (%)`, "Score (\u00b5s per step)", "Fit (s)", "Memory (MB)"].map((text, i) =>
         element("th", { scope: "col", class: i ? null : "left" }, text)))),
       element("tbody", {}, drawn.map(({ row, y }) => element("tr", {}, element("th", { scope: "row" }, rowLink(row)),
         element("td", {}, meanText(y, "percent")), ["step", "fit", "peak"].map((name) => element("td", {}, costText(row.cost[name])))))))),
@@ -69,21 +69,21 @@ function labelPlace(x, y, text, plot, taken) {
   return { x: x + chosen.dx, y: y + chosen.dy, "text-anchor": chosen.anchor };
 }
 
-/** Matched AUC of every detector by anomaly, environment or cell. */
+/** The metric that ranks of every detector by anomaly, environment or cell. */
 function heatPage(board) {
   const again = (value) => { overview.columns = value; redraw(heatPage(board)); };
   const columns = {
-    anomaly: board.anomalies.map((anomaly) => ({ title: DATA.anomalies[anomaly].title, selection: { ...EVERYTHING, anomaly } })),
-    environment: board.environments.map((environment) => ({ title: DATA.environments[environment].title, selection: { ...EVERYTHING, environment } })),
+    anomaly: board.anomalies.map((anomaly) => ({ title: anomalyOf(board, anomaly).title, selection: { ...EVERYTHING, anomaly } })),
+    environment: board.environments.map((environment) => ({ title: environmentOf(board, environment).title, selection: { ...EVERYTHING, environment } })),
     cell: board.cells.map(([environment, anomaly]) => ({
-      title: `${DATA.environments[environment].title}, ${DATA.anomalies[anomaly].title}`, selection: { environment, group: "all", anomaly }, cell: [environment, anomaly],
+      title: cellTitle(board, { environment, anomaly }), selection: { environment, group: "all", anomaly }, cell: [environment, anomaly],
     })),
   }[overview.columns];
   const rows = primaries(board);
   const options = [["anomaly", "Anomalies"], ["environment", "Environments"], ["cell", "Cells"]];
   return [
     element("h1", { tabindex: "-1" }, "Detectors by cells"),
-    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 matched AUC (%), one row a detector`),
+    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${rankingName(board)} (%), one row a detector`),
     element("form", { class: "choices", autocomplete: "off" }, tabs("heat-columns", "Columns", options, overview.columns, again),
       csvButton("heatmap", () => document.getElementById("heatmap"))),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Heat map" },
@@ -93,8 +93,8 @@ function heatPage(board) {
           columns.map(({ title }) => element("th", { scope: "col" }, element("span", {}, title))), element("th", { scope: "col" }, "Mean"))),
         element("tbody", {}, rows.map((row) => element("tr", { class: row.trivial ? "trivial" : null },
           element("th", { scope: "row" }, rowLink(row)),
-          columns.map(({ selection, cell }) => heatCell(mean(board, row, "auc_matched", selection), cell && address("detector", row.id, ...cell))),
-          heatCell(mean(board, row, "auc_matched"), null, "total")))))),
+          columns.map(({ selection, cell }) => heatCell(mean(board, row, board.ranking, selection), cell && address("detector", row.id, ...cell))),
+          heatCell(mean(board, row, board.ranking), null, "total")))))),
   ];
 }
 

@@ -16,9 +16,9 @@ function pairPage(board, rows, chosen) {
     section("Numbers", "numbers", pairTable(board, rows)),
     section("Cells", "cells",
       heat(board, first, cell, (selection) => difference(board, rows, selection), link,
-        `${first.label} minus ${second.label}: matched AUC in points of per cent; teal is where ${first.label} finds more`),
+        `${first.label} minus ${second.label}: ${rankingName(board)} in points of per cent; teal is where ${first.label} finds more`),
       element("p", { class: "note" }, "Choose a cell to see both rows\u2019 curves below.")),
-    section(`${DATA.environments[cell.environment].title}, ${DATA.anomalies[cell.anomaly].title}`, "cell",
+    section(cellTitle(board, cell), "cell",
       element("div", { class: "pair" }, rows.map((row) => element("div", {},
         element("h3", {}, element("a", { href: address("detector", row.id, cell.environment, cell.anomaly) }, row.label)),
         cellPart(board, row, PARTS.get(row.part).cells.find((c) => c.environment === cell.environment && c.anomaly === cell.anomaly) ?? cell))))),
@@ -33,12 +33,12 @@ function verdictText(board, first, second) {
   const [, gap, low, high] = found;
   const verdict = verdictOf(part, second.label);
   const words = { better: `${first.label} is significantly better`, worse: `${second.label} is significantly better` }[verdict] ?? "the two cannot be told apart";
-  return element("p", {}, `Mean matched AUC differs by ${signed(gap)} points, 95 % interval ${signed(low)} to ${signed(high)}: ${words} (paired bootstrap over test seeds, ${board.resamples} resamples, Holm\u2019s correction over the board).`);
+  return element("p", {}, `Mean ${rankingName(board)} differs by ${signed(gap)} points, 95 % interval ${signed(low)} to ${signed(high)}: ${words} (paired bootstrap over test ${board.paired ? "seeds" : "episodes"}, ${board.resamples} resamples, Holm\u2019s correction over the board).`);
 }
 
 /** The difference of two rows' means, shown about the middle of the scale of colours. */
 function difference(board, rows, selection) {
-  const [one, other] = rows.map((row) => meanOfRow(board, row, "auc_matched", selection));
+  const [one, other] = rows.map((row) => meanOfRow(board, row, board.ranking, selection));
   const defined = isNumber(one.value) && isNumber(other.value);
   return { ...one, value: defined ? one.value - other.value : null, state: one.state || other.state, low: null, high: null, gap: true };
 }

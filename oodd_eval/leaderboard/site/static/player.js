@@ -26,7 +26,7 @@ function revealer(plot) {
 
 /** Controls that move through an example; `reveals` are those of its drawings. */
 function player(example, reveals) {
-  const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
+  const last = example.start + Math.max(example.scores.length, example.twin?.length ?? 0) - 1;
   const slow = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
   let timer = null;
   const words = element("output", { class: "words" });
@@ -67,7 +67,8 @@ function player(example, reveals) {
 function momentOf(example, t) {
   const at = (list) => list[t - example.start];
   const value = (list) => isNumber(at(list)) ? brief(at(list), 2) : "undefined";
-  const phase = t < example.onset ? `${example.onset - t} before the onset` : `${t - example.onset} after the onset`;
+  const inside = () => example.intervals.some(([start, stop]) => t >= start && t < stop) ? "anomalous" : "not known to be anomalous";
+  const phase = example.intervals ? inside() : t < example.onset ? `${example.onset - t} before the onset` : `${t - example.onset} after the onset`;
   const alarm = example.alarms.includes(t) ? ", alarm" : "";
   return `t = ${t}, ${phase}: score ${value(example.scores)}, statistic ${value(example.cusum)}${alarm}`;
 }

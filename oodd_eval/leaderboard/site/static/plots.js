@@ -96,7 +96,7 @@ function numbersTable(columns) {
     element("tbody", {}, columns[names[0]].map((_, i) => element("tr", {}, names.map((n) => element("td", {}, brief(columns[n][i])))))));
 }
 
-function rocFigure(roc, area) {
+function rocFigure(roc, area, paired = true) {
   if (!roc.fpr.length) return element("p", { class: "note" }, "No ROC curve: no trajectory has scores of both classes.");
   const unit = { range: [0, 1], ticks: [0, 0.2, 0.4, 0.6, 0.8, 1] };
   const plot = chart("ROC curve", { ...unit, label: "false-positive rate" }, { ...unit, label: "true-positive rate" },
@@ -104,29 +104,34 @@ function rocFigure(roc, area) {
   plot.drawing.append(
     line(plot, [0, 1], [0, 1], NULL),
     line(plot, [0, ...roc.fpr], [0, ...roc.tpr], ANOMALOUS));
-  return figure([plot.drawing], [[ANOMALOUS, `this detector (matched AUC ${show(area, "percent")} %)`], [NULL, "no better than chance (50 %)"]],
-    "Scores from the onset on against the nominal twin\u2019s at the same times, averaged over test trajectories at equal false-positive rates.",
+  return figure([plot.drawing], [[ANOMALOUS, `this detector (${paired ? "matched" : "pooled"} AUC ${show(area, "percent")} %)`], [NULL, "no better than chance (50 %)"]],
+    paired ? "Scores from the onset on against the nominal twin\u2019s at the same times, averaged over test trajectories at equal false-positive rates."
+      : "Anomalous rows against the same rows of nominal test episodes (without a common clock against all their rows), averaged over episodes at equal false-positive rates.",
     () => numbersTable({ "false-positive rate": roc.fpr, "true-positive rate": roc.tpr }));
 }
 
 /** False-alarm rates run from 0 to a few tenths; a square root gives the small ones room. */
-function farAxis(far) {
+function farAxis(far, paired) {
   const top = Math.max(0.01, ...far) * 1.02;
   const marks = [0, 0.001, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.8].filter((t) => t <= top);
-  return { range: [0, top], ticks: marks, label: "achieved false-alarm rate on nominal twins (alarms per step)", bend: Math.sqrt };
+  return { range: [0, top], ticks: marks, label: `achieved false-alarm rate on nominal ${paired ? "twins" : "test episodes"} (alarms per step)`, bend: Math.sqrt };
 }
 
 function delayFigure(points) {
-  if (!points.far.length) return element("p", { class: "note" }, "No curve: no score of the twins is defined.");
-  const x = farAxis(points.far);
-  const high = Math.max(1, ...points.delay_censored, ...points.null_censored) * 1.05;
+  const paired = Boolean(points.null_censored);
+  if (!points.far.length) {
+    return element("p", { class: "note" }, paired ? "No curve: no score of the twins is defined."
+      : "No curve of delays: no episode has a known start, or no score of nominal test episodes is defined.");
+  }
+  const x = farAxis(points.far, paired);
+  const high = Math.max(1, ...points.delay_censored, ...points.null_censored ?? []) * 1.05;
   const plot = chart("Delay against false-alarm rate", { ...x, label: null }, { range: [0, high], ticks: ticks(0, high), label: "delay (steps)" }, { height: 210 });
-  plot.drawing.append(
-    line(plot, points.far, points.null_censored, TWIN),
-    line(plot, points.far, points.delay_censored, ANOMALOUS));
+  if (paired) plot.drawing.append(line(plot, points.far, points.null_censored, TWIN));
+  plot.drawing.append(line(plot, points.far, points.delay_censored, ANOMALOUS));
   const missed = chart("Missed trajectories against false-alarm rate", x, { range: [0, 1], ticks: [0, 0.5, 1], label: "missed" }, { height: 110 });
   missed.drawing.append(line(missed, points.far, points.missed, ANOMALOUS));
-  const legend = [[ANOMALOUS, "anomalous trajectories"], [TWIN, "nominal twins: what false alarms alone give"]];
+  const legend = [[ANOMALOUS, "anomalous trajectories"]];
+  if (paired) legend.push([TWIN, "nominal twins: what false alarms alone give"]);
   const at = points.threshold.indexOf(DATA.threshold);
   if (at >= 0) {
     plot.drawing.append(shape("circle", { class: "point", cx: plot.sx(points.far[at]), cy: plot.sy(points.delay_censored[at]), r: 4.5 }));
@@ -134,10 +139,10 @@ function delayFigure(points) {
     legend.push(["point", `the paper\u2019s threshold, ${DATA.threshold}`]);
   }
   return figure([plot.drawing, missed.drawing], legend,
-    "Mean delay from the onset to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. The scale of false-alarm rates is a square root. Left is stricter: fewer false alarms, longer delay.",
+    `Mean delay from the ${paired ? "onset" : "first anomalous row"} to the first alarm, a miss counting as the whole remainder of the episode, over the whole range of CUSUM thresholds; below it the share of trajectories without an alarm. The scale of false-alarm rates is a square root. Left is stricter: fewer false alarms, longer delay.`,
     () => numbersTable({
       "threshold": points.threshold, "false-alarm rate": points.far, "delay (steps)": points.delay_censored,
-      "missed": points.missed, "twins\u2019 delay (steps)": points.null_censored,
+      "missed": points.missed, ...(paired ? { "twins\u2019 delay (steps)": points.null_censored } : {}),
     }));
 }
 
@@ -212,6 +217,37 @@ function trajectoryFigure(example, sensors = null) {
     `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
     `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms. ` +
     `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.${bending ? " Where values are very large the upright scale is logarithmic." : ""}`)];
+}
+
+/** Scores and statistic of an episode without a twin, its anomalous rows shaded. */
+function episodeFigure(example) {
+  const last = example.start + example.scores.length - 1;
+  const rows = example.scores.map((_, i) => example.start + i);
+  const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
+  const wide = { width: 920, class: "wide" };
+  const shades = (plot) => shape("g", { class: "anomalous-rows" }, example.intervals.map(([start, stop]) => {
+    const [from, to] = [Math.max(start, example.start), Math.min(stop - 1, last)].map((t) => plot.sx(t));
+    return to < plot.left || from > plot.right || to < from ? null : shape("rect", {
+      class: start < 0 ? "unknown" : null, x: from, width: Math.max(1, to - from), y: plot.top, height: plot.bottom - plot.top,
+    });
+  }));
+  const scoreAxis = axisOf(example.scores, 1, example.score_step, "score (s.d.)");
+  const cusumAxis = axisOf(example.cusum, DATA.threshold, example.cusum_step, "CUSUM");
+  const scores = chart("Scores", { ...x, label: null }, scoreAxis, { ...wide, height: 210, top: 22 });
+  scores.drawing.append(shades(scores), line(scores, rows, example.scores, ANOMALOUS));
+  const cusum = chart("CUSUM statistic and alarms", x, cusumAxis, { ...wide, height: 240, bottom: 74 });
+  cusum.drawing.append(shades(cusum),
+    shape("line", { class: "threshold", x1: cusum.left, x2: cusum.right, y1: cusum.sy(DATA.threshold), y2: cusum.sy(DATA.threshold) }),
+    line(cusum, rows, example.cusum, ANOMALOUS), alarmStrip(cusum, example.alarms, ANOMALOUS, 26));
+  const area = example.auc_pool === null ? "undefined" : `${show(example.auc_pool, "percent")} %`;
+  const spans = example.intervals.map(([start, stop]) => start < 0 ? `up to ${stop - 1}, from an unknown row on` : `${start} to ${stop - 1}`);
+  const labelled = spans.length ? `Anomalous rows, shaded: ${spans.join("; ")}. ` : "Which of its rows are anomalous is not known. ";
+  const bending = Boolean(scoreAxis.bend || cusumAxis.bend);
+  return [player(example, [revealer(scores), revealer(cusum)]), figure([scores.drawing, cusum.drawing],
+    [[ANOMALOUS, "anomalous episode"], ["threshold", `alarm threshold ${DATA.threshold}`]],
+    `Test episode ${example.index}, the one with the median pooled AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ${labelled}` +
+    `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms.` +
+    `${bending ? " Where values are very large the upright scale is logarithmic." : ""}`)];
 }
 
 /** Marks below a chart, one for each alarm. */

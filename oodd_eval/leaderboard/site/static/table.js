@@ -21,7 +21,7 @@ function restore(text) {
   const known = {
     board: (v) => DATA.boards.some((b) => b.id === v),
     group: (v) => Object.hasOwn(GROUP_TITLES, v),
-    view: (v) => Object.hasOwn(LISTS, v),
+    view: (v) => Object.hasOwn(LISTS, v) || Object.hasOwn(LISTS_OF_LOGS, v),
   };
   for (const [name, usual] of Object.entries(DEFAULTS)) {
     const value = given.get(name);
@@ -72,28 +72,31 @@ function once(of) {
   };
 }
 
-const rankOfView = () => LISTS[state.view].rank ?? RANK;
+const rankOfView = () => listOf(currentBoard(), state.view).rank ?? RANK;
 
-/** Sort by a column, by matched AUC when the view has no such column; what has no value last. By rank
- * and by matched AUC, what was not run again stands below what was. */
+/** The key of the column that the table is sorted by; on a first visit that of the metric that ranks. */
+const sortKey = (board) => state.sort === DEFAULTS.sort ? board.ranking : state.sort;
+
+/** Sort by a column, by the metric that ranks when the view has no such column; what has no value last.
+ * By rank and by that metric, what was not run again stands below what was. */
 function sorted(board, rows, columns) {
   const label = (a, b) => a.label < b.label ? -1 : Number(a.label > b.label);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
-  const matched = once((row) => mean(board, row, "auc_matched", state).value);
-  const column = [rankOfView(), ...columns].find((c) => c.key === state.sort);
+  const matched = once((row) => mean(board, row, board.ranking, state).value);
+  const column = [rankOfView(), ...columns].find((c) => c.key === sortKey(board));
   const value = column ? once((row) => column.of(row, state).value) : matched;
   const sign = column && state.ascending ? 1 : -1;
   return [...rows].sort((a, b) => {
     const [x, y] = [value(a), value(b)];
     const defined = isNumber(y) - isNumber(x);
-    const below = column && !["rank", "alarm_rank", "auc_matched"].includes(column.key) ? 0 : a.below - b.below;
+    const below = column && !["rank", "alarm_rank", board.ranking].includes(column.key) ? 0 : a.below - b.below;
     return below || defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
   });
 }
 
 /** Sort by another column, best first, or turn the order round. */
 function sortBy(key, better) {
-  if (state.sort === key) state.ascending = !state.ascending;
+  if (sortKey(currentBoard()) === key) state.ascending = !state.ascending;
   else Object.assign(state, { sort: key, ascending: better !== "higher" });
   drawTable();
 }
@@ -136,7 +139,7 @@ async function drawTable() {
     element("tbody", {}, lines.map(({ row }) => body.lines.get(row))),
   );
   const detectors = new Set(rows.map((row) => row.detector)).size;
-  place.replaceChildren(columns.length ? table : element("p", { class: "note" }, LISTS[state.view].empty));
+  place.replaceChildren(columns.length ? table : element("p", { class: "note" }, listOf(board, state.view).empty));
   if (detectors > FIRST && !whole) {
     place.append(element("button", { type: "button", class: "action", id: "all", onclick: () => { whole = true; drawTable(); } }, `Show all ${detectors} detectors`));
   }
@@ -161,7 +164,7 @@ function bestOf(column, values) {
 }
 
 function header(column) {
-  const active = state.sort === column.key;
+  const active = sortKey(currentBoard()) === column.key;
   const order = active ? (state.ascending ? "ascending" : "descending") : "none";
   return element("th", { scope: "col", "aria-sort": order, class: column.class },
     element("button", {
@@ -228,7 +231,7 @@ function badges(row) {
 
 /** Where the axis of the small drawings begins: it is the same for all rows and ends at 1. */
 function axisStart(board) {
-  const lows = board.rows.map((r) => mean(board, r, "auc_matched", state)).map((m) => m.low ?? m.value);
+  const lows = board.rows.map((r) => mean(board, r, board.ranking, state)).map((m) => m.low ?? m.value);
   return Math.min(0.4, Math.floor(10 * Math.min(...lows.filter(isNumber))) / 10);
 }
 
@@ -251,11 +254,12 @@ function what(board, rows) {
   const cells = cellsOf(board, state).length;
   const where = state.environment === "all" ? "all environments"
     : { classic: "classic-control environments", bullet: "Bullet environments" }[state.environment]
-      ?? DATA.environments[state.environment].title;
-  const anomalies = state.anomaly !== "all" ? DATA.anomalies[state.anomaly].title
+      ?? environmentOf(board, state.environment).title;
+  const anomalies = state.anomaly !== "all" ? anomalyOf(board, state.anomaly).title
     : state.group === "all" ? "all anomalies" : `${state.group} anomalies`;
   const shown = rows.length === board.rows.length ? `${rows.length} rows` : `${rows.length} of ${board.rows.length} rows`;
-  const { title, over } = LISTS[state.view];
+  const { title: name, over, level } = listOf(board, state.view);
+  const title = level ? `${name} at ${level(board)}` : name;
   return over ? `${title}: ${over} (${shown})`
     : `${title}: ${where}, ${anomalies} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown})`;
 }
@@ -265,13 +269,14 @@ function notesOf(board, rows) {
   const limit = board.limit === null ? "" : `, limited to the first ${board.limit} trajectories of each part: for trying only`;
   const lines = [
     `Split ${board.split}, digest ${board.digest.slice(0, 12)}, protocol ${board.protocol}, ` +
-    `${board.tests.join(", ")} test seeds per environment${limit}. Tables never mix splits or protocols.`,
+    `${board.paired ? `${board.tests.join(", ")} test seeds per environment` : "episodes without twins"}${limit}. Tables never mix splits or protocols.`,
+    ...board.about,
   ];
   if (selectsLess(state)) {
     lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
   }
   if (!isSummary(state)) {
-    lines.push("Over single environments or anomalies only matched AUC has intervals here; every detector's page has those of single cells.");
+    lines.push("Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.");
   }
   if (rows.some((r) => r.below)) {
     lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
@@ -280,7 +285,7 @@ function notesOf(board, rows) {
   for (const [caption, own] of groupedBy(rows.filter((row) => row.caption), (row) => row.caption)) {
     lines.push(`${own.map((row) => row.label).join(", ")}: ${caption}`);
   }
-  if (rows.some((row) => mean(board, row, "auc_matched", state).partial)) {
+  if (rows.some((row) => mean(board, row, board.ranking, state).partial)) {
     lines.push("* A mean over fewer cells than other rows have.");
   }
   return lines.map((line) => element("li", {}, line));

@@ -1,0 +1,448 @@
+"""Boards without twins: tables, rankings, results, plots, curves, entries and the site."""
+
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_records import make_record
+from rich.console import Console
+
+from oodd_eval.cli.main import main
+from oodd_eval.data.facts import GROUPS
+from oodd_eval.errors import ResultsError
+from oodd_eval.results import tables
+from oodd_eval.results.board import Board, boards
+from oodd_eval.results.record import Metric
+from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render.text import print_sections
+from oodd_eval.results.report import Report, findings_of, flat
+from oodd_eval.results.standings import compare_rows, ranked
+from oodd_eval.results.strengths import by_place, strength_tables, thresholds
+from oodd_eval.results.unpaired import UnpairedTables
+
+
+def test_a_single_group_has_no_column():
+    """Logs may put all or some of their anomalies into one group, which tells nothing apart."""
+    kinds = {"slip": "dynamics", "stuck": "dynamics", "worn": ""}
+    some = Board([log_record("pe", anomaly=a, group=g) for a, g in kinds.items()])
+    assert some.groups == {}
+    kinds["worn"] = "sensor"
+    both = Board([log_record("pe", anomaly=a, group=g) for a, g in kinds.items()])
+    assert {g: {*kinds} for g, kinds in both.groups.items()} == {
+        "sensor": {"worn"},
+        "dynamics": {"slip", "stuck"},
+    }
+
+
+def test_guaranteed_alarms_without_delays_speak_of_none():
+    names = ("auc_outcome", "found_outcome_at_10pct", "false_episodes_at_10pct")
+    record = log_record("pe", values=dict.fromkeys(names, 0.5))
+    titles = [table.title for table in tables.all_alarms(Board([record]))]
+    assert titles
+    assert not [title for title in titles if "delay" in title]
+
+
+TWIN_WORDS = ("twin", "matched", "placebo", "unpaired", "smoothed")
+
+
+def log_record(
+    detector,
+    environment="arm",
+    anomaly="slip",
+    *,
+    nominal=6,
+    episodes=4,
+    values=None,
+    group="",
+    calibration=40,
+    **fields,
+):
+    """A record without twins: each metric has one value over its sample's episodes.
+
+    A list has one for each of them. Metrics of nominal episodes are false episodes and alarms.
+    """
+    columns = {}
+    for name, value in (values or {}).items():
+        of_nominal = name.startswith(("false_", "auc_pool_null")) or "_null" in name
+        terms = np.zeros((2, nominal + episodes))
+        sample = slice(None, nominal) if of_nominal else slice(nominal, None)
+        terms[0, sample], terms[1, sample] = value, 1.0
+        columns[name] = terms
+    metrics = {n: Metric(t[0].sum() / t[1].sum(), n=int(t[1].sum())) for n, t in columns.items()}
+    base = make_record(detector, digest="cd" * 32)
+    counts = {"train": 6, "calibration": calibration, "nominal": nominal, "test": episodes}
+    facts = {
+        "counts": counts,
+        "split": "logs",
+        "group": group,
+        "paired": False,
+        "metrics": metrics,
+        "per_trajectory": columns,
+        "brief": False,
+        "alarm": "cusum",
+    }
+    return replace(base, environment=environment, anomaly=anomaly, **facts | fields)
+
+
+def labelled(pool, rows, level="at_5pct", **more):
+    """Metrics of a cell whose anomalous rows are known."""
+    alarms = {
+        "events_found": 0.75,
+        "delay": 4.0,
+        "delay_censored": 8.0,
+        "found_within_100": 0.5,
+        "missed": 0.25,
+        "false_episodes": [0, 0, 0, 0, 0, 1],
+        "early": 0.0,
+        "false_alarms_per_hour": 2.0,
+    }
+    values = {"auc_pool": pool, "auc_pool_null": 0.5, "auc_rows": rows}
+    return values | {f"{name}_{level}": value for name, value in alarms.items()} | more
+
+
+def two_environments(**more):
+    """Three detectors; the arm has one kind of anomaly, the press two."""
+    return [
+        log_record(detector, environment, anomaly, values=labelled(pool, rows, **more))
+        for detector, rows in (("mewma", 0.8), ("rf", 0.6), ("clock", 0.7))
+        for environment, anomaly, pool in (
+            ("arm", "slip", 0.9 if detector == "mewma" else 0.5),
+            ("press", "leak", 0.5),
+            ("press", "jam", 0.6 if detector == "mewma" else 0.5),
+        )
+    ]
+
+
+def table_titled(records, start, detail="brief"):
+    report = Report(records, detail=detail)
+    (table,) = [t for s in report.sections for t in s.tables if t.title.startswith(start)]
+    return table
+
+
+def column(table, name):
+    return {row[0]: row[table.header.index(name)] for row in table.rows}
+
+
+# Tables
+
+
+def test_the_headline_has_its_columns_in_order_and_those_that_no_record_has_are_left_out():
+    table = table_titled(two_environments(), "Separability")
+    assert table.header == [
+        "detector",
+        "pooled AUC",
+        "null",
+        "AUC of rows",
+        "events found",
+        "delay (steps)",
+        "found within 100",
+        "missed",
+        "false episodes (≤ 5 %)",
+        "early",
+        "false alarms per hour",
+    ]
+    assert table.title.endswith("at 5 %")
+    assert [row[0] for row in table.rows] == ["mewma", "rf", "clock"]
+    assert column(table, "pooled AUC") == {"mewma": "66.7", "rf": "50.0", "clock": "50.0"}
+    assert re.fullmatch(r"16\.7 \[\d.*, \d.*\]", column(table, "false episodes (≤ 5 %)")["rf"])
+    without = [
+        replace(
+            r,
+            metrics={k: v for k, v in r.metrics.items() if "hour" not in k},
+            per_trajectory={k: v for k, v in r.per_trajectory.items() if "hour" not in k},
+        )
+        for r in two_environments()
+    ]
+    assert "false alarms per hour" not in table_titled(without, "Separability").header
+
+
+def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
+    records = [
+        log_record(d, values=labelled(pool, 0.6, "at_10pct"), calibration=30)
+        for d, pool in (("mewma", 0.9), ("rf", 0.6))
+    ]
+    board = Board(records)
+    assert (board.ranking, board.alarm_ranking) == ("auc_pool", "delay_censored_at_10pct")
+    assert "false episodes (≤ 10 %)" in table_titled(records, "Separability").header
+    (sentence,) = [text for text in findings_of(board) if "calibration" in text]
+    assert {"30", "38", "19"} <= set(re.findall(r"\d+", sentence))
+    assert "mewma, rf" in sentence
+    # One row with a statistic that takes half as many episodes does not leave the others blank.
+    one = log_record(
+        "pe",
+        values=labelled(0.7, 0.6) | labelled(0.7, 0.6, "at_10pct"),
+        calibration=30,
+        alarm="score",
+    )
+    assert Board([*records, one]).alarm_ranking == "delay_censored_at_10pct"
+    assert Board([one]).alarm_ranking == "delay_censored_at_5pct"
+    assert not [text for text in findings_of(Board([one])) if "calibration" in text]
+
+
+def test_environments_stand_apart_and_count_once_in_their_mean():
+    table = table_titled(two_environments(), "Pooled AUC (%) by environment")
+    assert table.header == ["detector", "mean", "arm", "press"]
+    assert table.rows[0] == ["mewma", "72.5", "90.0", "55.0"]  # and 66.7 over cells
+    wide = Report(two_environments(), detail="wide").sections[0].tables
+    assert {t.title.rpartition(": ")[2] for t in wide} >= {"arm", "press"}
+    one = [r for r in two_environments() if r.environment == "arm"]
+    assert not [t for t in Report(one).sections[0].tables if "by environment" in t.title]
+    alike = [replace(r, group="dynamics") for r in one]
+    titles = [table.title for table in Report(alike, detail="brief").sections[0].tables]
+    assert not [title for title in titles if "group" in title]
+    groups = {"jam": "sensor", "leak": "dynamics"}
+    grouped = [replace(r, group=groups.get(r.anomaly, "")) for r in two_environments()]
+    header = table_titled(grouped, "Pooled AUC (%) by").header
+    assert header[2:] == ["arm", "press", "sensor", "dynamics"]
+
+
+def test_a_sentence_says_where_the_time_alone_does_as_well_within_episodes():
+    sentences = findings_of(Board(two_environments()))
+    (one,) = [s for s in sentences if s.startswith("clock, ")]
+    assert "rf (60.0 against 70.0)" in one
+    assert "mewma" not in one
+    equal = [
+        r
+        if r.detector != "clock"
+        else log_record("clock", r.environment, r.anomaly, values=labelled(0.5, 0.8))
+        for r in two_environments()
+    ]
+    (one,) = [s for s in findings_of(Board(equal)) if s.startswith("clock, ")]
+    assert "mewma (80.0 against 80.0)" in one
+    assert not [
+        s
+        for s in findings_of(Board([r for r in equal if r.detector != "clock"]))
+        if "time alone" in s
+    ]
+
+
+def outcome(auc, found):
+    return {
+        "auc_pool": 0.5,
+        "auc_pool_null": 0.5,
+        "auc_outcome": auc,
+        "found_outcome_at_5pct": found,
+        "found_outcome_null_at_5pct": 0.0,
+        "false_episodes_at_5pct": 0.0,
+    }
+
+
+def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
+    records = [
+        log_record(d, values=outcome(auc, found))
+        for d, auc, found in (("clock", 0.5, 0.0), ("mewma", 0.9, 0.5))
+    ]
+    first, *others = Report(records, detail="brief").sections[0].tables
+    assert first.title.startswith("Episodes known by their outcome alone")
+    assert first.header[:4] == [
+        "detector",
+        "AUC of outcomes",
+        "found outcome",
+        "found outcome null",
+    ]
+    assert [row[:3] for row in first.rows] == [["mewma", "90.0", "50.0"], ["clock", "50.0", "0.0"]]
+    assert "false episodes (≤ 5 %)" in first.header
+    assert not others
+    ranks = ranked(records)
+    assert ranks.board.ranking == "auc_outcome"
+    assert list(ranks.alarms.ranks) == ["mewma", "clock"]
+    alone = UnpairedTables(Board(records[1:])).outcomes()
+    assert "clock" in alone.note
+    assert "clock" not in first.note
+
+
+def test_nominal_episodes_alone_have_false_alarms_and_no_rank():
+    values = {"false_episodes_at_5pct": [0, 0, 0, 0, 0, 1], "false_alarms_per_hour_at_5pct": 1.5}
+    records = [log_record(d, anomaly="nominal", episodes=0, values=values) for d in ("mewma", "rf")]
+    (table,) = Report(records, detail="brief").sections[0].tables
+    assert table.header == ["detector", "false episodes (≤ 5 %)", "false alarms per hour"]
+    assert re.fullmatch(r"16\.7 \[.*\]", table.rows[0][1])
+    ranks = ranked(records)
+    assert not ranks.ranking.ranks
+    assert all("no cell has" in row.state for row in ranks.standings)
+    for name, layout in FORMATS.items():
+        assert layout.render(Report(records)), name
+
+
+def test_a_board_may_have_cells_of_every_kind():
+    values = {"false_episodes_at_5pct": 0.0, "false_alarms_per_hour_at_5pct": 1.5}
+    kinds = [
+        ("arm", "slip", labelled(0.9, 0.8)),
+        ("pick", "failure", outcome(0.7, 0.5)),
+        ("idle", "nominal", values),
+    ]
+    records = [log_record(d, e, a, values=v) for d in ("mewma", "clock") for e, a, v in kinds]
+    titles = [table.title for table in Report(records, detail="brief").sections[0].tables]
+    starts = ("Separability", "Episodes known", "Alarms on nominal", "Pooled AUC (%) by")
+    assert all(map(str.startswith, titles, starts))
+    assert len(titles) == len(starts)
+    assert titles[2].endswith(": idle")
+    assert table_titled(records, "Pooled AUC (%) by").header == ["detector", "mean", "arm", "pick"]
+    # The mean is over all environments that have the metric: it has no mark.
+    assert table_titled(records, "Pooled AUC (%) by").rows[0][1] == "70.0"
+    assert ranked(records).ranking.ranks.keys() == {"mewma", "clock"}
+
+
+def test_metrics_of_rows_stand_in_a_table_of_their_own():
+    extra = {"f1_rows": 0.5, "far_rows": 0.1, "mar_rows": 0.4, "vus_pr": 0.6}
+    records = two_environments(**extra)
+    table = table_titled(records, "Metrics of rows")
+    assert "rank nothing" in table.title
+    assert table.header == [
+        "detector",
+        "F1 of rows",
+        "false-alarm rate of rows",
+        "missed-alarm rate of rows",
+        "VUS-PR",
+    ]
+    whole = table_titled(records, "All metrics", detail="wide")
+    assert not [name for name in whole.header if "rows" in name and name != "AUC of rows"]
+    assert not [
+        t for t in Report(two_environments()).sections[0].tables if "Metrics of rows" in t.title
+    ]
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name not in ("csv", "json")])
+@pytest.mark.parametrize("detail", ["brief", "wide", "full"])
+def test_nothing_speaks_of_twins_groups_or_the_paper(name, detail):
+    text = FORMATS[name].render(Report(two_environments(), detail=detail, intervals=True)).lower()
+    text = text.replace("episodes without twins", "").replace("the dynamics", "")
+    other = (*GROUPS, "Δ", "avg", "return", "nan")
+    assert not [word for word in (*TWIN_WORDS, *other) if word in text]
+
+
+def test_formats_for_programs_say_magnitude_pairing_and_notes():
+    records = [*two_environments(), make_record(magnitude=0.5, note="no twins")]
+    lines = list(csv.DictReader(io.StringIO(FORMATS["csv"].render(Report(records)))))
+    objects = json.loads(FORMATS["json"].render(Report(records)))
+    assert {"magnitude", "paired", "note"} <= flat(records)[0].keys()
+    assert (lines[0]["paired"], lines[0]["magnitude"], lines[0]["note"]) == ("False", "", "")
+    assert [objects[-1][n] for n in ("paired", "magnitude", "note")] == [True, 0.5, "no twins"]
+
+
+def test_a_note_is_a_finding_with_its_cells_and_rows():
+    records = [
+        make_record(d, anomaly=a, note="withheld: they are no twins")
+        for d in ("rf", "riqn")
+        for a in ("iid", "drift")
+    ]
+    (sentence,) = [s for s in findings_of(Board(records)) if "withheld" in s]
+    assert sentence.startswith("hopper/iid, hopper/drift (rf, riqn): ")
+    assert sentence in Report(records).sections[0].findings
+
+
+def test_records_with_and_without_twins_are_never_in_one_board():
+    mixed = [*two_environments(), make_record(digest="cd" * 32)]
+    assert sorted(len(board.records) for board in boards(mixed)) == [1, 9]
+    with pytest.raises(ResultsError, match="several splits"):
+        compare_rows(mixed, "mewma", "rf")
+
+
+def test_strengths_have_the_unit_that_the_split_names():
+    detection = "found_within_100_at_5pct"
+    records = [
+        make_record(
+            "mine",
+            "arm",
+            "drift",
+            strength=name,
+            magnitude=float(name),
+            values={detection: [share, share]},
+        )
+        for name, share in (("0.1", 0.0), ("0.2", 0.5), ("0.4", 1.0))
+    ]
+    tables = strength_tables(Board(records), units={"drift": "rad"})
+    assert [t.header[-1] for t in tables if "by anomaly" in t.title] == ["drift (rad)"]
+    by_row = thresholds(records)
+    table = by_place(Board(records), records[0].setting, by_row, units={"drift": "rad"})
+    assert table.header == ["Environment", "drift (rad)"]
+    assert by_place(Board(records), records[0].setting, by_row).header[1] == "drift"
+    unpaired = [
+        log_record("mine", strength=n, magnitude=float(n), values=labelled(s, 0.6))
+        for n, s in (("1", 0.6), ("2", 0.8))
+    ]
+    (table,) = strength_tables(Board(unpaired))
+    assert table.rows == [["mine", "60.0", "80.0"]]
+
+
+NAMES = ("pyod.models.ensembles:VeryLongDetectorNameOfSomebody", "mewma", "mewma-a", "rf", "clock")
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_tables_fit_every_terminal_with_whole_names(width):
+    records = [
+        replace(r, detector=name, horizon=h, overrides=o, parameters=o)
+        for name, h, o in [(name, 1, {}) for name in NAMES]
+        + [("mewma", 10, {}), ("mewma", 1, {"shrink": "ledoit-wolf", "window": 30})]
+        for r in two_environments()
+        if r.detector == "mewma"
+    ]
+    screen = Console(file=io.StringIO(), width=width, soft_wrap=True, highlight=False, markup=False)
+    print_sections(Report(records, detail="wide").sections, screen)
+    text = screen.file.getvalue()
+    assert max(map(len, text.splitlines())) <= width
+    assert text.count("NameOf") >= 1
+    labels = {str(r.setting) for r in records}
+    for table in Report(records, detail="wide").sections[0].tables:
+        assert {row[0] for row in table.rows} == labels
+    if width >= 80:
+        assert "mewma[h=10]" in text
+
+
+def test_a_group_of_columns_is_named_once_when_a_table_is_turned():
+    table = replace(table_titled([make_record()], "AUC (%), delay"), colours=())
+    assert table.labels == 2
+    assert table.transposed().header == ["Environment", "Hopper", "", ""]
+
+
+def test_show_prints_stored_records_and_one_detector(tmp_path, capsys):
+    lines = "".join(r.to_json() + "\n" for r in two_environments())
+    (tmp_path / "records.jsonl").write_text(lines)
+    assert main(["show", str(tmp_path), "--stored"]) == 0
+    text = capsys.readouterr().out
+    assert "Separability (%, higher is better) and guaranteed alarms at 5 %" in text
+    assert main(["show", str(tmp_path), "--stored", "--detector", "rf"]) == 0
+    assert "rf: pooled AUC (%) by anomaly" in capsys.readouterr().out
+    assert (
+        main(["show", str(tmp_path), "--stored", "--detector", "rf", "--metric", "auc_rows"]) == 0
+    )
+    assert "rf: AUC of rows (%) by anomaly" in capsys.readouterr().out
+
+
+def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):
+    worse = [
+        log_record(r.detector, r.environment, r.anomaly, values=labelled(0.2, 0.2))
+        for r in two_environments()
+    ]
+    files = {"now": two_environments(), "worse": worse}
+    for name, records in files.items():
+        (tmp_path / f"{name}.jsonl").write_text("".join(r.to_json() + "\n" for r in records))
+    now, later, xml = (str(tmp_path / name) for name in ("now.jsonl", "worse.jsonl", "out.xml"))
+    assert main(["compare", now, "--against", now, "--junit", xml]) == 0
+    fail = ["--fail", "auc_pool:-0.01", "--junit", xml]
+    assert main(["compare", later, "--against", now, *fail]) == 1
+    text = (tmp_path / "out.xml").read_text()
+    assert len(re.findall("<failure", text)) == len(worse)
+    assert "logs/press/jam::mewma[h=1,seed=0]" in text
+    for by in ("group", "mean"):
+        assert main(["compare", now, "--against", now, "--by", by]) == 0
+    capsys.readouterr()
+    assert main(["compare", now, "mewma", "rf"]) == 0
+    assert "pooled AUC: mewma 66.7, rf 50.0" in capsys.readouterr().out
+
+
+def test_a_single_figure_is_no_table_by_anomaly():
+    records = two_environments()
+    one = [r for r in records if r.environment == records[0].environment]
+    one = [r for r in one if r.anomaly == one[0].anomaly]
+    for chosen, several in ((records, True), (one, False)):
+        tables = [
+            t for section in Report(chosen).sections for t in [*section.tables, *section.folded]
+        ]
+        assert any("by anomaly" in table.title for table in tables) == several
+        (alarms,) = [t.title for t in tables if t.title.startswith("Guaranteed alarms at 5 %")]
+        assert "false alarms per hour, the rest in %" in alarms
