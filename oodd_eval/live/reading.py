@@ -7,7 +7,7 @@ between them.
 
 import math
 from dataclasses import astuple, dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ FEWEST: Final = 20
 """Nominal episodes that a tail can be estimated from."""
 TAIL: Final = 0.25
 """Share of the episodes, those with the largest statistics, that the tail is estimated from."""
+OK, WARN, ERROR, STALE = (bytes([level]) for level in range(4))
+"""Levels of ROS 2's DiagnosticStatus."""
 _NORMAL: Final = 1.96  # a 95 % interval of a normal distribution
 
 
@@ -142,6 +144,53 @@ class Reading:
 
     __hash__ = None  # type: ignore[assignment]
 
+    def diagnostics(
+        self, name: str = "oodd", hardware_id: str = "", time: float | None = None
+    ) -> dict[str, Any]:
+        """Return the reading as a ROS 2 ``diagnostic_msgs/DiagnosticArray``, a plain mapping.
+
+        Parameters
+        ----------
+        name, hardware_id
+            Of the one status in it.
+        time
+            Time stamp in seconds; 0 without one.
+
+        Returns
+        -------
+        dict
+            Fields of the message by name. The level is a byte, as ROS has it: ERROR in an alarm,
+            STALE where no observation comes, WARN for a fault or a statistic above the threshold
+            without an alarm, else OK.
+        """
+        seconds, nanoseconds = divmod(as_nanoseconds(time or 0.0), 10**9)
+        level = OK
+        if self.alarm:
+            level = ERROR
+        elif self.faults or self.statistic > self.threshold:
+            level = WARN
+        if self.faults.get("observation") == "missing":
+            level = STALE
+        values = {
+            "row": str(self.t),
+            "score": repr(float(self.score)),
+            "statistic": repr(float(self.statistic)),
+            "threshold": repr(float(self.threshold)),
+            "alarm": str(self.alarm).lower(),
+            "onset": "" if self.onset is None else str(self.onset),
+        }
+        values |= {f"sensor {sensor}": f"{share:.3f}" for sensor, share in self.sensors.items()}
+        values |= {f"fault {what}": fault for what, fault in self.faults.items()}
+        status = {
+            "level": level,
+            "name": name,
+            "message": str(self),
+            "hardware_id": hardware_id,
+            "values": [{"key": key, "value": value} for key, value in values.items()],
+        }
+        stamp = {"sec": seconds, "nanosec": nanoseconds}
+        return {"header": {"stamp": stamp, "frame_id": ""}, "status": [status]}
+
     @property
     def sensor(self) -> str:
         """The sensor that is named first; empty where none is."""
@@ -156,3 +205,13 @@ class Reading:
         if self.onset is not None:
             parts.append(f"since row {self.onset}")
         return ", ".join(parts)
+
+
+def as_nanoseconds(time: float) -> int:
+    """Return seconds since whenever as nanoseconds, without the product that rounds.
+
+    >>> as_nanoseconds(1.5e9 + 0.25)
+    1500000000250000000
+    """
+    whole = math.floor(time)
+    return whole * 10**9 + round((time - whole) * 1e9)

@@ -1,0 +1,81 @@
+"""Logs as a scan reads them: every episode in recorded order, labelled or not."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from oodd_eval.data.episodes import EVERY, Episode, read_every_episode
+from oodd_eval.data.inspection.draft import draft
+from oodd_eval.data.inspection.logs import inspect_logs, recognised
+from oodd_eval.data.recipe import Recipe
+from oodd_eval.metrics.outliers import ENOUGH
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedLogs:
+    """Episodes in recorded order.
+
+    Attributes
+    ----------
+    episodes
+        All of them, with their labels.
+    sensors
+        Names of the columns.
+    baseline
+        Rows at the start of every episode that are nominal.
+    notes
+        What was read and left out, a sentence each.
+    """
+
+    episodes: list[Episode]
+    sensors: list[str]
+    baseline: int
+    notes: list[str]
+
+
+def read_logs(
+    path: Path,
+    recipe: Recipe | None = None,
+    form: str = "",
+    options: Mapping[str, Any] | None = None,
+    window: int | None = None,
+) -> RecordedLogs:
+    """Read all episodes of logs.
+
+    Parameters
+    ----------
+    path
+        A file, a folder, or the directory of a data set; with a recipe, what its files are
+        relative to.
+    recipe
+        By default a first one, as ``data inspect`` writes it.
+    form, options
+        Format of the files and options of its reader, without a recipe; by default it is
+        recognised.
+    window
+        Rows to which longer recordings are cut, in place of the recipe's. Without a recipe, 20
+        recordings and more are left whole.
+
+    Returns
+    -------
+    RecordedLogs
+    """
+    reader, files, _ = recognised(path, form or (recipe.format if recipe else ""))
+    root = path if path.is_dir() and files != [path] else path.parent
+    if recipe is None:
+        logs = inspect_logs(path, reader.name, options or {})
+        recipe = Recipe.parse(tomllib.loads(draft(logs)))
+        files = list(dict.fromkeys(root / recording.file for recording in logs.recordings))
+        if window is None and len(logs.recordings) >= ENOUGH:
+            window = 0
+    if window is not None:
+        recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
+    with read_every_episode(recipe, root, files) as source:
+        return RecordedLogs(
+            list(source.episodes(EVERY)),
+            [sensor.name for sensor in source.sensors],
+            recipe.baseline,
+            list(source.notes),
+        )

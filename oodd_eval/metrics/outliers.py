@@ -1,0 +1,153 @@
+"""Which of many episodes are odd, judged by their largest statistics alone.
+
+A rank among n others is never below 1 / (n + 1), so that a rank alone rejects nothing where all
+episodes are tested against one another: the k-th smallest of n such p-values is k / n. Beyond the
+median a p-value is therefore read from a tail, whose shape is assumed: how rare false discoveries
+are then is known from simulations and is no guarantee. Ranks among episodes that are kept apart are
+p-values whatever the distribution, and with enough of these nothing has to be assumed.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LEAST: Final = 8
+"""Episodes from which on a tail can be estimated from the others."""
+ENOUGH: Final = 20
+"""Episodes from which on a tail finds what stands out."""
+ODD_SHARE: Final = 0.2
+"""Share of the others that may be odd, too, without a word in the tail: the largest of them."""
+_ROUNDING: Final = 1e-9  # of an episode
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """The tail of the largest statistics of nominal episodes, beyond their median.
+
+    Cube roots of statistics beyond the median are taken to exceed it by exponential amounts;
+    whatever falls off faster, such as exponential or most log-normal statistics, has fewer large
+    values than is said here. The mean of the amounts is estimated twice: from all episodes, and
+    from all but the largest fifth, which counts as censored, so that odd episodes among the others
+    do not hide one another. From either estimate the p-value of one more episode is exact, as the
+    ratio of an exponential amount and a mean of r others has Fisher's distribution with 2 and 2 r
+    degrees of freedom; the smaller one is doubled.
+
+    Attributes
+    ----------
+    start
+        The median.
+    share
+        Chance that a further episode lies beyond the median.
+    estimates
+        Mean of the amounts, and the number r of them that it is from.
+    """
+
+    start: float
+    share: float
+    estimates: tuple[tuple[float, int], ...]
+
+    @classmethod
+    def fit(cls, others: Floats) -> "Tail | None":
+        """Estimate the tail; None where there are too few episodes, or ties leave no spread.
+
+        Parameters
+        ----------
+        others : float64 array of shape (n,)
+            Largest statistic of each other episode.
+
+        Returns
+        -------
+        Tail or None
+        """
+        ordered, n = np.sort(others), len(others)
+        middle = (n + 1) // 2
+        if n + 1 < LEAST or not math.isfinite(ordered[middle - 1]):
+            return None
+        start = float(ordered[middle - 1])
+        amounts = np.cbrt(ordered[middle:]) - np.cbrt(start)
+        estimates = []
+        for r in (len(amounts), math.floor((1 - ODD_SHARE) * n) - middle):
+            # Of a censored amount is known that it is at least the largest other.
+            if 0 < (largest := float(amounts[r - 1])) < math.inf:
+                total = float(amounts[:r].sum()) + (len(amounts) - r) * largest
+                estimates.append((total / r, r))
+        share = (n + 1 - middle) / (n + 1)
+        return cls(start, share, tuple(estimates)) if estimates else None
+
+    def p(self, largest: float) -> float:
+        """Return the chance that a nominal episode's largest statistic is at least this.
+
+        Parameters
+        ----------
+        largest
+            The statistic.
+
+        Returns
+        -------
+        float
+            1 up to the median.
+        """
+        if largest <= self.start:
+            return 1.0
+        amount = float(np.cbrt(largest) - np.cbrt(self.start))
+        logs = (-r * math.log1p(amount / mean / r) for mean, r in self.estimates)
+        return min(1.0, len(self.estimates) * self.share * math.exp(min(logs)))
+
+    def threshold(self, p: float) -> float:
+        """Return the statistic beyond the median that has a p-value.
+
+        Parameters
+        ----------
+        p
+            The p-value, above 0.
+
+        Returns
+        -------
+        float
+        """
+        ratio = len(self.estimates) * self.share / p
+        amount = min(mean * r * math.expm1(math.log(ratio) / r) for mean, r in self.estimates)
+        return float((np.cbrt(self.start) + max(amount, 0.0)) ** 3)
+
+
+def rank_p(largest: float, others: Floats) -> float:
+    """Return the conformal p-value: a rank among the others, ties counted against the episode.
+
+    >>> rank_p(3.0, np.array([1.0, 2.0, 3.0]))
+    0.5
+    """
+    return float((1 + np.count_nonzero(others >= largest)) / (len(others) + 1))
+
+
+def rank_threshold(p: float, others: Floats) -> float:
+    """Return the least statistic whose rank among the others is a p-value of at most this.
+
+    >>> others = np.array([1.0, 2.0, 3.0])
+    >>> rank_p(rank_threshold(0.5, others), others), rank_p(2.0, others)
+    (0.5, 0.75)
+    """
+    above = math.floor(p * (len(others) + 1) + _ROUNDING) - 1
+    return float(np.nextafter(np.sort(others)[-1 - above], np.inf)) if above >= 0 else math.inf
+
+
+def q_values(p: Floats) -> Floats:
+    """Return Benjamini and Hochberg's q-values: the smallest rate at which each is rejected.
+
+    >>> q_values(np.array([0.01, 0.4, 0.02])).round(3).tolist()
+    [0.03, 0.4, 0.03]
+    """
+    n, order = len(p), np.argsort(p, kind="stable")
+    scaled = p[order] * n / np.arange(1, n + 1)
+    values = np.empty(n)
+    values[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
+    return values
+
+
+def critical_p(p: Floats, fdr: float) -> float:
+    """Return the largest p-value that is rejected, or would be if it were the only one."""
+    return fdr * max(1, int(np.count_nonzero(q_values(p) <= fdr))) / len(p)

@@ -1,0 +1,787 @@
+"""Scans: odd episodes with rows and sensors, faults of the stream, pages, viewers, the command."""
+
+import html.parser
+import json
+import re
+import sys
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from oodd_eval import scan_episodes
+from oodd_eval.cli.main import main
+from oodd_eval.data.episodes import EVERY, Episode, read_every_episode
+from oodd_eval.data.recipe import Recipe
+from oodd_eval.errors import MissingExtraError, UsageError
+from oodd_eval.live import Watchdog
+from oodd_eval.live.handle import DetectorHandle
+from oodd_eval.live.logs import read_logs
+from oodd_eval.live.scan_page import PICTURES, page
+from oodd_eval.live.viewers import write_mcap, write_rerun
+from oodd_eval.metrics.binomial import clopper_pearson
+from oodd_eval.metrics.outliers import LEAST, Tail, critical_p, q_values, rank_p, rank_threshold
+
+ROOT = Path(__file__).parents[1]
+SENSORS = ["speed", "torque", "current"]
+
+
+def logs(seed=0, n=20, rows=150, sensors=3):
+    """Episodes of a stable linear process, each about an offset of its own."""
+    rng = np.random.default_rng(seed)
+    episodes = []
+    for _ in range(n):
+        x = np.zeros((rows, sensors))
+        for t in range(1, rows):
+            x[t] = 0.8 * x[t - 1] + rng.normal(size=sensors)
+        episodes.append(x + 0.5 * rng.normal(size=sensors))
+    return episodes
+
+
+def episode(rows, name="one", time=None, **facts):
+    rows = np.asarray(rows, dtype=float)
+    return Episode(name, "log.csv", rows, np.empty((len(rows) - 1, 0)), None, time=time, **facts)
+
+
+def p_values(largest):
+    p = []
+    for i, one in enumerate(largest):
+        others = np.delete(largest, i)
+        tail = Tail.fit(others)
+        p.append(rank_p(one, others) if tail is None or one <= tail.start else tail.p(one))
+    return np.array(p)
+
+
+# The arithmetic
+
+
+def test_a_tail_worked_by_hand():
+    # Of nine others the fifth is the median, 1; the cube roots of the rest are 1, 2, 4 and 8 beyond
+    # it. All have the mean 15 / 4; with the largest fifth of nine censored at 2, 7 / 2 of 2.
+    others = np.array([0.1, 0.2, 0.3, 0.4, 1.0, 8.0, 27.0, 125.0, 729.0])
+    tail = Tail.fit(others)
+    assert (tail.start, tail.share) == (1.0, 0.5)
+    assert tail.estimates == (pytest.approx((15 / 4, 4)), pytest.approx((7 / 2, 2)))
+    every, censored = (1 + 10 / 15) ** -4, (1 + 10 / 7) ** -2
+    assert tail.p(11.0**3) == pytest.approx(2 * 0.5 * min(every, censored))
+    assert tail.p(1.0) == 1.0
+    assert 0.9 < tail.p(1.001) < 1.0
+
+
+def test_threshold_and_p_value_agree():
+    for shift in (0.0, -40.0):
+        tail = Tail.fit(np.random.default_rng(1).exponential(size=30) + shift)
+        for p in (0.3, 0.01, 1e-6):
+            assert tail.p(tail.threshold(p)) == pytest.approx(p)
+
+
+@pytest.mark.parametrize("others", [np.ones(30), np.arange(LEAST - 2.0), np.full(30, -np.inf)])
+def test_no_tail_of_ties_or_of_few(others):
+    assert Tail.fit(others) is None
+
+
+@pytest.mark.parametrize("n", [8, 20, 60])
+def test_p_values_are_valid_and_nearly_exact_for_cubes(n):
+    """From one estimate alone they are exact: the share of them up to each level is that level."""
+    rng, draws = np.random.default_rng(n), 4000
+    p = np.empty((3, draws))
+    for i in range(draws):
+        largest = rng.exponential(size=n) ** 3
+        tail = Tail.fit(largest[1:])
+        alone = [Tail(tail.start, tail.share, (one,)) for one in tail.estimates]
+        p[:, i] = [tail.p(largest[0]), *(one.p(largest[0]) for one in alone)]
+    for level in (0.2, 0.05, 0.01):
+        both, every, censored = ((one <= level).sum() for one in p)
+        for count in (every, censored):
+            low, high = clopper_pearson(int(count), draws, 0.999)
+            assert low <= level <= high
+        assert clopper_pearson(int(both), draws, 0.999)[0] <= level
+        assert clopper_pearson(int(both), draws, 0.999)[1] >= level / 2
+
+
+def test_q_values_by_hand():
+    p = np.array([0.04, 0.01, 0.5, 0.012])
+    assert q_values(p) == pytest.approx([0.04 * 4 / 3, 0.024, 0.5, 0.024])
+    assert critical_p(p, 0.03) == pytest.approx(0.03 * 2 / 4)
+    assert critical_p(np.ones(4), 0.1) == pytest.approx(0.1 / 4)
+
+
+def test_ranks_alone_reject_nothing():
+    """The reason for a tail: the k-th smallest of n ranks among all is k / n."""
+    largest = np.array([*range(1, 50), 1e9])
+    p = np.array([rank_p(one, np.delete(largest, i)) for i, one in enumerate(largest)])
+    assert q_values(p).min() == pytest.approx(1.0)
+    assert q_values(p_values(largest))[-1] < 0.01
+
+
+@pytest.mark.parametrize("draw", ["cube", "gumbel", "lognormal"])
+def test_false_discoveries_are_as_rare_as_promised(draw):
+    """Without an odd episode any rejection is a false discovery."""
+    rng, runs = np.random.default_rng(7), 400
+    draws = {
+        "cube": lambda: rng.exponential(size=20) ** 3,
+        "gumbel": lambda: rng.gumbel(size=20) + 6,
+        "lognormal": lambda: np.exp(rng.normal(size=20)),
+    }
+    wrong = sum((q_values(p_values(draws[draw]())) <= 0.1).any() for _ in range(runs))
+    assert clopper_pearson(wrong, runs, 0.99)[0] <= 0.1
+
+
+def test_heavy_tails_break_what_is_promised():
+    """As docs/adr/0021-scan-tail.md says: the tail is assumed, and a power law is beyond it."""
+    rng = np.random.default_rng(7)
+    wrong = sum((q_values(p_values(rng.pareto(3, size=60) + 1)) <= 0.1).any() for _ in range(200))
+    assert clopper_pearson(wrong, 200, 0.99)[0] > 0.1
+
+
+def test_ranks_among_others_keep_the_promise_whatever_the_tail():
+    """Five episodes against 49 that are kept apart: the smallest rank is 1 / 50 = 0.1 / 5."""
+    rng, wrong, runs = np.random.default_rng(7), 0, 2000
+    for _ in range(runs):
+        largest = rng.pareto(1, size=54)
+        p = np.array([rank_p(one, largest[5:]) for one in largest[:5]])
+        odd = q_values(p) <= 0.1
+        assert (odd == (largest[:5] >= rank_threshold(critical_p(p, 0.1), largest[5:]))).all()
+        wrong += odd.any()
+    low, high = clopper_pearson(wrong, runs, 0.999)
+    assert low <= 0.1
+    assert high >= 0.05
+
+
+def test_a_fifth_of_odd_episodes_does_not_hide_itself():
+    rng = np.random.default_rng(3)
+    found = 0
+    for _ in range(50):
+        largest = rng.gumbel(size=30) + 6
+        largest[:5] *= 15
+        found += (q_values(p_values(largest))[:5] <= 0.1).sum()
+    assert found >= 0.95 * 50 * 5
+
+
+# Odd episodes
+
+
+def test_the_odd_one_is_named_with_row_and_sensor():
+    named = rows = 0
+    for seed in range(5):
+        episodes = logs(seed)
+        episodes[5][90:, 1] += 12
+        scan = scan_episodes(episodes, sensors=SENSORS)
+        assert [one.episode.name for one in scan.odd] == ["episode 5"]
+        (odd,) = scan.odd
+        assert odd.intervals[0][0] == odd.row
+        assert odd.statistic[odd.row] >= odd.threshold
+        assert (odd.statistic[: odd.row] < odd.threshold).all()
+        assert sum(odd.sensors.values()) == pytest.approx(1)
+        named += odd.suspects[0] == "torque"
+        rows += abs(odd.first - 90) <= 3
+    assert named == 5
+    assert rows >= 4
+
+
+def test_clean_logs_have_odd_episodes_as_rarely_as_promised():
+    runs = 40
+    scans = [scan_episodes(logs(seed, n=12, rows=80), fdr=0.1) for seed in range(100, 100 + runs)]
+    assert not any(one.faults for scan in scans for one in scan.episodes)
+    wrong = sum(bool(scan.odd) for scan in scans)
+    assert clopper_pearson(wrong, runs, 0.99)[0] <= 0.1
+
+
+def test_labels_decide_nothing_and_stand_beside():
+    episodes = [episode(x, f"e{i}") for i, x in enumerate(logs())]
+    plain = scan_episodes(episodes)
+    labelled = [episode(x, f"e{i}", kind="leak", intervals=((3, 9),)) for i, x in enumerate(logs())]
+    scan = scan_episodes(labelled)
+    assert [one.p for one in scan.episodes] == [one.p for one in plain.episodes]
+    assert {one.label for one in scan.episodes} == {"leak, 3 to 9"}
+    assert {one.label for one in plain.episodes} == {""}
+    assert scan_episodes([episode(logs()[0], outcome=False)] * 2).episodes[0].label == "failure"
+
+
+class Spy:
+    """A detector that scores the distance from the mean, and knows what it was fitted on."""
+
+    fits: ClassVar = []
+
+    def fit(self, nominal):
+        self.seen = {float(x.observations[0, 0]) for x in nominal}
+        self.fits.append(self.seen)
+        self.mean = np.concatenate([x.observations for x in nominal]).mean(axis=0)
+
+    def score(self, trajectory):
+        assert float(trajectory.observations[0, 0]) not in self.seen
+        return np.abs(trajectory.observations - self.mean).sum(axis=1).astype(np.float64)
+
+
+@pytest.mark.parametrize(("n", "fits"), [(9, 9), (20, 20), (33, 20)])
+def test_nothing_is_judged_by_a_fit_that_has_seen_it(n, fits):
+    Spy.fits.clear()
+    episodes = logs(n=n, rows=30)
+    episodes[4][10:] += 500
+    scan = scan_episodes(episodes, detector=Spy())
+    assert len(Spy.fits) == fits
+    assert f"{fits} fits" in scan.notes[0]
+    assert scan.episodes[4].odd  # by a CUSUM of its scores
+    first = [float(np.float32(x[0, 0])) for x in episodes]
+    assert len({*first}) == n
+
+
+class Explaining(Spy):
+    def explain(self, trajectory):
+        rows = np.tile([0.1, 0.2, 0.7], (len(trajectory), 1))
+        return rows, np.minimum(np.arange(len(trajectory)), 3)
+
+
+def test_explanations_of_the_detector_count():
+    episodes = logs(rows=40)
+    episodes[2][20:, 0] += 200
+    (odd,) = scan_episodes(episodes, sensors=SENSORS, detector=Explaining()).odd
+    assert odd.sensors == {"current": 0.7, "torque": 0.2, "speed": 0.1}
+    assert (odd.since, odd.first) == (3, 3)
+
+
+class Broken(Spy):
+    def fit(self, nominal):
+        raise ZeroDivisionError("ratio")
+
+
+def test_a_detector_that_fails_is_named():
+    with pytest.raises(ValueError, match="Broken raised ZeroDivisionError"):
+        scan_episodes(logs(n=8), detector=Broken())
+
+
+def test_processes_give_what_one_gives():
+    episodes = logs(n=8, rows=40)
+    one, two = (scan_episodes(episodes, jobs=jobs) for jobs in (1, 2))
+    assert [e.as_json() for e in one.episodes] == [e.as_json() for e in two.episodes]
+
+
+def test_baseline_rows_take_the_day_off():
+    """Days differ by far more than the fault, which a baseline shows."""
+    rng = np.random.default_rng(5)
+    episodes = [x + 60 * rng.normal(size=3) for x in logs(5)]
+    episodes[8][100:, 2] += 12
+    (odd,) = scan_episodes(episodes, sensors=SENSORS, baseline=40).odd
+    assert (odd.episode.name, odd.suspects[0]) == ("episode 8", "current")
+    assert abs(odd.first - 100) <= 3
+    assert np.isnan(odd.scores[:40]).all()
+
+
+def test_rows_that_a_detector_adapts_to_are_not_judged(monkeypatch):
+    class Loud:
+        def fit(self, nominal):
+            assert {len(x) for x in nominal} == {150}
+
+        def score(self, trajectory):
+            return np.abs(trajectory.observations).sum(axis=1) + 1e6 * (np.arange(150) < 40)
+
+    handle = DetectorHandle(Loud(), "score", actions=True, adapts=True, state={"name": "loud"})
+    monkeypatch.setattr("oodd_eval.live.scan._Fit.handle", lambda _: handle)
+    for one in scan_episodes(logs(5), sensors=SENSORS, baseline=40).episodes:
+        assert np.isnan(one.scores[:40]).all()
+        assert one.largest < 1e5
+
+
+def test_a_single_recording_is_cut_into_windows():
+    recording = np.concatenate(logs(n=1, rows=2000))
+    recording[1230:1260, 1] += 40
+    scan = scan_episodes([recording], sensors=SENSORS)
+    assert len(scan.episodes) == 40
+    (odd,) = scan.odd
+    assert odd.episode.name == "episode 0[1200:1250]"
+    assert abs(odd.first - 30) <= 2
+    assert "50 rows" in " ".join(scan.notes)
+
+
+def test_windows_keep_labels_times_and_the_rest():
+    one = episode(np.random.default_rng(0).normal(size=(25, 2)), time=np.arange(25.0),
+                  intervals=((8, 13),))  # fmt: skip
+    parts = [x.episode for x in scan_episodes([one, one], window=10).episodes][:3]
+    assert [len(x.observations) for x in parts] == [10, 10, 5]
+    assert [x.intervals for x in parts] == [((8, 10),), ((0, 3),), ()]
+    assert [x.name for x in parts] == ["one[0:10]", "one[10:20]", "one[20:25]"]
+    assert parts[1].time[0] == 10.0
+
+
+def test_few_episodes_are_said_to_be_few():
+    episodes = logs(n=LEAST - 1)
+    episodes[1][50:] += 8
+    scan = scan_episodes(episodes)
+    assert not scan.odd
+    assert f"takes {LEAST}" in " ".join(scan.notes)
+    assert scan.episodes[0].as_json()["p"] is None
+    assert scan_episodes(episodes + logs(1, n=13)).episodes[1].odd  # together with others
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fdr": 0.0}, "fdr=0.0"),
+        ({"window": 1}, "window=1"),
+        ({"sensors": ["a"]}, "1 names of sensors"),
+        ({"baseline": 200}, "no episode of at least"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(UsageError, match=re.escape(message)):
+        scan_episodes(logs(n=9), **arguments)
+
+
+def test_wrong_episodes():
+    for wrong in ([np.zeros(3)], [np.zeros((5, 2)), np.zeros((5, 3))], [], logs(n=1, rows=9)):
+        with pytest.raises(UsageError):
+            scan_episodes(wrong)
+
+
+def test_tasks_are_compared_among_themselves():
+    rng = np.random.default_rng(0)
+    loud = [episode(100 * rng.normal(size=(60, 2)), f"l{i}", task="loud") for i in range(10)]
+    quiet = [episode(rng.normal(size=(60, 2)), f"q{i}", task="quiet") for i in range(12)]
+    quiet[3].observations[30:] += 60
+    scan = scan_episodes([*loud, *quiet], detector="mahalanobis")
+    assert [one.episode.name for one in scan.odd] == ["q3"]
+
+
+# Faults of the stream
+
+
+def test_an_offset_that_float32_cannot_tell():
+    episodes = [x * [0.02, 1, 1] + [5.4e6, 0, 0] for x in logs()]
+    episodes[3][100:, 0] += 0.3
+    (odd,) = scan_episodes(episodes, sensors=SENSORS).odd
+    assert (odd.episode.name, odd.suspects) == ("episode 3", ["speed"])
+
+
+def broken(fault):
+    episodes = [episode(x, f"e{i}", time=0.1 * np.arange(150)) for i, x in enumerate(logs())]
+    rows, time = episodes[6].observations, episodes[6].time
+    if fault == "missing":
+        rows[60:70, 1] = np.nan
+    elif fault == "missing now and then":
+        rows[60:90:3, 1] = np.nan
+    elif fault == "wild":
+        rows[60:70, 1] = 1e30
+    elif fault == "frozen":
+        rows[60:90, 1] = rows[60, 1]
+    elif fault == "repeated":
+        rows[60:90] = rows[60]
+    elif fault == "out of range":
+        rows[60:70, 1] = 900.0
+    elif fault == "gap":
+        time[60:] += 7.0
+    return episodes
+
+
+@pytest.mark.parametrize(
+    ("fault", "what", "name"),
+    [
+        ("missing", "torque", "missing"),
+        ("missing now and then", "torque", "missing"),
+        ("wild", "torque", "missing"),
+        ("frozen", "torque", "frozen"),
+        ("repeated", "observation", "repeated"),
+        ("out of range", "torque", "out of range"),
+        ("gap", "time", "gap"),
+    ],
+)
+def test_each_fault_of_the_stream(fault, what, name):
+    scan = scan_episodes(broken(fault), sensors=SENSORS, detector="mahalanobis")
+    assert [one.episode.name for one in scan.episodes if one.faults] == ["e6"]
+    (seen,) = [f for f in scan.episodes[6].faults if f.fault == name]
+    assert seen.what == what
+    assert 60 <= seen.row <= {"missing": 62, "repeated": 72}.get(name, 66)
+    assert scan.episodes[6].odd
+    assert what in scan.episodes[6].suspects
+
+
+def test_no_fault_without_one():
+    assert not any(one.faults for one in scan_episodes(broken("none"), sensors=SENSORS).episodes)
+
+
+def test_a_gap_between_pieces_of_one_recording():
+    pieces = [episode(x, f"e{i}", time=20.0 * i + 0.1 * np.arange(150))
+              for i, x in enumerate(logs())]  # fmt: skip
+    assert not any(one.faults for one in scan_episodes(pieces).episodes)  # so are all of them
+    close = [episode(x, f"e{i}", time=15.0 * i + 500 * (i > 7) + 0.1 * np.arange(150))
+             for i, x in enumerate(logs())]  # fmt: skip
+    faults = {one.episode.name: one.faults for one in scan_episodes(close).episodes if one.faults}
+    assert {name: (f.what, f.fault, f.row) for name, (f,) in faults.items()} == {
+        "e8": ("time", "gap", 0)
+    }
+
+
+def test_what_many_episodes_do_is_no_fault():
+    """A gripper that rests for as long as it likes is not frozen."""
+    episodes = [episode(x, f"e{i}") for i, x in enumerate(logs())]
+    rng = np.random.default_rng(0)
+    for one in episodes:
+        rest = int(rng.integers(5, 60))
+        one.observations[20 : 20 + rest, 2] = one.observations[20, 2]
+    assert not any(one.faults for one in scan_episodes(episodes, sensors=SENSORS).episodes)
+
+
+def test_a_dead_sensor_and_one_that_is_constant():
+    episodes = [episode(x, f"e{i}") for i, x in enumerate(logs())]
+    for i, one in enumerate(episodes):
+        one.observations[:, 2] = i  # a payload
+    episodes[4].observations[:, 1] = np.nan
+    scan = scan_episodes(episodes, sensors=SENSORS, detector="mahalanobis")
+    assert [(one.episode.name, [str(f) for f in one.faults]) for one in scan.episodes
+            if one.faults] == [("e4", ["torque missing at row 0"])]  # fmt: skip
+
+
+# A watchdog
+
+
+@pytest.fixture(scope="module")
+def watchdog():
+    return Watchdog.fit("mewma", logs(1, n=20), logs(2, n=40), alpha=0.1, sensors=SENSORS, rate=10)
+
+
+def test_a_watchdog_judges_by_its_calibration(watchdog):
+    episodes = logs(3, n=3)
+    episodes[1][70:, 2] += 15
+    scan = scan_episodes(episodes, sensors=SENSORS, watchdog=watchdog)
+    (odd,) = scan.odd
+    assert (odd.episode.name, odd.suspects[0]) == ("episode 1", "current")
+    assert abs(odd.first - 70) <= 3
+    largest = np.array(watchdog.calibration.largest)
+    for one in scan.episodes:
+        assert one.rank_p == rank_p(one.largest, largest)
+    assert watchdog.promise in scan.notes[0]
+
+
+def test_p_values_are_ranks_where_calibration_episodes_are_enough(watchdog):
+    """41 places for a rate of 0.1: four episodes may be judged by rank, five need the tail."""
+    n, largest = len(watchdog.calibration.largest), np.array(watchdog.calibration.largest)
+    most = int(0.1 * (n + 1))
+    episodes = logs(3, n=most + 1)
+    episodes[1][70:, 2] += 15
+    few, many = (
+        scan_episodes(episodes[:m], sensors=SENSORS, watchdog=watchdog) for m in (most, most + 1)
+    )
+    assert [one.p for one in few.episodes] == [rank_p(one.largest, largest) for one in few.episodes]
+    assert few.odd[0].p == 1 / (n + 1) > many.odd[0].p
+    assert few.odd[0].threshold == pytest.approx(largest.max())
+    assert abs(few.odd[0].first - 70) <= 3
+    assert (len(few.notes), len(many.notes)) == (2, 1)
+
+
+def test_a_watchdog_finds_columns_by_name(watchdog):
+    episodes = [x[:, [2, 0, 1, 0]] for x in logs(3, n=2)]
+    episodes[0][70:, 0] += 15
+    names = ["current", "speed", "torque", "spare"]
+    (odd,) = scan_episodes(episodes, sensors=names, watchdog=watchdog).odd
+    assert odd.suspects[0] == "current"
+    with pytest.raises(UsageError, match="torque"):
+        scan_episodes(episodes, sensors=["current", "speed", "torq", "spare"], watchdog=watchdog)
+
+
+def test_a_watchdog_sees_faults_and_a_single_episode(watchdog):
+    (one,) = logs(3, n=1)
+    assert not scan_episodes([one], sensors=SENSORS, watchdog=watchdog).odd
+    one[50:60, 0] = np.nan
+    (odd,) = scan_episodes([one], sensors=SENSORS, watchdog=watchdog).odd
+    assert [(f.what, f.fault) for f in odd.faults] == [("speed", "missing")]
+
+
+# What is written
+
+
+@pytest.fixture(scope="module")
+def scan():
+    episodes = [episode(x, f"run <{i}>", time=100 + 0.1 * np.arange(150))
+                for i, x in enumerate(logs())]  # fmt: skip
+    episodes[5].observations[90:, 1] += 12
+    episodes[7].observations[20:40, 0] = np.nan
+    return scan_episodes(episodes, sensors=SENSORS)
+
+
+def documented(heading):
+    text = (ROOT / "docs" / "how-to" / "scan.md").read_text(encoding="utf-8")
+    section = text.partition(f"{heading}\n")[2].partition("\n#")[0]
+    return dict(re.findall(r"^\| `(\w+)` \| (\w+)", section, re.MULTILINE))
+
+
+KINDS = {
+    "text": lambda v: isinstance(v, str),
+    "number": lambda v: v is None or isinstance(v, float),
+    "whole": lambda v: v is None or type(v) is int,
+    "flag": lambda v: isinstance(v, bool),
+    "list": lambda v: isinstance(v, list),
+    "object": lambda v: isinstance(v, dict),
+}
+
+
+def test_json_is_as_documented(scan):
+    content = json.loads(json.dumps(scan.as_json(), allow_nan=False))
+    for part, heading in ((content, "### JSON"), (content["episodes"][5], "#### An episode")):
+        kinds = documented(heading)
+        assert list(part) == list(kinds)
+        assert all(KINDS[kinds[key]](value) for key, value in part.items()), part
+    assert content["odd"] == ["run <5>", "run <7>"]
+    fifth, seventh = content["episodes"][5], content["episodes"][7]
+    assert fifth["first_odd_time"] == pytest.approx(100 + 0.1 * fifth["first_odd_row"])
+    assert seventh["faults"] == [{"what": "speed", "fault": "missing", "row": 20}]
+    assert seventh["suspects"] == ["speed"]
+
+
+class Tags(html.parser.HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.tags, self.open, self.addresses = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [v for k, v in attrs if k in {"href", "src", "xlink:href"}]
+        if tag not in {"meta", "rect", "line", "polyline"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_page_needs_nothing_else_and_shows_odd_episodes(scan):
+    text = page(scan, "logs & more")
+    tags = Tags()
+    tags.feed(text)
+    assert not tags.open
+    assert tags.tags.count("svg") == 2
+    assert all(address.startswith("#episode-") for address in tags.addresses)
+    assert not re.search(r"https?:|<script|<link|@import|url\(", text)
+    assert "logs &amp; more" in text
+    assert "run &lt;5&gt;" in text
+    assert "run <5>" not in text
+
+
+def test_pictures_are_bounded(scan):
+    many = type(scan)([scan.odd[0]] * (PICTURES + 7), scan.sensors, scan.judge, scan.fdr, [])
+    text = page(many)
+    assert text.count("<svg") == PICTURES
+    assert "7 more" in text
+    long = [episode(x, f"e{i}") for i, x in enumerate(logs(n=9, rows=30_000))]
+    long[2].observations[9_000:, 1] += 40
+    assert len(page(scan_episodes(long, detector="mahalanobis"))) < 100_000
+
+
+@pytest.mark.browser
+def test_page_in_a_browser(scan, tmp_path):
+    from helpers_browser import launch, programs
+
+    if programs() is None:
+        pytest.skip("no Chromium with its driver")
+    (tmp_path / "scan.html").write_text(page(scan, "logs"), encoding="utf-8")
+    with launch(tmp_path) as browser:
+        for width in (1200, 390):
+            with browser.narrow(width):
+                browser.open((tmp_path / "scan.html").as_uri())
+                wide = "document.documentElement.scrollWidth <= innerWidth"
+                assert browser.run(f"return {wide}")
+                assert browser.run("return document.querySelectorAll('svg').length") == 2
+        assert not browser.console()
+        assert all(url.startswith("file:") for url in browser.requests())
+
+
+def test_mcap_is_read_back(scan, tmp_path):
+    from mcap.reader import make_reader
+
+    write_mcap(scan, tmp_path / "scan.mcap")
+    with (tmp_path / "scan.mcap").open("rb") as file:
+        messages = [
+            (channel.topic, message.log_time, json.loads(message.data), json.loads(schema.data))
+            for schema, channel, message in make_reader(file).iter_messages()
+        ]
+    assert {topic for topic, *_ in messages} == {
+        f"/run <{i}>/{kind}" for i in range(20) for kind in ("sensors", "oodd")
+    }
+    fifth = scan.episodes[5]
+    verdicts = [(t, m, s) for topic, t, m, s in messages if topic == "/run <5>/oodd"]
+    assert len(verdicts) == 150
+    for row in (0, fifth.row):
+        stamp, message, schema = verdicts[row]
+        assert stamp == round((100 + 0.1 * row) * 1e9)
+        assert schema["properties"].keys() == message.keys()
+        assert message["alarm"] == (row == fifth.row)
+        assert message["suspects"] == (["torque"] if message["alarm"] else [])
+    assert verdicts[50][1]["score"] == fifth.scores[50]
+    seventh = [m for topic, _, m, _ in messages if topic == "/run <7>/sensors"]
+    assert seventh[19].keys() == {*SENSORS}
+    assert seventh[19]["speed"] is not None
+    assert seventh[20]["speed"] is None
+
+
+def test_rerun_is_read_back(scan, tmp_path):
+    from rerun.chunk import RrdReader
+
+    write_rerun(scan, tmp_path / "scan.rrd")
+    entities = {}
+    for chunk in RrdReader(tmp_path / "scan.rrd").stream():
+        entities.setdefault(str(chunk.entity_path), []).append(chunk)
+    kinds = ["score", "statistic", "threshold", "alarm", *(f"sensors/{s}" for s in SENSORS)]
+    paths = {re.sub(r"\\", "", path) for path in entities}
+    assert {f"/run <{i}>/{kind}" for i in range(20) for kind in kinds} <= paths
+    assert {f"/run <{i}>/suspects" for i in (5, 7)} == {p for p in paths if "suspects" in p}
+
+
+@pytest.mark.parametrize(("module", "write"), [("rerun", write_rerun), ("mcap.writer", write_mcap)])
+def test_viewers_without_their_library(scan, tmp_path, monkeypatch, module, write):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError, match="viewers"):
+        write(scan, tmp_path / "scan")
+    assert not list(tmp_path.iterdir())
+
+
+# Logs and the command
+
+
+def write_logs(folder, episodes, stamps=None, names=SENSORS):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, rows in enumerate(episodes):
+        time = 0.1 * np.arange(len(rows)) if stamps is None else stamps[i]
+        lines = [",".join(["t[s]", *names])]
+        for moment, row in zip(time, rows, strict=True):
+            cells = ("" if np.isnan(x) else f"{x:.6f}" for x in row)
+            lines.append(",".join([f"{moment:.3f}", *cells]))
+        (folder / f"run-{i:02}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_command_on_a_folder(tmp_path, capsys):
+    episodes = logs()
+    write_logs(tmp_path / "clean", episodes)
+    assert main(["scan", str(tmp_path / "clean")]) == 0
+    assert "0 of 20 episodes are odd" in capsys.readouterr().out
+    episodes[5][90:, 1] += 12
+    episodes[7][60:75, 0] = np.nan
+    write_logs(tmp_path / "logs", episodes)
+    outputs = {kind: tmp_path / f"out/scan.{kind}" for kind in ("json", "html", "mcap")}
+    options = [f"--{kind}={path}" for kind, path in outputs.items()]
+    assert main(["scan", str(tmp_path / "logs"), *options]) == 1
+    out = capsys.readouterr().out
+    odd = [line.split()[1] for line in out.splitlines() if line.startswith("odd")]
+    assert odd == ["run-05", "run-07"]
+    content = json.loads(outputs["json"].read_text())
+    assert content["odd"] == odd
+    assert content["episodes"][7]["faults"][0]["fault"] == "missing"
+    assert "run-05" in outputs["html"].read_text()
+    assert outputs["mcap"].stat().st_size
+    assert main(["scan", str(tmp_path / "logs"), "-q"]) == 1
+    assert capsys.readouterr().out.count("\n") == 1
+
+
+def test_of_many_episodes_the_table_has_the_oddest(tmp_path, capsys):
+    episodes = logs()
+    episodes[5][90:, 1] += 12
+    write_logs(tmp_path / "logs", episodes)
+    command = ["scan", str(tmp_path / "logs"), "--window", "50"]
+
+    def table():
+        assert main(command) == 1
+        out = capsys.readouterr().out
+        return out, [x.split() for x in out.splitlines() if "run-" in x]
+
+    out, brief = table()
+    total = int(re.search(r"of (\d+) episodes", out)[1])
+    assert 10 < len(brief) < 40 < total
+    assert f"Not listed: {total - len(brief)} episodes" in out
+    command.append("-v")
+    out, whole = table()
+    assert len(whole) == total
+    assert [row for row in whole if row in brief] == brief  # in recorded order
+    assert [row for row in whole if row[0] == "odd"] == [row for row in brief if row[0] == "odd"]
+    assert "Not listed" not in out
+
+
+@pytest.mark.parametrize(("labelled", "many"), [(3, False), (6, True)])
+def test_the_command_says_what_became_of_labelled_episodes(labelled, many, tmp_path, capsys):
+    episodes = logs()
+    write_logs(tmp_path / "logs", episodes)
+    files = sorted((tmp_path / "logs").iterdir())
+    for number, file in enumerate(files):
+        header, *rows = file.read_text().splitlines()
+        fault = [int(number < labelled and i > 80) for i in range(len(rows))]
+        lines = [f"{row},{mark}" for row, mark in zip(rows, fault, strict=True)]
+        file.write_text("\n".join([f"{header},fault", *lines]) + "\n")
+    assert main(["scan", str(tmp_path / "logs")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"{labelled} episodes are anomalous by their labels, 0 of them odd" in out
+    assert ("--watchdog DIR" in out) == many
+
+
+def test_command_with_recipe_and_watchdog(tmp_path, capsys):
+    episodes = logs()
+    recipe = tmp_path / "arm.toml"
+    recipe.write_text(
+        'split = "arm"\ntime = "t"\nrate = 10\nsensors = ["speed", "torque", "current"]\n'
+        '[nominal]\nfiles = ["good/*.csv"]\n[anomalous.leak]\nfiles = ["bad/*.csv"]\nonset = 90\n'
+    )
+    write_logs(tmp_path / "data/good", episodes)
+    episodes[5][90:, 1] += 12
+    write_logs(tmp_path / "data/bad", episodes[5:6])
+    arguments = ["--recipe", str(recipe), "--json", str(tmp_path / "scan.json")]
+    assert main(["scan", str(tmp_path / "data"), *arguments]) == 1
+    content = json.loads((tmp_path / "scan.json").read_text())
+    (odd,) = [one for one in content["episodes"] if one["odd"]]
+    assert (odd["label"], odd["suspects"]) == ("leak, 90 to 150", ["torque"])
+    assert "leak" in capsys.readouterr().out
+    watchdog = Watchdog.fit("mewma", episodes[6:13], episodes[13:] + logs(9), 0.1, sensors=SENSORS)
+    watchdog.save(tmp_path / "watchdog")
+    today = tmp_path / "today"
+    write_logs(today, episodes[4:6])
+    arguments += ["--watchdog", str(tmp_path / "watchdog")]
+    assert main(["scan", str(today), *arguments]) == 1
+    assert json.loads((tmp_path / "scan.json").read_text())["odd"] == ["run-01"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["nowhere"], ["logs", "--fdr", "1.5"], ["logs", "--detector", "mewmo"], ["logs", "--recipe",
+     "none.toml"], ["logs", "--watchdog", "none"], ["logs", "--param", "x=1"]],
+)  # fmt: skip
+def test_command_that_cannot_be_carried_out(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_logs(tmp_path / "logs", logs(n=8, rows=30))
+    assert main(["scan", *arguments]) == 4
+
+
+def test_every_row_is_read_whatever_labels_stamps_and_cells_say(tmp_path):
+    rows = np.arange(60.0).reshape(30, 2)
+    time = 0.1 * np.arange(30)
+    time[20:] += 50  # a gap
+    time[5] = 0.05  # back
+    rows[0, 0] = rows[12, 1] = np.nan
+    lines = [f"{t:.2f},{a},{b},{int(i > 24)}"
+             for i, (t, (a, b)) in enumerate(zip(time, rows, strict=True))]  # fmt: skip
+    text = "\n".join(["t,a,b,fault", *lines]).replace("nan", "")
+    (tmp_path / "x.csv").write_text(f"{text}\n", encoding="utf-8")
+    recipe = Recipe.parse(
+        {"split": "x", "time": "t", "labels": "fault", "sensors": ["a", "b"],
+         "nominal": {"files": ["x.csv"]}}
+    )  # fmt: skip
+    with read_every_episode(recipe, tmp_path, [tmp_path / "x.csv"]) as source:
+        first, second = source.episodes(EVERY)
+    # The leading row and the one that is stamped before another are left out.
+    assert first.observations[:, 0].tolist() == [2 * i for i in range(1, 20) if i != 5]
+    assert np.flatnonzero(np.isnan(first.observations[:, 1])).tolist() == [10]
+    assert (len(second.observations), second.intervals, second.kind) == (
+        10,
+        ((5, 10),),
+        "anomalous",
+    )
+    assert second.time[0] - first.time[-1] == pytest.approx(50.1)
+
+
+def test_files_that_a_recipe_does_not_list_are_read(tmp_path):
+    write_logs(tmp_path / "new", logs(n=2, rows=30))
+    recipe = Recipe.parse(
+        {"split": "x", "time": "t", "sensors": SENSORS, "nominal": {"files": ["old/*.csv"]},
+         "anomalous": {"leak": {"files": ["bad/*.csv"], "onset": 3}}, "task": "task"}
+    )  # fmt: skip
+    read = read_logs(tmp_path / "new", recipe)
+    assert [(one.name, one.kind) for one in read.episodes] == [("run-00", ""), ("run-01", "")]
+    (one,) = read_logs(tmp_path / "new" / "run-01.csv", recipe).episodes
+    assert one.name == "run-01"
+    assert len(read_logs(tmp_path / "new", recipe, window=10).episodes) == 6
