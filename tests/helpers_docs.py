@@ -44,6 +44,8 @@ NOT_RUN = [
     Rule(r"^python docs/figures/make\.py$", "test_figures_are_what_the_script_draws runs it"),
     Rule(r"^python docs/figures/environments\.py$", "test_page calls it"),
     Rule(r"^mkdocs build", "the fixture of test_docs runs it"),
+    Rule(r"\bskab\b", "needs files that others published; test_recipes has some of their shape"),
+    Rule(r"^python benchmarks/(?:public_logs|promises)\.py", "the same, and minutes"),
 ]
 """Commands that no test of this module runs."""
 
@@ -57,6 +59,9 @@ PARSED_ONLY = [
          "test_reproduce_run renders what minutes did"),
     Rule(r"leaderboard submit reproduction\b", "submits what hours computed; "
          "test_submission_reproduction submits what minutes did"),
+    Rule(r"^oodd-eval data (inspect|import) (g1|bags|mug)\b",
+         "needs a data set of LeRobot, or a bag; tests of the readers write both"),
+    Rule(r"^oodd-eval data import plant --env pump ", "test_import imports such parts"),
     Rule(r"--executor dask://", "needs a cluster; test_executors starts one"),
 ]  # fmt: skip
 """Commands whose options are checked, and no more."""

@@ -227,7 +227,7 @@ def test_every_function_of_the_reference_names_its_parameters():
             re.DOTALL | re.MULTILINE,
         )
         named = re.findall(
-            r"^(\w+(?:, \w+)*)(?: :.*)?$", section[1] if section else "", re.MULTILINE
+            r"^\**(\w+(?:, \w+)*)(?: :.*)?$", section[1] if section else "", re.MULTILINE
         )
         documented = {one for names in named for one in names.split(", ")}
         expected = {*inspect.signature(function).parameters} - {"self", "cls"}

@@ -74,8 +74,58 @@ KNOWN = {
         "files": {"make_logs.py": "```python"},
         "before": ["python -m make_logs"],
     },
+    "docs/index.md": {
+        "files": {
+            "make_logs.py": """
+                from pathlib import Path
+
+                import numpy as np
+
+                rng = np.random.default_rng(0)
+                Path("logs").mkdir()
+                for name in [f"run-{i}" for i in range(40)] + [f"slip-{i}" for i in range(4)]:
+                    fault = (np.arange(100) > 50) * name.startswith("slip")
+                    rows = rng.normal(size=(100, 2)) + 4 * fault[:, None]
+                    lines = [f"{a},{b},{c}" for (a, b), c in zip(rows, fault, strict=True)]
+                    text = "\\n".join(["speed,torque,fault", *lines])
+                    Path("logs", f"{name}.csv").write_text(text)
+            """
+        },
+        "before": ["python -m make_logs"],
+    },
     "docs/how-to/own-environment.md": {
         "files": {"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"}
+    },
+    "docs/how-to/scan.md": {
+        "files": {
+            "arm.toml": """
+                split = "arm"
+                sensors = ["speed", "torque"]
+                [nominal]
+                files = ["*.csv"]
+            """,
+            "make.py": """
+                from pathlib import Path
+
+                import numpy as np
+
+                from oodd_eval.live import Watchdog
+
+                rng = np.random.default_rng(0)
+                for folder, shift in (("logs", 9), ("today", 0)):
+                    Path(folder).mkdir()
+                    for i in range(20):
+                        rows = rng.normal(size=(60, 2)) + (shift if i == 5 else 0)
+                        lines = ["speed,torque", *(f"{a},{b}" for a, b in rows)]
+                        Path(folder, f"{i}.csv").write_text("\\n".join(lines))
+                nominal = [rng.normal(size=(60, 2)) for _ in range(40)]
+                names = ["speed", "torque"]
+                watchdog = Watchdog.fit("mewma", nominal[:20], nominal[20:], 0.1, sensors=names)
+                watchdog.save("arm-watchdog")
+            """,
+        },
+        "before": ["python -m make"],
+        "fails": [r"^oodd-eval scan logs"],
     },
     "docs/how-to/live.md": {"rules": {r"(\w+_\w+\.py)": r"\1 --detector mewma"}},
     "examples/oodd-swimmer/README.md": {"folders": ["examples/oodd-swimmer"]},
