@@ -136,14 +136,11 @@ watchdog = Watchdog.fit("mahalanobis", arm, alpha=0.1)
 shutil.rmtree("watchdog", ignore_errors=True)
 watchdog.save("watchdog")
 watchdog = Watchdog.load("watchdog")
-offsets = arm.logs.offsets or [0.0] * len(arm.sensors)
 alarms = {}
 for part, episodes in {"nominal": arm.twins, "slip": arm.labelled("slip")}.items():
     alarms[part] = 0
     for episode in episodes:
-        watchdog.reset()
-        rows = episode.observations.astype("float64") + offsets
-        alarms[part] += any([watchdog.update(row).alarm for row in rows])
+        alarms[part] += any([reading.alarm for reading in watchdog.replay(episode)])
     alarms[part] /= len(episodes)
 print(json.dumps(alarms))
 """

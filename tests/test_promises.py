@@ -394,6 +394,11 @@ def test_a_split_gives_its_offsets_to_the_watchdog(tmp_path):
             far = watchdog.update(raw).score
             assert far == pytest.approx(near, rel=1e-6)
             assert other.update(dict(zip(watchdog.sensors, raw, strict=True))).score == far
+        # Of what a split has, the offsets are subtracted already.
+        watchdog.acknowledge()
+        replayed = [reading.score for reading in watchdog.replay(data.twins[0])]
+        scored = plain.replay(data.twins[0])
+        np.testing.assert_array_equal(replayed, [reading.score for reading in scored])
 
 
 def test_offsets_are_of_what_float32_cannot_tell_and_of_nothing_else():

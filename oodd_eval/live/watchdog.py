@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import FittedStateError, PromiseWarning, UsageError
 from oodd_eval.live.handle import DetectorHandle, streaming
 from oodd_eval.live.nominal import Episode, Nominal, NominalData
@@ -300,8 +301,9 @@ class Watchdog:
         Parameters
         ----------
         observation : array of shape (D,), mapping or None
-            The newest readings, or readings by sensor. NaN, infinite or absent: no reading came
-            from that sensor in time; None: from none.
+            The newest readings as the sensors send them, or readings by sensor. Offsets of the
+            split are subtracted; `replay` takes its episodes, of which they are already. NaN,
+            infinite or absent: no reading came from that sensor in time; None: from none.
         action : array of shape (A,), optional
             Commanded since the row before; None at the first row.
         time, acted
@@ -325,10 +327,37 @@ class Watchdog:
                 f"time={time!r}, acted={acted!r}, rate={rate!r}: time stamps need a watchdog "
                 "fitted with rate=, observations in a second, and acted needs time"
             )
-        self._t += 1
         if isinstance(observation, Mapping):
             observation = [observation.get(name, math.nan) for name in self.sensors]
-        row, command = self._stream.take(self._measured(observation), action, time, acted)
+        return self._judged(self._measured(observation), action, time, acted)
+
+    def replay(self, episode: Trajectory) -> list[Reading]:
+        """Judge a recorded episode of a split from its first row on.
+
+        Parameters
+        ----------
+        episode
+            Observations of shape (T + 1, D) as a split has them: its offsets are subtracted.
+
+        Returns
+        -------
+        list of Reading
+            One for each observation. The watchdog is at the end of the episode then.
+        """
+        self.reset()
+        rows = zip(episode.observations, [None, *episode.actions], strict=True)
+        return [self._judged(row, action, None, None) for row, action in rows]
+
+    def _judged(
+        self,
+        observation: ArrayLike | None,
+        action: ArrayLike | None,
+        time: float | None,
+        acted: float | None,
+    ) -> Reading:
+        """Judge the next row, from which offsets are subtracted."""
+        self._t += 1
+        row, command = self._stream.take(observation, action, time, acted)
         score = math.nan
         if self._t >= self._hidden:
             shift = None if self._handle.adapts else self._stream.shift
