@@ -67,7 +67,9 @@ _DETECTORS: Final = "mewma,mahalanobis,range,clock"  # fitted in seconds, withou
     help="a recipe, or the name of a shipped one; "
     "or the name of a split of your own, with the options below for paired parts",
 )
-@click.option("--root", type=DIRECTORY, help="folder of the recipe's files (default: its own)")
+@click.option(
+    "--root", type=DIRECTORY, help="folder of the recipe's files (default: where the recipe lies)"
+)
 @click.option("--env", metavar="NAME", help="name of the environment")
 @click.option("--format", metavar="NAME", help="of the files")
 @click.option("--train", type=DIRECTORY, help="nominal episodes to fit on")

@@ -24,7 +24,7 @@ CONSTANT: Final = 1e-6
 
 
 class Shift(NamedTuple):
-    """What brings one episode to training's: ``(row - mean) * factor + reference``, in float64.
+    """Shift of one episode to training's level: ``(row - mean) * factor + reference``, in float64.
 
     Attributes
     ----------

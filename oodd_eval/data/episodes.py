@@ -93,7 +93,7 @@ class Episode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeFacts:
-    """What is known of an episode whose rows are on disk; see `Episode`."""
+    """Facts of an episode whose rows are on disk; see `Episode`."""
 
     part: str
     name: str

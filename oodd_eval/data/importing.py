@@ -373,7 +373,7 @@ def import_frames(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Target:
-    """Where an environment is written: a new split, or one that was imported earlier."""
+    """Place of an environment: a new split, or one that was imported earlier."""
 
     recipe: Recipe
     directory: Path

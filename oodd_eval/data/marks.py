@@ -1,4 +1,4 @@
-"""Which rows of a recording are anomalous: from columns with labels, lists of intervals, an onset.
+"""Anomalous rows of a recording: from columns with labels, lists of intervals, an onset.
 
 Marks are in seconds where a recording has stamps, else in rows of the file; `rows_of` finds the
 rows of an episode.

@@ -28,14 +28,14 @@ MISSING_ROWS: Final = 20
 _RECIPE_BYTES: Final = 10**7
 
 Missing = Literal["refuse", "hold", "drop", "keep"]
-"""What missing values do; they are kept, as NaN, for scans alone."""
+"""Treatments of missing values; they are kept, as NaN, for scans alone."""
 Interval = tuple[str, int | float | str | None, int | float | str | None, str]
 """File, start, stop and kind; a start or stop is a row, a time, or None where it is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class NominalFiles:
-    """Where nominal episodes are: the table ``[nominal]`` of a recipe.
+    """Files of nominal episodes: the table ``[nominal]`` of a recipe.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class NominalFiles:
 
 @dataclass(frozen=True, slots=True)
 class AnomalousFiles:
-    """Where episodes with one anomaly are: a table ``[anomalous.NAME]`` of a recipe.
+    """Files of episodes with one anomaly: a table ``[anomalous.NAME]`` of a recipe.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class AnomalousFiles:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How logs become one environment of a split.
+    """A recipe that makes one environment of a split from logs.
 
     Parameters
     ----------

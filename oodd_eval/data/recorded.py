@@ -1,4 +1,4 @@
-"""What a recipe says of one recording: values that hold for all of it, stamps, anomalous rows."""
+"""Facts of one recording by its recipe: values that hold for all of it, stamps, anomalous rows."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -57,7 +57,7 @@ class Recorded:
 
     @property
     def source(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return self.recording.source
 
     @property

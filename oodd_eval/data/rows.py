@@ -33,7 +33,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(slots=True)
 class Tally:
-    """What was dropped and held while rows were read, for the message at the end."""
+    """Counts of rows dropped and held while rows were read, for the message at the end."""
 
     rows: Counter[str] = field(default_factory=Counter)
     files: dict[str, set[str]] = field(default_factory=dict)

@@ -23,7 +23,7 @@ Episode: TypeAlias = Trajectory | ArrayLike | tuple[ArrayLike, ArrayLike]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nominal:
-    """What a watchdog knows of its machine besides the fit.
+    """Facts of a machine that a watchdog has besides the fit.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Nominal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NominalData:
-    """What a watchdog is fitted on.
+    """Data that a watchdog is fitted on.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which of some recorded episodes are odd, and which of their rows and sensors.
+"""Find the odd ones among recorded episodes, with their odd rows and sensors.
 
 Each episode is judged by a detector that was fitted on others, and its largest statistic by theirs.
 Faults of the stream, such as gaps and frozen sensors, are looked for by themselves.
@@ -55,7 +55,7 @@ WINDOWS: Final = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScannedEpisode:
-    """What a scan says about one episode.
+    """Verdict of a scan on one episode.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class ScannedEpisode:
 
     @property
     def alarms(self) -> NDArray[np.bool_]:
-        """Whether a row is odd, shape (R,): in the intervals, or where a fault began."""
+        """True for each odd row, shape (R,): in the intervals, or where a fault began."""
         rows = np.zeros(len(self.scores), dtype=np.bool_)
         for start, stop in self.intervals:
             rows[start:stop] = True
@@ -119,14 +119,14 @@ class ScannedEpisode:
 
     @property
     def suspects(self) -> list[str]:
-        """What to look at first: names of sensors with a fault, else those with most evidence."""
+        """Names of sensors with a fault, else of those with most evidence, which come first."""
         faulty = list(dict.fromkeys(f.what for f in self.faults))
         named = [name for name, share in self.sensors.items() if share >= 1 / len(self.sensors)]
         return faulty or named[:3]
 
     @property
     def label(self) -> str:
-        """What the logs say about the episode, which nothing here is judged by."""
+        """Labels of the episode in its logs, by which nothing here is judged."""
         episode = self.episode
         parts = [episode.kind] if episode.kind else []
         parts += [f"{max(start, 0)} to {stop}" for start, stop in episode.intervals]
@@ -164,7 +164,7 @@ class ScannedEpisode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """What `scan_episodes` returns.
+    """Result of `scan_episodes`.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class Scan:
 
 
 Outcome = tuple[Floats, Explanation | None]
-"""What a detector says about one episode: scores, and an explanation if it gives any."""
+"""Answer of a detector about one episode: scores, and an explanation if it gives any."""
 
 
 def scan_episodes(
@@ -417,7 +417,7 @@ def _watched(watchdog: Watchdog, one: Episode, longest: float, trajectory: Traje
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """What makes a detector for one fit."""
+    """A function that makes a detector for one fit."""
 
     detector: str | Detector
     seed: int
@@ -499,7 +499,7 @@ class _Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Terms:
-    """How statistics are compared: with those of `reference`, by default of the other episodes.
+    """Comparison of statistics: with those of `reference`, by default of the other episodes.
 
     If `exact`, these are enough for p-values by rank. Where they are too few for any, what is above
     the limit is odd.

@@ -117,7 +117,7 @@ class GuaranteedAlarm:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What thresholds are found from: the largest statistics of nominal episodes.
+    """Basis of thresholds: the largest statistics of nominal episodes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the columns of logs hold, counted over blocks of rows: nothing here needs a whole file.
+"""Contents of the columns of logs, counted over blocks of rows: nothing here needs a whole file.
 
 A `ColumnFacts` takes the cells of a column block by block, of one recording after another. Its
 properties say what it looks like: a constant, a flag, a counter, an angle that wraps, values that
@@ -31,7 +31,7 @@ PERIODS: Final = (2 * math.pi, 360.0)
 
 @dataclass(slots=True)
 class ColumnFacts:
-    """What is in the cells of one column, of all recordings that have it.
+    """Contents of one column, over all recordings that have it.
 
     Parameters
     ----------
@@ -133,27 +133,27 @@ class ColumnFacts:
 
     @property
     def empty(self) -> bool:
-        """Whether no cell has a value."""
+        """True if no cell has a value."""
         return self.cells == self.missing
 
     @property
     def constant(self) -> bool:
-        """Whether all cells that have a value have the same."""
+        """True if all cells that have a value have the same."""
         return self.values is not None and len(self.values) == 1
 
     @property
     def flag(self) -> bool:
-        """Whether there are at least two values, and few."""
+        """True if there are at least two values, and few."""
         return self.values is not None and len(self.values) > 1 and self.cells > 2 * FEW
 
     @property
     def counter(self) -> bool:
-        """Whether the numbers rise from nearly every row to the next and never fall."""
+        """True if the numbers rise from nearly every row to the next and never fall."""
         return not self.text and self.steps > FEW and not self.falls and self.rises > self.steps / 2
 
     @property
     def set_point(self) -> bool:
-        """Whether it never changes within a recording, but does between recordings."""
+        """True if it never changes within a recording, but does between recordings."""
         several = self.recordings > 1 and (self.values is None or len(self.values) > 1)
         return several and not self.rises + self.falls and not self.text
 
@@ -171,7 +171,7 @@ class ColumnFacts:
 
     @property
     def coarse(self) -> bool:
-        """Whether float32 cannot tell its values: an import subtracts the training mean."""
+        """True if float32 cannot tell its values: an import subtracts the training mean."""
         if self.text or self.empty or self.constant or self.counter:
             return False
         return bool(is_coarse(self.numbers.spread, self.numbers.largest))

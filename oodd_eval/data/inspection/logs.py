@@ -1,4 +1,4 @@
-"""What is in logs: recordings, their columns and clocks, and files that are not as the others."""
+"""Contents of logs: recordings, their columns and clocks, and files that are not as the others."""
 
 import hashlib
 import re
@@ -36,7 +36,7 @@ _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
 
 @dataclass(frozen=True, slots=True)
 class RecordingFacts:
-    """What is in one recording.
+    """Contents of one recording.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class RecordingFacts:
 
 @dataclass(slots=True)
 class Inspection:
-    """What is in logs, and what columns may be.
+    """Contents of logs, and the roles that columns may have.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ _LAYOUTS: Final = {"onset", "seed", "terminated", "parameters", "discrete", "sta
 
 @dataclass(frozen=True, slots=True)
 class Sorting:
-    """Which files are nominal, and which have which anomaly."""
+    """Nominal files, and the files of each anomaly."""
 
     nominal: tuple[str, ...]
     anomalous: Mapping[str, tuple[str, ...]]

@@ -1,4 +1,4 @@
-"""What there is to know of logs before they are imported, in words and as a table."""
+"""A report on logs before they are imported, in words and as a table."""
 
 import json
 import re
@@ -94,7 +94,7 @@ _TEXTS: Final = {
     "few": "{episodes}: an alarm that at most 10 % of them raise needs 9 for calibration alone, "
     "one at 5 % 19 (twice as many for detectors whose alarm is a CUSUM){window}",
 }
-"""What advice says, by its topic; what is in braces comes from the logs."""
+"""Words of advice by topic; what is in braces comes from the logs."""
 
 
 def _say(topic: str, **values: Any) -> Advice:
@@ -284,7 +284,7 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
         f"{logs.path.name or logs.path}: {logs.form}, {counted(files, 'file(s)')}, "
         f"{counted(len(logs.recordings), 'episode(s)')} of {min(lengths)}"
     )
-    if len(lengths) > 1:
+    if min(lengths) < max(lengths):
         heading += f" to {max(lengths)} rows, {np.median(lengths):g} in the median"
     else:
         heading += " rows"

@@ -47,7 +47,7 @@ _Cells = Column | list[str]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a file of text is laid out.
+    """Layout of a file of text.
 
     Parameters
     ----------
