@@ -4,7 +4,7 @@
 
 A trained policy balances Gymnasium's CartPole. At an onset the dynamics change: the pole gets
 heavier and longer. The detector is fitted on nominal trajectories of the mini split, and the
-threshold chosen such that at most one nominal episode in ten raises an alarm. With ``--fit DIR``
+threshold chosen such that at most one nominal episode in ten raises an alarm. With ``--fit FILE``
 the watchdog is kept, and the next start takes no training; ``--monitor`` shows it at work.
 """
 
@@ -43,7 +43,7 @@ class Episode:
 
     @property
     def statistic(self):
-        """What is compared with the threshold."""
+        """Statistic that is compared with the threshold."""
         return np.array([reading.statistic for reading in self.readings])
 
 
@@ -181,7 +181,7 @@ def main(arguments=None):
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--onset", type=int, default=150)
-    parser.add_argument("--fit", type=Path, metavar="DIR", help="keep the watchdog here")
+    parser.add_argument("--fit", type=Path, metavar="FILE", help="keep the watchdog here")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
     parser.add_argument("--gif", type=Path, metavar="FILE", help="write a film")
     parser.add_argument("--monitor", action="store_true", help="show the readings as they come")

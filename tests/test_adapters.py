@@ -10,10 +10,11 @@ from sklearn.neighbors import KernelDensity
 
 from oodd_eval import Trajectory
 from oodd_eval.cli.main import main
-from oodd_eval.errors import ContractError, UnknownNameError, UsageError
+from oodd_eval.errors import ContractError, FittedStateError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
+from oodd_eval.plugins.state import pack
 from oodd_eval.results.directory import ResultsDirectory
 
 pytestmark = pytest.mark.slow
@@ -363,3 +364,28 @@ def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
     (entry,) = (tmp_path / "entries").iterdir()
     assert entry.name.startswith("forecast-their_models.mean-tiny")
     assert not [p for p in entry.rglob("*") if ":" in p.name]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["sklearn:IsolationForest", "pyod:ECOD", "forecast:sklearn.linear_model.Ridge",
+     "forecast:their_models.Dice", "forecast:their_models.Single"],
+)  # fmt: skip
+def test_a_state_is_the_rows_and_gives_the_same_scores(theirs, name):
+    detector = make(name, window=2, rows=150)
+    detector.fit(noise(*[60] * 4))
+    packed = pack(detector.state())
+    assert {n: a.dtype for n, a in packed.arrays.items() if a.dtype == np.float32} == {
+        "rows": np.float32, "later": np.float32,
+    }  # fmt: skip
+    assert packed.arrays["rows"].shape == (150, 6)
+    other = make(name, window=2, rows=150)
+    other.restore(packed.state())
+    x = noise(50, seed=7)[0]
+    np.testing.assert_array_equal(other.score(x), detector.score(x))
+    streamed = [[d.update(row) for row in x.observations] for d in (detector, other)]
+    np.testing.assert_array_equal(*streamed)
+    with pytest.raises(FittedStateError, match="'window': 2"):
+        make(name, window=3).restore(packed.state())
+    with pytest.raises(FittedStateError, match="'later'"):
+        make(name, window=2).restore({**packed.state(), "later": np.zeros((149, 3), np.float32)})

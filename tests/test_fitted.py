@@ -1,13 +1,13 @@
 """Fitted detectors are kept by content key: scoring again never fits again."""
 
-import json
-
+import numpy as np
 import pytest
 from helpers_plugins import install
 
 from oodd_eval.data.split import load_split
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.state import pack
 from oodd_eval.results.directory import FitStore, ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
@@ -16,7 +16,6 @@ from oodd_eval.scoring.runner import run
 pytestmark = pytest.mark.slow
 
 PLUGIN = """
-import json, os
 from pathlib import Path
 import numpy as np
 from dataclasses import dataclass
@@ -43,16 +42,16 @@ class Mean:
     def score(self, x):
         return self.factor * np.abs(x.observations.astype(np.float64).mean(axis=1) - self.mean)
 
-    def save(self, directory):
-        (directory / "mean.json").write_text(json.dumps(self.mean))
+    def state(self):
+        return {{"mean": self.mean}}
 
-    def load(self, directory):
+    def restore(self, state):
         with LOG.open("a") as log:
-            log.write("load\\n")
-        self.mean = json.loads((directory / "mean.json").read_text())
+            log.write("restore\\n")
+        self.mean = state["mean"]
 
 class Forgets(Mean):
-    def load(self, directory):
+    def restore(self, state):
         raise RuntimeError("forgot how")
 
 @hookimpl
@@ -61,7 +60,7 @@ def oodd_detectors():
     return [
         DetectorSpec("mean", Mean, "mean", **common),
         DetectorSpec("mean-too", Mean, "same fit", fit_name="mean", **common),
-        DetectorSpec("forgets", Forgets, "cannot load", **common),
+        DetectorSpec("forgets", Forgets, "cannot restore", **common),
     ]
 """
 
@@ -93,16 +92,16 @@ def test_scores_of_another_anomaly_need_no_second_fit(tiny_split, log, tmp_path)
     go(tiny_split, tmp_path / "out", anomalies=("iid",))
     assert log() == ["fit"]
     _, done = go(tiny_split, tmp_path / "out", anomalies=("iid", "drift"))
-    assert log() == ["load"]
+    assert log() == ["restore"]
     assert [r.status for r in done.records] == ["ok", "ok"]
 
 
 def test_what_the_fit_ignores_shares_it(tiny_split, log, tmp_path):
     _, done = go(tiny_split, tmp_path / "out", ("mean", "mean-too"), horizons=(1, 2), jobs=2)
-    assert sorted(log()) == ["fit", "load", "load", "load"]
+    assert sorted(log()) == ["fit", "restore", "restore", "restore"]
     assert {r.seconds_fit for r in done.records} == {done.records[0].seconds_fit}
     go(tiny_split, tmp_path / "out", parameters={"factor": 2.0})
-    assert log() == ["load"]
+    assert log() == ["restore"]
 
 
 @pytest.mark.parametrize(
@@ -115,12 +114,12 @@ def test_what_decides_the_fit_has_a_key_of_its_own(tiny_split, log, tmp_path, se
     assert log() == ["fit"]
 
 
-def test_a_loaded_fit_gives_the_same_records(tiny_split, log, tmp_path):
+def test_a_restored_fit_gives_the_same_records(tiny_split, log, tmp_path):
     go(tiny_split, tmp_path / "one", anomalies=("iid",))
-    _, loaded = go(tiny_split, tmp_path / "one")
+    _, restored = go(tiny_split, tmp_path / "one")
     _, fitted = go(tiny_split, tmp_path / "two")
-    assert log() == ["fit", "load", "fit"]
-    assert [r.metrics for r in loaded.records] == [r.metrics for r in fitted.records]
+    assert log() == ["fit", "restore", "fit"]
+    assert [r.metrics for r in restored.records] == [r.metrics for r in fitted.records]
 
 
 def test_fresh_fits_again_and_keeps_that(tiny_split, log, tmp_path):
@@ -128,59 +127,67 @@ def test_fresh_fits_again_and_keeps_that(tiny_split, log, tmp_path):
     go(tiny_split, tmp_path / "out", fresh=True)
     assert log() == ["fit", "fit"]
     go(tiny_split, tmp_path / "out", horizons=(3,))
-    assert log() == ["load"]
+    assert log() == ["restore"]
 
 
 def test_fresh_fits_once_what_the_units_of_a_run_share(tiny_split, log, tmp_path):
     go(tiny_split, tmp_path / "out", anomalies=("iid",))
     log()
     go(tiny_split, tmp_path / "out", anomalies=("iid",), horizons=(1, 2), fresh=True)
-    assert log() == ["fit", "load"]
+    assert log() == ["fit", "restore"]
 
 
-@pytest.mark.parametrize("damage", ["bytes", "index", "gone"])
-def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path, damage):
+def test_a_damaged_fit_is_made_again(tiny_split, log, tmp_path):
     plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
-    key = plan.units[0].fit_key
-    place = tmp_path / "out" / "fitted" / key
-    match damage:
-        case "bytes":
-            (place / "mean.json").write_text("123.0")
-        case "index":
-            (place / "fitted.json").write_text("{}")
-        case "gone":
-            (place / "mean.json").unlink()
+    file = tmp_path / "out" / "fitted" / f"{plan.units[0].fit_key}.npz"
+    content = file.read_bytes()
+    file.write_bytes(content.replace(b'"mean": ', b'"mean": 1', 1))
+    assert file.read_bytes() != content
     log()
     _, done = go(tiny_split, tmp_path / "out", anomalies=("drift",))
     assert log() == ["fit"]
     assert done.records[0].ok
 
 
-def test_a_detector_that_cannot_load_itself_is_fitted(tiny_split, log, tmp_path):
+def test_directories_of_an_earlier_version_are_left_alone_and_named(tiny_split, log, tmp_path):
+    plan, _ = go(tiny_split, tmp_path / "out", anomalies=("iid",))
+    fitted = tmp_path / "out" / "fitted"
+    (fitted / f"{plan.units[0].fit_key}.npz").unlink()
+    old = fitted / plan.units[0].fit_key
+    old.mkdir()
+    (old / "fitted.json").write_text("{}")
+    log()
+    results = ResultsDirectory(tmp_path / "out")
+    results.prepare()
+    assert [note for note in results.notes if old.name in note and "deleted" in note]
+    go(tiny_split, tmp_path / "out", anomalies=("drift",))
+    assert log() == ["fit"]
+    assert old.exists()
+
+
+def test_a_detector_that_cannot_restore_itself_is_fitted(tiny_split, log, tmp_path):
     go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",))
     _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("drift",))
     assert log() == ["fit", "fit"]
     assert done.records[0].ok
 
 
-def test_a_fit_of_the_same_run_that_cannot_be_loaded_is_made_again(tiny_split, log, tmp_path):
+def test_a_fit_of_the_same_run_that_cannot_be_restored_is_made_again(tiny_split, log, tmp_path):
     _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",), horizons=(1, 2),
                  fresh=True)  # fmt: skip
     assert log() == ["fit", "fit"]
     assert [r.status for r in done.records] == ["ok", "ok"]
 
 
-def test_a_store_keeps_whole_directories_only(tmp_path):
+def test_a_store_keeps_one_file_a_fit(tmp_path):
     store = FitStore(tmp_path / "fitted")
     assert store.find("k") is None
-    with store.filling() as room:
-        (room / "a").write_text("1")
-        store.keep("k", room, 2.5)
-    found = store.find("k")
-    assert found is not None
-    assert found.seconds_fit == 2.5
-    assert json.loads((found.path / "fitted.json").read_text())["files"].keys() == {"a"}
-    with store.filling() as room:
-        store.keep("empty", room, 1.0)
-    assert store.find("empty") is None
-    assert [p.name for p in store.path.iterdir()] == ["k"]
+    state = {"order": np.asfortranarray(np.ones((2, 3), np.float32)), "word": ["a", None, {"b": 1}]}
+    store.keep("k", pack(state), 2.5)
+    assert [p.name for p in store.path.iterdir()] == ["k.npz"]
+    kept = FitStore(store.path).find("k")
+    assert kept.seconds_fit == 2.5
+    assert kept.packed.state()["word"] == state["word"]
+    array = kept.packed.arrays["order"]
+    assert (array.dtype, array.shape, array.flags.f_contiguous) == (np.float32, (2, 3), True)
+    assert FitStore(store.path).find("k", fresh=True) is None

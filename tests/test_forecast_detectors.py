@@ -1,12 +1,10 @@
 """riqn, riqn-ms, n-riqn and npn: loss, learned distributions, rollouts, and the score contract."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 from helpers_forecast import Walker, one_step, slow_errors
-from helpers_saved import assert_zero_scales_are_refused
+from helpers_state import assert_zero_scales_are_refused
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms, riqn_r
 from oodd_torch import forecast
@@ -31,6 +29,7 @@ from scipy.stats import ks_2samp
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError
+from oodd_eval.plugins.state import pack
 
 pytestmark = pytest.mark.slow
 
@@ -363,13 +362,12 @@ def test_scheduled_sampling_is_on_beyond_one_step_and_off_at_one(name):
     assert losses(4) == losses(9) != true
 
 
-def test_riqn_r_scores_by_the_median_in_nominal_distances(tmp_path):
+def test_riqn_r_scores_by_the_median_in_nominal_distances():
     """One fit serves both; the score of nominal data is about 1."""
     episodes = waves(20)
     made = riqn(seed=0, horizon=1, **SMALL).fit(episodes)
-    made.save(tmp_path)
     other = riqn_r(seed=0, horizon=1, **SMALL)
-    other.load(tmp_path)
+    other.restore(made.state())
     x = waves(1, 40, seed=9)[0]
     rows = made.scale_(x)
     inputs = arrange([rows[:-1]], 1).expand(2, -1, -1, -1)
@@ -382,46 +380,42 @@ def test_riqn_r_scores_by_the_median_in_nominal_distances(tmp_path):
     )
 
 
-def test_one_fit_serves_other_horizons_beyond_one_and_samples(tmp_path):
+def test_one_fit_serves_other_horizons_beyond_one_and_samples():
     episode = waves(1, 30, seed=9)[0]
     other = {**SMALL, "samples": 3}
-    riqn(seed=1, horizon=2, **SMALL).fit(waves()).save(tmp_path)
-    loaded = riqn_ms(seed=1, horizon=4, **other)
-    loaded.load(tmp_path)
+    state = riqn(seed=1, horizon=2, **SMALL).fit(waves()).state()
+    restored = riqn_ms(seed=1, horizon=4, **other)
+    restored.restore(state)
     fresh = riqn_ms(seed=1, horizon=4, **other).fit(waves())
-    assert np.array_equal(loaded.score(episode), fresh.score(episode), equal_nan=True)
+    assert np.array_equal(restored.score(episode), fresh.score(episode), equal_nan=True)
     with pytest.raises(FittedStateError, match=r"'scheduled_sampling': 0\.5"):
-        riqn(seed=1, horizon=1, **SMALL).load(tmp_path)
+        riqn(seed=1, horizon=1, **SMALL).restore(state)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda d: (d / "weights.safetensors").write_bytes(b"x" * 40), "cannot be read"),
-        (lambda d: (d / "weights.safetensors").unlink(), "cannot be read"),
-        (lambda d: (d / "state.json").write_text("[]"), "holds"),
-        (lambda d: edit(d, kind="networks/0"), "'networks/0'"),
-        (lambda d: edit(d, settings={"members": 3}), "'members': 3"),
-        (lambda d: np.savez(d / "arrays.npz", mean=np.zeros(1), std=np.ones(1)), "cannot be read"),
-        (lambda d: np.savez(d / "arrays.npz", mean=np.zeros(1), std=np.ones(2)), "array 'std'"),
+        (lambda s: s.pop("weights.out"), "'weights.out' of the state is nothing"),
+        (lambda s: s.update({"weights.out": s["weights.out"][..., :1]}), "'weights.out'"),
+        (lambda s: s["weights.out"].fill(np.nan), "'weights.out'"),
+        (lambda s: s.update({"weights.out": s["weights.out"].astype(int)}), "'weights.out'"),
+        (lambda s: s.update(kind="networks/0"), "'networks/0'"),
+        (lambda s: s.update(kind=np.zeros(3)), "the state is of"),
+        (lambda s: s.update(settings={"members": 3}), "'members': 3"),
+        (lambda s: s.update(mean=np.zeros(1)), "array 'std'"),
     ],
 )
-def test_damaged_fits_are_refused(damage, message, tmp_path):
-    npn(seed=1, horizon=1, **SMALL).fit(waves()).save(tmp_path)
-    damage(tmp_path)
+def test_damaged_fits_are_refused(damage, message):
+    state = pack(npn(seed=1, horizon=1, **SMALL).fit(waves()).state()).state()
+    damage(state)
     with pytest.raises(FittedStateError, match=message):
-        npn(seed=1, horizon=1, **SMALL).load(tmp_path)
+        npn(seed=1, horizon=1, **SMALL).restore(state)
 
 
-def test_a_saved_scale_of_zero_is_refused(tmp_path):
+def test_a_scale_of_zero_is_refused():
     saved = npn(seed=1, horizon=1, **SMALL).fit(waves())
     fresh = npn(seed=1, horizon=1, **SMALL)
-    assert_zero_scales_are_refused(saved, fresh, tmp_path, ["std", "residual"])
-
-
-def edit(directory, **changes):
-    file = directory / "state.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    assert_zero_scales_are_refused(saved, fresh, ["std", "residual"])
 
 
 @pytest.mark.parametrize("trunk", ["shared", "per-feature"])

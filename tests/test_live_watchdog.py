@@ -8,10 +8,11 @@ import pytest
 from helpers_live import first_alarm, rows_of, walk
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
+from oodd_eval.errors import FittedStateError, OutputError, TrajectoryError, UsageError
 from oodd_eval.live import Reading, Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.state import PackedState, read_state, write_state
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +36,7 @@ class Size:
 
 
 class LiveSize(Size):
-    """The same row by row, and saved as nothing."""
+    """The same row by row, with nothing to hand over."""
 
     def reset(self): ...
 
@@ -43,9 +44,10 @@ class LiveSize(Size):
         self.action = action
         return float(np.abs(observation).astype(np.float64).sum())
 
-    def save(self, directory): ...
+    def state(self):
+        return {}
 
-    def load(self, directory): ...
+    def restore(self, state): ...
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +130,7 @@ def test_calibration_episodes_without_a_score_stay_below_every_threshold(tmp_pat
     watchdog.save(tmp_path / "kept")
     again = Watchdog.load(tmp_path / "kept").calibration
     assert again == watchdog.calibration
-    json.loads((tmp_path / "kept" / "watchdog.json").read_text(), parse_constant=pytest.fail)
+    json.loads(read_state(tmp_path / "kept").text, parse_constant=pytest.fail)
 
 
 def test_a_wider_range_leaves_rows_out_of_it_to_the_detector():
@@ -291,37 +293,111 @@ def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
         one.reset()
         for row in rows_of(walk(3, push=1.0)):
             assert other.update(*row) == one.update(*row)
-    assert not list(tmp_path.rglob("*.pkl"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["alpha", "endless"]
 
 
 def test_an_instance_is_loaded_into_another(tmp_path):
     watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.save(tmp_path / "kept")
-    with pytest.raises(UsageError, match=r"load\(directory, detector\) needs one"):
+    with pytest.raises(UsageError, match=r"load\(path, detector\) needs one"):
         Watchdog.load(tmp_path / "kept")
     assert Watchdog.load(tmp_path / "kept", LiveSize()).rule == watchdog.rule
-    with pytest.raises(UsageError, match="is not empty"):
+    watchdog.save(tmp_path / "kept")
+    with pytest.raises(OutputError, match="is a directory, as earlier versions"):
         watchdog.save(tmp_path)
+    with pytest.raises(FittedStateError, match="there is no saved fit"):
+        Watchdog.load(tmp_path / "absent")
 
 
-@pytest.mark.parametrize("threshold", [float("inf"), float("nan")])
-def test_a_saved_threshold_that_nothing_exceeds_is_refused(watchdog, tmp_path, threshold):
-    watchdog.save(tmp_path / "kept")
-    file = tmp_path / "kept" / "watchdog.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"threshold": threshold}))
-    with pytest.raises(FittedStateError, match="which nothing exceeds"):
+def rewritten(watchdog, file, change):
+    """Save a watchdog, and change its values or arrays behind its back."""
+    watchdog.save(file)
+    packed = read_state(file)
+    values, arrays = packed.values(), dict(packed.arrays)
+    change(values, arrays)
+    write_state(file, PackedState(arrays, json.dumps(values)))
+
+
+def set_value(*path, to):
+    def change(values, _):
+        for name in path[:-1]:
+            values = values[name]
+        values[path[-1]] = to
+
+    return change
+
+
+def drop(*path):
+    def change(values, arrays):
+        if path[0] in arrays:
+            del arrays[path[0]]
+            return
+        for name in path[:-1]:
+            values = values[name]
+        del values[path[-1]]
+
+    return change
+
+
+HARM = {
+    "another kind": set_value("kind", to="watchdog/2"),
+    "a kind that is a list": set_value("kind", to=[[]]),
+    "a kind that is an array": lambda values, arrays: arrays.update(kind=np.zeros(3)),
+    "an infinite threshold": set_value("watchdog", "threshold", to=1e999),
+    "a threshold of text": set_value("watchdog", "threshold", to="1"),
+    "no threshold": drop("watchdog", "threshold"),
+    "no sensors": drop("watchdog", "sensors"),
+    "a sensor less": set_value("watchdog", "sensors", to=["x", "y"]),
+    "a number of sensors": set_value("watchdog", "sensors", to=3),
+    "nothing made": set_value("watchdog", "made", to=None),
+    "a seed of text": set_value("watchdog", "made", "seed", to="one"),
+    "a list of parameters": set_value("watchdog", "made", "parameters", to=[1]),
+    "a text of baseline rows": set_value("watchdog", "made", "baseline", to="three"),
+    "a text calibration": set_value("watchdog", "calibration", to="x"),
+    "no calibration": drop("watchdog", "calibration"),
+    "a rate of text": set_value("watchdog", "settings", "rate", to="fast"),
+    "unknown settings": set_value("watchdog", "settings", to={}),
+    "no notes": drop("watchdog", "notes"),
+    "a number of notes": set_value("watchdog", "notes", to=1),
+    "values that are a list": set_value("watchdog", to=[]),
+    "a detector that is a list": set_value("detector", to=[1]),
+    "an empty detector": set_value("detector", to={}),
+    "another detector's settings": set_value("detector", "settings", to={}),
+    "no array of the detector": drop("detector.coefficients"),
+    "no limits": drop("mean"),
+    "no offsets": drop("offsets"),
+}
+
+
+@pytest.mark.parametrize("change", HARM.values(), ids=HARM)
+def test_a_damaged_watchdog_is_refused(watchdog, tmp_path, change):
+    rewritten(watchdog, tmp_path / "kept", change)
+    with pytest.raises(FittedStateError):
         Watchdog.load(tmp_path / "kept")
 
 
-@pytest.mark.parametrize("harm", ["threshold", "sensors", "made", "calibration", "notes", "{"])
-def test_a_damaged_watchdog_is_refused(watchdog, tmp_path, harm):
+def test_files_that_are_no_watchdogs_are_refused(watchdog, tmp_path):
+    with pytest.raises(FittedStateError, match="no plain file"):
+        Watchdog.load(tmp_path / "absent")
+    (tmp_path / "old").mkdir()
+    with pytest.raises(FittedStateError, match="fit again"):
+        Watchdog.load(tmp_path / "old")
     watchdog.save(tmp_path / "kept")
-    file = tmp_path / "kept" / "watchdog.json"
-    told = json.loads(file.read_text())
-    told.pop(harm, None)
-    file.write_text(harm if harm == "{" else json.dumps(told))
-    with pytest.raises(FittedStateError, match="cannot be read as a saved watchdog"):
-        Watchdog.load(tmp_path / "kept")
+    content = (tmp_path / "kept").read_bytes()
+    for size in (0, 4, len(content) // 2, len(content) - 1):
+        (tmp_path / "kept").write_bytes(content[:size])
+        with pytest.raises(FittedStateError):
+            Watchdog.load(tmp_path / "kept")
+
+
+def test_a_restore_that_raises_is_an_unreadable_file(tmp_path):
+    class Forgets(LiveSize):
+        def restore(self, state):
+            raise RuntimeError("forgot how")
+
+    Watchdog.fit(LiveSize(), WIDE, CALIBRATION).save(tmp_path / "kept")
+    with pytest.raises(FittedStateError, match="forgot how"):
+        Watchdog.load(tmp_path / "kept", Forgets())
 
 
 def test_readings_of_equal_rows_are_equal_also_undefined_ones(fitted):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers_saved import assert_zero_scales_are_refused
+from helpers_state import assert_zero_scales_are_refused
 from oodd_common.charts import distance, product, smooth, whitening
 from oodd_mewma import make_mewma, make_mewma_a
 from oodd_mewma.forecast import Moments, regressors
@@ -213,6 +213,6 @@ def test_a_live_chart_with_actions_asks_for_them():
         made.update(NOMINAL[0].observations[1])
 
 
-def test_a_saved_scale_of_zero_is_refused(tmp_path):
+def test_a_scale_of_zero_is_refused():
     scales = ["std", "action_scale", "residual_scale", "distance_std"]
-    assert_zero_scales_are_refused(make_mewma_a().fit(NOMINAL), make_mewma_a(), tmp_path, scales)
+    assert_zero_scales_are_refused(make_mewma_a().fit(NOMINAL), make_mewma_a(), scales)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers_saved import assert_zero_scales_are_refused
+from helpers_state import assert_zero_scales_are_refused
 from oodd_pe import make_pe
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.network import LEAST_SCALES, DensityNetworks, train
@@ -277,16 +277,15 @@ def test_a_weak_push_is_found_with_memory_and_with_actions(fitted):
     assert shift(fitted["pe-a"]) > 1.5 * max(shift(step), shift(fitted["pe"]))
 
 
-def test_the_step_row_is_the_chart_without_memory_of_the_same_fit(fitted, tmp_path):
-    fitted["pe-a"].save(tmp_path)
+def test_the_step_row_is_the_chart_without_memory_of_the_same_fit(fitted):
     step = make_pe("pe-step-a", **SMALL)
-    step.load(tmp_path)
+    step.restore(fitted["pe-a"].state())
     x = NOMINAL[0]
     charts = fitted["pe-a"].charts_
     first = charts.statistic(sums(charts, fitted["pe-a"]._evidence(x)))[0]
     np.testing.assert_array_equal(step.score(x)[1:], first)
 
 
-def test_a_saved_scale_of_zero_is_refused(fitted, tmp_path):
+def test_a_scale_of_zero_is_refused(fitted):
     scales = ["std", "action_scale", "error_scale", "input_scale"]
-    assert_zero_scales_are_refused(fitted["pe-a"], make_pe("pe-a", **SMALL), tmp_path, scales)
+    assert_zero_scales_are_refused(fitted["pe-a"], make_pe("pe-a", **SMALL), scales)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from oodd_trivial import Clock, Comb, Mahalanobis, Persistence, Random, Range
+from oodd_trivial import Clock, Comb, Mahalanobis, Manifold, Persistence, Random, Range
 from scipy.stats import binom, kstest
 
 from oodd_eval.data.split import load_split
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import FittedStateError
+from oodd_eval.errors import ContractError, FittedStateError
 from oodd_eval.metrics.auc import auc_contributions, auc_onset, auc_same_times
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.cusum import Standardization
@@ -158,7 +158,46 @@ def test_mahalanobis_leaves_out_what_did_not_vary():
     assert scores_of(still, [1, 1], [5, 5]) == [0, 0]
 
 
-def test_a_baseline_does_not_load_the_fit_of_another(tmp_path):
-    Range().fit([WALK]).save(tmp_path)
+def circle(seed, rows=400):
+    angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, size=rows)
+    return np.stack([np.cos(angles), np.sin(angles), np.full(rows, 3.0)], axis=1)
+
+
+def test_manifold_sees_what_leaves_a_surface_and_no_single_sensor_shows():
+    train = [episode(circle(7)), episode(circle(8))]
+    inside, point = Manifold().fit(train), [0.5, 0.5, 3]
+    nominal = inside.score(episode(circle(9)))
+    assert scores_of(inside, point)[0] > 50 * nominal.max()
+    plain = Mahalanobis().fit(train)
+    assert scores_of(plain, point)[0] < plain.score(episode(circle(9))).max()
+    # A constant sensor that moves is not seen.
+    assert scores_of(inside, [1, 0, 3]) == scores_of(inside, [1, 0, 4])
+
+
+def test_manifold_is_the_length_of_whitened_products():
+    train, detector = [episode(circle(7)), WALK], Manifold()
+    detector.fit(train)
+    rows = np.concatenate([x.observations for x in train]).astype(np.float64)
+    z = (rows - rows.mean(axis=0)) / rows.std(axis=0)
+
+    def products(x):
+        return np.array([*x, *(x[i] * x[j] for i in range(3) for j in range(i, 3))])
+
+    features = np.array([products(x) for x in z])
+    mean, std = features.mean(axis=0), features.std(axis=0)
+    covariance = np.corrcoef(features.T) + 1e-6 * np.eye(9)
+    row = WALK.observations[20].astype(np.float64)
+    far = (products((row - rows.mean(axis=0)) / rows.std(axis=0)) - mean) / std
+    expected = np.sqrt(far @ np.linalg.solve(covariance, far))
+    assert scores_of(detector, row)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_manifold_refuses_more_sensors_than_it_can_multiply():
+    rows = np.random.default_rng(0).normal(size=(70, 61))
+    with pytest.raises(ContractError, match="got 61 sensors"):
+        Manifold().fit([episode(rows)])
+
+
+def test_a_baseline_does_not_take_over_the_fit_of_another():
     with pytest.raises(FittedStateError, match="'range/1'"):
-        Mahalanobis().load(tmp_path)
+        Mahalanobis().restore(Range().fit([WALK]).state())

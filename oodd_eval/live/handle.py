@@ -86,7 +86,7 @@ class DetectorHandle:
         """Make a saved detector again, not fitted; one without a name is `detector`."""
         if not state["name"] and detector is None:
             raise UsageError(
-                "this watchdog was fitted with an instance: load(directory, detector) needs one "
+                "this watchdog was fitted with an instance: load(path, detector) needs one "
                 "with the same parameters"
             )
         return cls.make(

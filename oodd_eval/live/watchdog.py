@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import FittedStateError, PromiseWarning, UsageError
+from oodd_eval.errors import FittedStateError, OoddError, PromiseWarning, UsageError
 from oodd_eval.live.handle import DetectorHandle, streaming
 from oodd_eval.live.nominal import Episode, Nominal, NominalData
 from oodd_eval.live.reading import Reading, RunLength
@@ -30,11 +29,11 @@ from oodd_eval.metrics.alarms import (
 )
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.plugins.contract import Detector, StorableDetector
-from oodd_eval.plugins.state import load_state, save_state
+from oodd_eval.plugins.state import pack, read_state, write_state
 
-KIND: Final = "watchdog/2"
-FILE: Final = "watchdog.json"
-DETECTOR: Final = "detector"
+KIND: Final = "watchdog/3"
+DETECTOR: Final = "detector."
+"""Prefix of the detector's arrays among those of a saved watchdog."""
 
 _LISTED: Final = 5  # episodes and sensors that a message names
 
@@ -435,31 +434,28 @@ class Watchdog:
         other.reset()
         return other
 
-    def save(self, directory: str | Path) -> None:
-        """Write everything into a new or empty directory, as JSON and plain arrays.
+    def save(self, path: str | Path) -> None:
+        """Write everything into one file, which is whole or absent.
 
         Parameters
         ----------
-        directory : str or Path
-            The detector's own files go into a directory ``detector`` in it.
+        path : str or Path
+            Such as ``arm.npz``; a file of that name is replaced.
 
         Raises
         ------
         UsageError
-            When the detector cannot be saved, or the directory is not empty.
+            When the detector cannot hand over its fit.
+        OutputError
+            When the file cannot be written.
         """
-        path = Path(directory)
-        if not isinstance(self._handle.detector, StorableDetector):
-            what = f"{type(self._handle.detector).__name__} has no save and load"
+        detector = self._handle.detector
+        if not isinstance(detector, StorableDetector):
+            what = f"{type(detector).__name__} has no state and restore"
             raise UsageError(f"{what}: fit the watchdog anew where it is needed")
-        if path.exists() and any(path.iterdir()):
-            raise UsageError(f"{str(path)!r} is not empty: save into a new directory")
-        (path / DETECTOR).mkdir(parents=True)
-        self._handle.detector.save(path / DETECTOR)
-        arrays = {**self._limits.arrays(), **self._nominal.arrays()}
-        save_state(path, kind=KIND, settings={}, arrays=arrays)
+        fitted = pack(detector.state(), type(detector).__name__)
         scale, known = self.rule.standardization, self.calibration
-        state = {
+        values = {
             "made": self._handle.state,
             "sensors": self.sensors,
             "threshold": self.rule.threshold,
@@ -475,16 +471,24 @@ class Watchdog:
             "settings": asdict(self.settings),
             "notes": self.notes,
         }
-        (path / FILE).write_text(json.dumps(state, indent=1), encoding="utf-8")
+        whole = {
+            "kind": KIND,
+            "watchdog": values,
+            "detector": fitted.values(),
+            **self._limits.arrays(),
+            **self._nominal.arrays(),
+            **{DETECTOR + name: array for name, array in fitted.arrays.items()},
+        }
+        write_state(Path(path), pack(whole, "the watchdog"))
 
     @classmethod
-    def load(cls, directory: str | Path, detector: Detector | None = None) -> Self:
+    def load(cls, path: str | Path, detector: Detector | None = None) -> Self:
         """Return the watchdog that `save` wrote.
 
         Parameters
         ----------
-        directory : str or Path
-            The directory that `save` was called with.
+        path : str or Path
+            The file that `save` was called with.
         detector : Detector, optional
             An instance with the parameters of the saved one, where that had no name.
 
@@ -495,45 +499,65 @@ class Watchdog:
         Raises
         ------
         FittedStateError
-            When the files are missing or damaged.
+            When the file is missing, damaged, or of an earlier version.
         """
-        path = Path(directory)
-        arrays = load_state(path, kind=KIND, settings={})
-        limits = StreamLimits.of(arrays)
+        what = f"{str(path)!r} cannot be read as a saved watchdog"
+        whole = read_state(Path(path)).state()
+        if (kind := str(whole.get("kind"))) != KIND:
+            raise FittedStateError(f"{what}: it is {kind:.40}, expected {KIND}: fit it anew")
         try:
-            state = json.loads((path / FILE).read_text(encoding="utf-8"))
-            handle = DetectorHandle.from_state(state["made"], detector)
-            scale, threshold = state["standardization"], float(state["threshold"])
-            standardization = None if scale is None else Standardization(*map(float, scale))
-            known = state["calibration"]
-            length = state["run_length"]
-            run_length = None if length is None else RunLength(*map(float, length))
-            names = [str(name) for name in state["sensors"]]
-            nominal = Nominal.of(arrays, names, int(state["made"]["baseline"]))
-            settings = Settings(**state["settings"])
-            notes = [str(note) for note in state["notes"]]
-            calibration = known and Calibration(
-                handle.alarm,
-                standardization,
-                tuple(map(float, known["largest"])),
-                int(known["episodes"]),
-                bool(known["rolling"]),
-            )
-        except UsageError:
+            return cls._of(whole, detector)
+        except OoddError:
             raise
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            what = f"{str(path / FILE)!r} cannot be read as a saved watchdog"
-            raise FittedStateError(f"{what}: {type(error).__name__}: {error}") from None
-        if not math.isfinite(threshold):
-            raise FittedStateError(
-                f"{str(path / FILE)!r} has the threshold {threshold}, which nothing exceeds, "
-                "expected a finite one: fit the watchdog anew"
-            )
+        except Exception as error:  # the file may hold anything where values are expected
+            problem = f"{type(error).__name__}: {error}"
+            raise FittedStateError(f"{what}: {problem:.500}; fit it anew") from error
+
+    @classmethod
+    def _of(cls, whole: Mapping[str, Any], detector: Detector | None) -> Self:
+        """Return the watchdog that all this was written of."""
+        values, limits = whole["watchdog"], StreamLimits.of(whole)
+        handle = DetectorHandle.from_state(values["made"], detector)
+        names = [str(name) for name in values["sensors"]]
         if not isinstance(handle.detector, StorableDetector) or len(names) != len(limits.mean):
-            raise FittedStateError(f"{str(path)!r} does not fit {type(handle.detector).__name__}")
-        handle.detector.load(path / DETECTOR)
-        rule = GuaranteedAlarm(standardization, threshold)
+            raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
+        nominal = Nominal.of(whole, names, int(values["made"]["baseline"]))
+        scale, known, length = (
+            values[name] for name in ("standardization", "calibration", "run_length")
+        )
+        standardization = scale and Standardization(*map(_finite, scale))
+        calibration = known and Calibration(
+            handle.alarm,
+            standardization,
+            tuple(map(float, known["largest"])),
+            int(known["episodes"]),
+            bool(known["rolling"]),
+        )
+        chosen = values["settings"]
+        settings = Settings(
+            alpha=_finite(chosen["alpha"]),
+            confidence=chosen["confidence"] and _finite(chosen["confidence"]),
+            rate=chosen["rate"] and _finite(chosen["rate"]),
+            latch=bool(chosen["latch"]),
+            hold_off=int(chosen["hold_off"]),
+        )
+        rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
+        run_length = length and RunLength(*map(_finite, length))
+        arrays = {
+            name.removeprefix(DETECTOR): array
+            for name, array in whole.items()
+            if name.startswith(DETECTOR)
+        }
+        handle.detector.restore({**whole["detector"], **arrays})
+        notes = [str(note) for note in values["notes"]]
         return cls(handle, calibration, rule, limits, nominal, settings, run_length, notes)
+
+
+def _finite(value: float) -> float:
+    """Return a finite number as one; `ValueError` for another, which no threshold can be."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value} among what has to be finite")
+    return float(value)
 
 
 _Faults: TypeAlias = Mapping[int | str, StreamFault]

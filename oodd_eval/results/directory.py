@@ -5,7 +5,7 @@
     records.jsonl      one record a line
     scores/<key>.h5    all scores of one unit; also the cache from which a later run resumes
     scores/<key>.sha256  SHA-256 and size of that file, and of the one before it
-    fitted/<key>/      a fitted detector that could save itself, see `FitStore`
+    fitted/<key>.npz   the state of a fitted detector that can hand it over, see `FitStore`
     logs/<key>.txt     the end of the output of a failing detector, with its traceback
     report.md
 
@@ -18,11 +18,9 @@ import hashlib
 import io
 import json
 import math
-import os
-import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -32,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import files
-from oodd_eval.data.bounded import SCORES
-from oodd_eval.data.files import digests
+from oodd_eval.data.bounded import SCORES, open_plain
 from oodd_eval.data.stored import child
-from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.errors import FittedStateError, OutputError, ResultsError
+from oodd_eval.plugins.state import PackedState, read_state, write_state
 from oodd_eval.results.record import Record
 
 RECORDS: Final = "records.jsonl"
@@ -43,8 +41,6 @@ REPORT: Final = "report.md"
 
 WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next one may take
 
-
-ORDER_BITS: Final = 53  # random bits of the order of groups: a float64 keeps them exactly
 
 EXPLAINED: Final = ("sensors", "onsets")
 """Datasets of explanations beside ``scores``: by row, the sensor named first, and the onset."""
@@ -55,23 +51,20 @@ class ScoreFile:
     """Scores of one unit by part (``calibration``, ``test/nominal``, ``test/iid`` and so on).
 
     `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit, and
-    ``steps_scored``, the number of observations that ``seconds_score`` is for. `order` is the seed
-    of the order in which groups were scored; each part keeps its own where parts of several runs
-    lie in one file. `explained` are explanations by part, int32 arrays of shape (2, rows) with the
-    sensors named first and the onsets, of anomalous parts and detectors that explain only.
+    ``steps_scored``, the number of observations that ``seconds_score`` is for. `explained` are
+    explanations by part, int32 arrays of shape (2, rows) with the sensors named first and the
+    onsets, of anomalous parts and detectors that explain only.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
-    order: int | None = None
     explained: dict[str, list[NDArray[np.int32]]] = field(default_factory=dict)
 
 
 class _StoredPart(NamedTuple):
-    """One part of a score file: scores, order and explanations, None where it has none."""
+    """One part of a score file: scores and explanations, None where it has none."""
 
     sequences: list[NDArray[np.float64]]
-    order: float | None
     explained: list[NDArray[np.int32]] | None
 
 
@@ -108,6 +101,11 @@ class ResultsDirectory:
             files.remove_abandoned(self.path, name)
         for directory in (self.path / "scores", self.path / "logs", self.fits.path):
             files.remove_abandoned(directory)
+        if old := self.fits.leftovers():
+            self.notes.append(
+                f"{len(old)} directories in {str(self.fits.path)!r}, such as {old[0].name}, hold "
+                "fits of an earlier version and are not read: they can be deleted"
+            )
 
     def records(self) -> list[Record]:
         """Read all records, also compressed ones; `ResultsError` without any, or a damaged one.
@@ -162,16 +160,14 @@ class ResultsDirectory:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
-            parts[part] = _StoredPart(sequences, scores.order, scores.explained.get(part))
+            parts[part] = _StoredPart(sequences, scores.explained.get(part))
         path, digests = self._score_paths(key)
         # In memory: HDF5 crashes where it cannot write, as on a full disk.
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
             file.attrs.update(scores.cost)
             for part in sorted(parts):
-                group, (sequences, order, explained) = file.create_group(part), parts[part]
-                if order is not None:
-                    group.attrs["order"] = float(order)
+                group, (sequences, explained) = file.create_group(part), parts[part]
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
                 columns = {"scores": np.concatenate([np.zeros(0), *sequences])}
                 if explained is not None:
@@ -193,7 +189,7 @@ class ResultsDirectory:
         path, digests = self._score_paths(key)
         if digests.exists():
             sealed, size = _lines(digests), f" {path.stat().st_size}"
-            with path.open("rb") as file:
+            with open_plain(path) as file:
                 same = any(line.endswith(size) for line in sealed) and (
                     hashlib.file_digest(file, "sha256").hexdigest() + size in sealed
                 )
@@ -224,10 +220,10 @@ class ResultsDirectory:
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
         cost = {name: value for name, value in cost.items() if 0 <= value < np.inf}
-        return ScoreFile(parts, cost, explained=explained)
+        return ScoreFile(parts, cost, explained)
 
     def _all_parts(self, key: str) -> dict[str, _StoredPart]:
-        """Return all parts, each with the order in which groups were scored."""
+        """Return all parts."""
         parts: dict[str, _StoredPart] = {}
 
         def collect(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -251,16 +247,14 @@ def _stored_part(part: h5py.Group) -> _StoredPart:
     offsets = part["offsets"][:]
     # A part may have no trajectories.
     sequences = np.split(np.asarray(stored[:], np.float64), offsets[1:-1])[: len(offsets) - 1]
-    # Files of earlier versions have one order for all parts.
-    order = part.attrs.get("order", part.file.attrs.get("order"))
-    return _StoredPart(sequences, order, _explained(part))
+    return _StoredPart(sequences, _explained(part))
 
 
 def _lines(digests: Path) -> list[str]:
     """Return the lines of a file of digests, none where there is none."""
     if not digests.is_file():
         return []
-    with digests.open("rb") as file:
+    with open_plain(digests) as file:
         return file.read(1000).decode(errors="replace").splitlines()
 
 
@@ -335,10 +329,8 @@ def read_records(
     ResultsError
         When it cannot be read, naming the line.
     """
-    try:
-        lines = (text := files.read_text(file)).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
+    # Of the ends of lines that Python knows, JSON has this one alone.
+    lines = (text := files.read_text(file)).removesuffix("\n").split("\n")
     if notes is not None and len(lines) > 1 and not text.endswith("\n"):
         try:
             Record.from_json(lines[-1])
@@ -370,21 +362,18 @@ def _attempt(record: Record) -> tuple[object, ...]:
     return cell, record.split_digest, record.limit
 
 
-INDEX: Final = "fitted.json"
-
-MAX_BYTES: Final = 512 * 10**6  # A fitted detector larger than this is not kept
-_MAX_INDEX: Final = 10**7
-
-
 class KeptFit(NamedTuple):
-    """A fitted detector that can be loaded: its directory, and the seconds that its fit took."""
+    """A fit as data, and the seconds that it took."""
 
-    path: Path
+    packed: PackedState
     seconds_fit: float
 
 
 class FitStore:
-    """Fitted detectors below one directory."""
+    """Fits of detectors in one directory, each a file that is whole or absent.
+
+    Another run may fit again, and does where a file is missing or damaged.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -392,62 +381,43 @@ class FitStore:
 
     def has(self, key: str, *, fresh: bool = False) -> bool:
         """Tell whether a fit is kept under a key; when `fresh`, only one that this object kept."""
-        return (key in self._kept or not fresh) and (self.path / key / INDEX).is_file()
+        return (key in self._kept or not fresh) and self._file(key).is_file()
 
     def find(self, key: str, *, fresh: bool = False) -> KeptFit | None:
-        """Return the fit kept under a key; None when there is none, or its files were damaged."""
+        """Return the fit kept under a key; None when there is none, or its file is damaged."""
         if not self.has(key, fresh=fresh):
             return None
-        path = self.path / key
         try:
-            if _size(path) > MAX_BYTES or (path / INDEX).stat().st_size > _MAX_INDEX:
-                return None
-            index = json.loads((path / INDEX).read_text(encoding="utf-8"))
-            seconds = float(index["seconds_fit"])
-            if digests(path, without=INDEX) != index["files"] or not 0 <= seconds < math.inf:
-                return None
-            return KeptFit(path, seconds)
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            packed = read_state(self._file(key))
+            whole = json.loads(packed.text)
+            text, seconds = json.dumps(whole["state"]), float(whole["seconds_fit"])
+        except (
+            FittedStateError,
+            LookupError,
+            TypeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+        ):
             return None
+        if not 0 <= seconds < math.inf:
+            return None
+        return KeptFit(PackedState(packed.arrays, text), seconds)
 
-    @contextlib.contextmanager
-    def filling(self) -> Iterator[Path]:
-        """Yield an empty directory for a detector to save itself in; remove it afterwards.
-
-        `OutputError`: it cannot be made.
-        """
-        suffix = f".{os.getpid()}"
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            path = Path(tempfile.mkdtemp(prefix=".", suffix=suffix, dir=self.path))
-        except OSError as error:
-            raise OutputError(f"{str(self.path)!r} cannot be written to: {error}") from None
-        try:
-            yield path
-        finally:
-            shutil.rmtree(path, ignore_errors=True)
-
-    def keep(self, key: str, directory: Path, seconds_fit: float) -> None:
-        """Move a filled directory to its key; do nothing when it is empty or too large.
-
-        Nor where it cannot be written: without it, another run fits again.
-        """
-        # Another process may have been quicker; then its result, the same, stays.
-        with contextlib.suppress(OSError):
-            # Sizes first: a file may be said to hold more than there is room for.
-            if _size(directory) > MAX_BYTES or not (files := digests(directory, without=INDEX)):
-                return
-            index = {"files": files, "seconds_fit": seconds_fit}
-            (directory / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")
-            shutil.rmtree(self.path / key, ignore_errors=True)
-            directory.rename(self.path / key)
+    def keep(self, key: str, packed: PackedState, seconds_fit: float) -> None:
+        """Keep a fit under a key, where it can be written."""
+        text = f'{{"seconds_fit": {json.dumps(seconds_fit)}, "state": {packed.text}}}'
+        with contextlib.suppress(OutputError):
+            write_state(self._file(key), PackedState(packed.arrays, text))
             self._kept.add(key)
 
     def distrust(self, key: str) -> None:
-        """Treat the fit under a key as an earlier run's: it could not be loaded."""
+        """Treat the fit under a key as an earlier run's: it could not be restored."""
         self._kept.discard(key)
 
+    def leftovers(self) -> list[Path]:
+        """Return directories in which earlier versions kept fits, and which nothing reads."""
+        return sorted(p.parent for p in self.path.glob("*/fitted.json"))
 
-def _size(directory: Path) -> int:
-    """Return the bytes of all files below a directory."""
-    return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+    def _file(self, key: str) -> Path:
+        return self.path / f"{key}.npz"

@@ -1,12 +1,12 @@
 """What a run has kept, changed by somebody, cut short, or with no room left to write it."""
 
-import hashlib
-import json
 import os
 import resource
 import shutil
 import subprocess
 import sys
+import time
+import zipfile
 
 import h5py
 import numpy as np
@@ -16,8 +16,9 @@ from oodd_eval import load_split
 from oodd_eval.errors import ResultsError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.state import PackedState, pack, write_state
 from oodd_eval.results import directory as results_directory
-from oodd_eval.results.directory import INDEX, FitStore, ResultsDirectory, ScoreFile
+from oodd_eval.results.directory import FitStore, ResultsDirectory, ScoreFile
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
@@ -27,7 +28,7 @@ LENGTHS = {"calibration": [5, 6], "test/nominal": [7]}
 
 def some_scores(value=1.0):
     parts = {p: [np.full(n, value) for n in sizes] for p, sizes in LENGTHS.items()}
-    return ScoreFile(parts, {"seconds_fit": 1.0, "steps_scored": 18.0}, order=3)
+    return ScoreFile(parts, {"seconds_fit": 1.0, "steps_scored": 18.0})
 
 
 @pytest.fixture
@@ -238,61 +239,99 @@ def test_records_that_are_damaged_otherwise_are_refused(tiny_split, tmp_path, da
 @pytest.fixture
 def fit(tmp_path):
     store = FitStore(tmp_path / "fitted")
-    with store.filling() as place:
-        (place / "weights").write_text("1")
-        store.keep("key", place, 2.0)
+    store.keep("key", pack({"weights": np.arange(50.0), "words": ["one", {"two": 2}]}), 2.0)
     assert store.find("key").seconds_fit == 2.0
-    return store, tmp_path / "fitted" / "key"
+    return store, tmp_path / "fitted" / "key.npz"
 
 
-INDICES = {
-    "deep": b"[" * 10**5,
-    "no object": b"5",
-    "null": b"null",
-    "no seconds": b'{"files": {}}',
-    "infinite seconds": b'{"files": @, "seconds_fit": Infinity}',
-    "no number": b'{"files": @, "seconds_fit": NaN}',
-    "negative seconds": b'{"files": @, "seconds_fit": -1}',
-    "enormous seconds": b'{"files": @, "seconds_fit": 1' + b"0" * 400 + b"}",
-    "a list of seconds": b'{"files": @, "seconds_fit": [1]}',
-    "no UTF-8": b"\xff\xff",
-    "nothing": b"",
+WRAPPINGS = {
+    "deep": "[" * 10**5,
+    "no object": "5",
+    "null": "null",
+    "no seconds": '{"state": {}}',
+    "no state": '{"seconds_fit": 2.0}',
+    "infinite seconds": '{"state": {}, "seconds_fit": Infinity}',
+    "seconds beyond all floats": '{"state": {}, "seconds_fit": 1e999}',
+    "no number": '{"state": {}, "seconds_fit": NaN}',
+    "negative seconds": '{"state": {}, "seconds_fit": -1}',
+    "enormous seconds": '{"state": {}, "seconds_fit": 1' + "0" * 400 + "}",
+    "a list of seconds": '{"state": {}, "seconds_fit": [1]}',
+    "nothing": "",
 }
 
 
-@pytest.mark.parametrize("content", INDICES.values(), ids=INDICES)
-def test_a_damaged_index_of_a_kept_fit_is_no_fit(fit, content):
-    store, place = fit
-    files = json.dumps({"weights": hashlib.sha256(b"1").hexdigest()}).encode()
-    (place / INDEX).write_bytes(content.replace(b"@", files))
+@pytest.mark.parametrize("text", WRAPPINGS.values(), ids=WRAPPINGS)
+def test_a_kept_fit_with_other_words_is_no_fit(fit, text):
+    store, file = fit
+    write_state(file, PackedState({"weights": np.zeros(3)}, text))
     assert store.find("key") is None
 
 
-@pytest.mark.parametrize("name", ["weights", "another", INDEX])
-def test_the_size_of_a_kept_fit_is_looked_at_before_it_is_read(fit, name, monkeypatch):
-    store, place = fit
-    (place / name).touch()
-    os.truncate(place / name, 10**12)
-    monkeypatch.setattr(results_directory, "digests", lambda *_, **__: pytest.fail("it was read"))
+def test_a_fit_with_a_bit_changed_anywhere_is_the_one_that_was_kept_or_none(fit):
+    store, file = fit
+    whole, kept = file.read_bytes(), store.find("key")
+    gone = 0
+    for place in range(len(whole)):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        found = store.find("key")
+        gone += found is None
+        if found is not None:
+            assert (found.packed.text, found.seconds_fit) == (kept.packed.text, 2.0)
+            assert (
+                found.packed.arrays["weights"].tobytes() == kept.packed.arrays["weights"].tobytes()
+            )
+    assert gone > len(whole) / 2
+
+
+def test_a_fit_cut_short_anywhere_is_none(fit):
+    store, file = fit
+    whole = file.read_bytes()
+    for size in range(0, len(whole), 7):
+        file.write_bytes(whole[:size])
+        assert store.find("key") is None
+
+
+def a_bomb(file):
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in "abc":
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array_header_1_0(
+                    entry, {"descr": "|i1", "fortran_order": False, "shape": (3 * 10**8,)}
+                )
+                for _ in range(300):
+                    entry.write(bytes(10**6))
+
+
+def many_arrays(file):
+    with zipfile.ZipFile(file, "w") as archive:
+        for k in range(6000):
+            archive.writestr(f"{k}.npy", b"")
+
+
+def a_directory(file):
+    file.unlink()
+    file.mkdir()
+
+
+def a_pipe(file):
+    file.unlink()
+    os.mkfifo(file)
+
+
+@pytest.mark.parametrize("change", [sparse, a_bomb, many_arrays, a_directory, a_pipe])
+def test_what_is_no_fit_is_neither_read_nor_waited_for(fit, change):
+    store, file = fit
+    change(file)
+    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
     assert store.find("key") is None
+    assert time.monotonic() - start < 10
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 700_000
 
 
-def test_the_size_of_a_new_fit_is_looked_at_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(results_directory, "digests", lambda *_, **__: pytest.fail("it was read"))
+def test_a_fit_that_cannot_be_kept_is_done_without(tmp_path):
+    (tmp_path / "fitted").write_text("a file")
     store = FitStore(tmp_path / "fitted")
-    with store.filling() as place:
-        (place / "weights").touch()
-        os.truncate(place / "weights", 10**12)
-        store.keep("key", place, 1.0)
-    assert not store.has("key")
-
-
-def test_a_fit_that_cannot_be_kept_is_done_without(tmp_path, monkeypatch):
-    store = FitStore(tmp_path / "fitted")
-    with store.filling() as place:
-        (place / "weights").write_text("1")
-        (place / INDEX).mkdir()  # what is written there fails
-        store.keep("key", place, 1.0)
+    store.keep("key", pack({}), 1.0)
     assert not store.has("key")
 
 

@@ -10,11 +10,11 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.windows import WindowDetector
+from oodd_common.windows import StorableWindowDetector
 
 from oodd_adapters.windows import (
     Floats,
@@ -29,6 +29,7 @@ from oodd_eval import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import parameter
+from oodd_eval.plugins.state import Arrays, take
 
 PROBE: Final = 200
 """Rows on which a forecaster is tried."""
@@ -42,10 +43,12 @@ class AdapterParameters:
     rows: int = parameter(10_000, low=2, help="rows to train on, at most: a random choice of all")
 
 
-class _Adapter(WindowDetector):
+class _Adapter(StorableWindowDetector):
     """Common part of both kinds: windows, seeds, and one row at a time where it has to be.
 
-    The seed decides which rows are taken for training, and whatever the class draws.
+    The seed decides which rows are taken for training, and whatever the class draws. There is no
+    safe way to hand over an object of any class: the state is the rows that it was fitted on, and
+    restoring it fits another one on them, with the same seed.
 
     Parameters
     ----------
@@ -56,6 +59,10 @@ class _Adapter(WindowDetector):
     parameters
         How to feed it.
     """
+
+    kind: ClassVar[str] = "windows/1"
+    ahead: ClassVar[int]
+    """Rows from the end of a training window to the one that is predicted from it."""
 
     alone_: bool
     """True for a library that compares the rows of a call: it is given one row at a time."""
@@ -91,17 +98,36 @@ class _Adapter(WindowDetector):
         rows = window.reshape(1, -1).astype(np.float64)
         return float(self._scores(rows, now[None], alone=True)[0])
 
-    def _sample(
-        self, nominal: Sequence[Trajectory], scale: FeatureScale, ahead: int
-    ) -> tuple[Floats, Floats]:
-        return sample_windows(
+    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
+        scale = FeatureScale.fit(nominal)
+        rows, later = sample_windows(
             nominal,
             scale,
             length=self.window,
-            ahead=ahead,
+            ahead=self.ahead,
             limit=self.parameters.rows,
             seed=self.seed,
         )
+        self._take(rows, later)
+        return scale
+
+    def _take(self, rows: NDArray[np.float32], later: NDArray[np.float32]) -> None:
+        self.rows_, self.later_ = rows, later
+        self._fit_class(rows.astype(np.float64), later.astype(np.float64))
+
+    @abstractmethod
+    def _fit_class(self, rows: Floats, later: Floats) -> None:
+        """Fit the class on windows (N, W * D) and the rows (N, D) ahead of them."""
+
+    def _fitted_with(self) -> dict[str, Any]:
+        return {"name": self.name, "window": self.window, "ahead": self.ahead}
+
+    def _arrays(self) -> Arrays:
+        return {"rows": self.rows_, "later": self.later_}
+
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
+        rows = take(arrays, "rows", (None, self.window * sensors))
+        self._take(rows, take(arrays, "later", (len(rows), sensors)))
 
     def _seeded_call(self, function: Callable[[Floats], Any]) -> Function:
         def call(rows: Floats) -> Floats:
@@ -131,13 +157,13 @@ class OutlierDetector(_Adapter):
         1 if higher means more anomalous there, -1 if it is the reverse.
     """
 
+    ahead: ClassVar[int] = 0
+
     def __init__(self, *arguments: Any, method: str, sign: int, **more: Any) -> None:
         super().__init__(*arguments, **more, lag=0)
         self.method, self.sign = method, sign
 
-    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
-        scale = FeatureScale.fit(nominal)
-        rows, _ = self._sample(nominal, scale, ahead=0)
+    def _fit_class(self, rows: Floats, later: Floats) -> None:  # noqa: ARG002  nothing is predicted
         model = self.make()
         with seeded(self.seed):
             model.fit(rows)
@@ -154,7 +180,6 @@ class OutlierDetector(_Adapter):
 
         self.function_: Function = function
         self.alone_ = compares_rows(function, rows)
-        return scale
 
     def _scores(self, rows: Floats, now: NDArray[np.float32], *, alone: bool) -> Floats:  # noqa: ARG002  the newest part of the window
         return self.sign * row_by_row(self.function_, rows, alone=alone)
@@ -174,9 +199,9 @@ class ForecastDetector(_Adapter):
     out by trying. Whatever the horizon, it learns one-step transitions.
     """
 
-    def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
-        scale = FeatureScale.fit(nominal)
-        rows, later = self._sample(nominal, scale, ahead=1)
+    ahead: ClassVar[int] = 1
+
+    def _fit_class(self, rows: Floats, later: Floats) -> None:
         sensors = later.shape[1]
         differences = later - rows[:, :sensors]
         with seeded(self.seed):
@@ -188,7 +213,6 @@ class ForecastDetector(_Adapter):
                 predict = self._one_per_sensor(rows, differences)
         self.predict_: Function = self._seeded_call(predict)
         self.alone_ = compares_rows(self.predict_, rows)
-        return scale
 
     def _scores(self, rows: Floats, now: NDArray[np.float32], *, alone: bool) -> Floats:
         forecasts = row_by_row(self._forecast, rows, alone=alone)  # (N, D)

@@ -37,7 +37,7 @@ def sample_windows(
     ahead: int,
     limit: int,
     seed: int,
-) -> tuple[Floats, Floats]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return windows (N, W * D) of standardized trajectories, and the rows (N, D) `ahead` of them.
 
     Of more than `limit` windows a random choice is taken, which the seed decides.
@@ -51,8 +51,9 @@ def sample_windows(
     for x, start, count in zip(nominal, starts, counts, strict=True):
         times = chosen[(chosen >= start) & (chosen < start + count)] - start
         standardized = scale(x)
-        rows.append(flat_windows(standardized, times, length))
-        later.append(standardized[times + ahead].astype(np.float64))
+        width = length * standardized.shape[1]
+        rows.append(windows(standardized, times, length).reshape(len(times), width))
+        later.append(standardized[times + ahead])
     return np.concatenate(rows), np.concatenate(later)
 
 

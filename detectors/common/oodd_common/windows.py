@@ -1,7 +1,7 @@
 """Windows of observations, and bases of detectors that judge an observation by one.
 
 A subclass says how it learns and how it scores. Its base checks seed and horizon, refuses to score
-before `fit`, keeps the latest observations of a live episode, and saves and loads the fit.
+before `fit`, keeps the latest observations of a live episode, and hands over the fit.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from oodd_eval.errors import NotFittedError, TrajectoryError
 from oodd_eval.plugins.contract import Scores
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import checked, parameter
-from oodd_eval.plugins.state import Arrays, load_state, save_state
+from oodd_eval.plugins.state import Arrays, State, labelled, unlabelled
 
 Row = NDArray[np.float32]
 
@@ -203,37 +202,36 @@ class WindowDetector(ABC):
 
 
 class StorableWindowDetector(WindowDetector):
-    """A `WindowDetector` whose fit can be saved as plain files."""
+    """A `WindowDetector` whose fit can be handed over as arrays."""
 
     kind: ClassVar[str]
-    """Name of the saved state, with the version of its layout: ``"rf/1"``."""
+    """Name of the state, with the version of its layout: ``"rf/1"``."""
 
-    def save(self, directory: Path) -> None:
-        """Write the fit into a directory, as plain arrays and JSON."""
+    def state(self) -> dict[str, Any]:
+        """Return the fit as arrays, with the parameters that it goes with."""
         arrays = {**self._scale().arrays(), **self._arrays()}
-        save_state(directory, kind=self.kind, settings=self._saved_with(), arrays=arrays)
+        return labelled(self.kind, self._fitted_with(), arrays)
 
-    def load(self, directory: Path) -> None:
-        """Take over a fit that `save` wrote.
+    def restore(self, state: State) -> None:
+        """Take over a fit that `state` returned.
 
-        Raises `FittedStateError` when the files are missing or damaged, or of a detector with other
-        parameters.
+        Raises `FittedStateError` when it is damaged, or of a detector with other parameters.
         """
-        arrays = load_state(directory, kind=self.kind, settings=self._saved_with())
+        arrays = unlabelled(state, self.kind, self._fitted_with())
         scale = FeatureScale.of(arrays)
         self.scale_ = None
-        self._restore(arrays, len(scale.mean), directory)
+        self._restore(arrays, len(scale.mean))
         self.scale_ = scale
         self.reset()
 
     @abstractmethod
-    def _saved_with(self) -> dict[str, Any]:
-        """Return the parameters that a detector must share with a fit to load it; JSON values."""
+    def _fitted_with(self) -> dict[str, Any]:
+        """Return the parameters that a detector must share with a fit to take it over, as JSON."""
 
     @abstractmethod
     def _arrays(self) -> Arrays:
         """Return the fit as arrays of numbers, by name; the scale is not among them."""
 
     @abstractmethod
-    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:
-        """Take over the fit from the arrays that `save` wrote into the directory."""
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
+        """Take over the fit from arrays that `_arrays` returned."""

@@ -7,19 +7,15 @@ over networks, samples and sensors, in training standard deviations of the senso
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from oodd_common.windows import StorableWindowDetector
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError
 from oodd_eval.plugins.forecasting import FeatureScale, anomaly_scores
 from oodd_eval.plugins.state import Arrays, take
 from oodd_torch.device import resolved_device
@@ -48,7 +44,8 @@ RESIDUAL_SAMPLES: Final = 8
 BATCH: Final = 64
 """Trajectories that are scored together."""
 
-WEIGHTS: Final = "weights.safetensors"
+WEIGHTS: Final = "weights."
+"""Prefix of the names of weights in a state."""
 
 
 class NetworkDetector(StorableWindowDetector):
@@ -87,7 +84,7 @@ class NetworkDetector(StorableWindowDetector):
     are keyed by seed and time. Source: Danesh & Fern (2021), section 3 and appendix B.
     """
 
-    kind: ClassVar[str] = "networks/4"
+    kind: ClassVar[str] = "networks/5"
 
     def __init__(
         self,
@@ -211,13 +208,7 @@ class NetworkDetector(StorableWindowDetector):
         truth = torch.from_numpy(now).to(network.device).reshape(1, 1, -1)
         return float(self._forecaster.distance(samples, truth).mean())
 
-    def save(self, directory: Path) -> None:
-        """Write the fit into a directory: weights in safetensors, arrays and JSON."""
-        super().save(directory)
-        weights = {n: t.cpu().contiguous() for n, t in self.network_.state_dict().items()}
-        save_file(weights, directory / WEIGHTS)
-
-    def _saved_with(self) -> dict[str, Any]:
+    def _fitted_with(self) -> dict[str, Any]:
         return {
             "members": self.parameters.members,
             "scheduled_sampling": self.schedule.scheduled_sampling,
@@ -225,19 +216,19 @@ class NetworkDetector(StorableWindowDetector):
         }
 
     def _arrays(self) -> Arrays:
-        return {"history": np.array(self.history_), "residual": self.residual_}
+        weights = {WEIGHTS + n: t.cpu().numpy() for n, t in self.network_.state_dict().items()}
+        return {"history": np.array(self.history_), "residual": self.residual_, **weights}
 
-    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
         generators = [torch.Generator() for _ in range(self.parameters.members)]
         architecture = Architecture(features=sensors, **self.architecture)
         base = np.zeros((self.window * sensors + 1, sensors), np.float32)
         network = Ensemble(architecture, generators, base, np.ones(sensors, np.float32))
-        try:
-            network.load_state_dict(load_file(directory / WEIGHTS))
-        except (OSError, RuntimeError, SafetensorError) as error:
-            raise FittedStateError(
-                f"{str(directory / WEIGHTS)!r} cannot be read as weights of this detector: {error}"
-            ) from None
+        weights = {
+            n: torch.from_numpy(take(arrays, WEIGHTS + n, tuple(t.shape)))
+            for n, t in network.state_dict().items()
+        }
+        network.load_state_dict(weights)
         residual = take(arrays, "residual", (sensors,), "+").astype(np.float32)
         self._take(
             network.to(self.device), take(arrays, "history", (None, None)).tolist(), residual

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -67,7 +66,7 @@ class MewmaDetector(StorableWindowDetector):
     control chart", Technometrics 34 (1992).
     """
 
-    kind: ClassVar[str] = "mewma/3"
+    kind: ClassVar[str] = "mewma/4"
 
     def __init__(
         self, name: str, parameters: MewmaParameters, *, seed: int, horizon: int, actions: bool
@@ -189,7 +188,7 @@ class MewmaDetector(StorableWindowDetector):
     def _whitening(self, covariances: Floats) -> Floats:
         return np.stack([whitening(c, self.parameters.shrinkage) for c in covariances])
 
-    def _saved_with(self) -> dict[str, Any]:
+    def _fitted_with(self) -> dict[str, Any]:
         p = self.parameters
         return {
             "actions": self.actions,
@@ -204,12 +203,13 @@ class MewmaDetector(StorableWindowDetector):
             "action_scale": np.stack([self.action_scale_.mean, self.action_scale_.std]),
             "coefficients": self.coefficients_,
             "residual_scale": self.residual_scale_,
-            "whitening": self.whitening_,
+            # As they lie in memory, on which the last bit of a product depends.
+            "whitening": self.whitening_.swapaxes(1, 2),
             "distance_mean": self.distance_mean_,
             "distance_std": self.distance_std_,
         }
 
-    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
         d, w = sensors, len(self.parameters.weights)
         self.observation_scale_ = FeatureScale(
             take(arrays, "mean", (d,)), take(arrays, "std", (d,), "+")
@@ -218,7 +218,7 @@ class MewmaDetector(StorableWindowDetector):
         used = len(self.action_scale_.mean) if self.actions else 0
         self.coefficients_ = take(arrays, "coefficients", (self.window * (d + used) + 1, d))
         self.residual_scale_ = take(arrays, "residual_scale", (d,), "+")
-        self.whitening_ = take(arrays, "whitening", (w, d, d))
+        self.whitening_ = take(arrays, "whitening", (w, d, d)).swapaxes(1, 2)
         self.distance_mean_ = take(arrays, "distance_mean", (w, 1))
         self.distance_std_ = take(arrays, "distance_std", (w, 1), "+")
 

@@ -33,7 +33,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             summary="recurrent networks without quantiles, one forecast each",
             reference="Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
             parameters=NetworkParameters,
-            requires=("torch", "safetensors"),
+            requires=("torch",),
             extra="oodd-eval[reference]",
         )
     ]

@@ -7,7 +7,6 @@ residuals, each on the scale that was forecast for it, enter charts of several m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -81,7 +80,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
     Rigdon, "A multivariate exponentially weighted moving average control chart" (1992).
     """
 
-    kind: ClassVar[str] = "pe/1"
+    kind: ClassVar[str] = "pe/2"
 
     def __init__(
         self,
@@ -318,7 +317,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         shares: Floats = explained / explained.sum(axis=1, keepdims=True)
         return shares
 
-    def _saved_with(self) -> dict[str, Any]:
+    def _fitted_with(self) -> dict[str, Any]:
         p = self.parameters
         return {
             "actions": self.actions,
@@ -341,7 +340,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             **self.charts_.arrays(),
         }
 
-    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
         self.observation_scale_ = FeatureScale.of(arrays)
         self.action_scale_ = FeatureScale.of(arrays, "action_scale")
         self.varying_ = take(arrays, "varying", (None,), "i")

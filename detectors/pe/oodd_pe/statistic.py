@@ -149,7 +149,9 @@ class Charts:
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
-        return {name: np.asarray(getattr(self, name + "_")) for name in SHAPES}
+        arrays = {name: np.asarray(getattr(self, name + "_")) for name in SHAPES}
+        # As they lie in memory, on which the last bit of a product depends.
+        return arrays | {"roots": self.roots_.swapaxes(1, 2)}
 
     def restore(self, arrays: Arrays, sensors: int, constant: int) -> None:
         """Take over fitted charts of so many varying and constant sensors."""
@@ -157,6 +159,7 @@ class Charts:
         lengths = {"D": sensors, "W": w, "C": c, "R": c - 1, "1": 1, "B": None}
         for name, shape in SHAPES.items():
             setattr(self, name + "_", take(arrays, name, tuple(lengths[n] for n in shape)))
+        self.roots_ = self.roots_.swapaxes(1, 2)
         self._join()
 
 

@@ -7,7 +7,6 @@ over forests and sensors, in training standard deviations of the sensor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -131,7 +130,7 @@ class RandomForestDetector(StorableWindowDetector):
             total += np.abs(now - predicted).mean(axis=1)
         return total / len(self.members_)
 
-    def _saved_with(self) -> dict[str, Any]:
+    def _fitted_with(self) -> dict[str, Any]:
         return {"members": self.parameters.members, "window": self.window}
 
     def _arrays(self) -> Arrays:
@@ -141,7 +140,7 @@ class RandomForestDetector(StorableWindowDetector):
             for name, array in member.arrays().items()
         }
 
-    def _restore(self, arrays: Arrays, sensors: int, directory: Path) -> None:  # noqa: ARG002
+    def _restore(self, arrays: Arrays, sensors: int) -> None:
         self.members_ = [
             Forest.of(
                 {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"{i}.")},

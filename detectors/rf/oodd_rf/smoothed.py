@@ -20,8 +20,8 @@ class SmoothedForestDetector(RandomForestDetector):
 
     .. math:: z_h = s_h, \quad z_t = (1 - w) z_{t-1} + w s_t
 
-    with the weight w and the horizon h, before which z is undefined as s is. A saved fit of one is
-    a fit of the other.
+    with the weight w and the horizon h, before which z is undefined as s is. The state of one is
+    one of the other.
 
     Parameters
     ----------

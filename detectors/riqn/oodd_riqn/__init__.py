@@ -73,7 +73,7 @@ def oodd_detectors() -> list[DetectorSpec]:
     """Offer the four detectors of this package."""
     common: dict[str, Any] = {
         "reference": "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
-        "requires": ("torch", "safetensors"),
+        "requires": ("torch",),
         "extra": "oodd-eval[reference]",
     }
     return [

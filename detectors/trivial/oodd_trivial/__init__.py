@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import blake2b
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeAlias
 
-from oodd_eval.errors import NotFittedError
+from oodd_eval.errors import ContractError, NotFittedError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import DetectorSpec, Scores
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins.forecasting import FeatureScale
-    from oodd_eval.plugins.state import Arrays
+    from oodd_eval.plugins.state import Arrays, State
 
 Row: TypeAlias = "NDArray[np.float32]"
 
@@ -34,6 +33,15 @@ DISCRETE: Final = 8
 
 LEAST_VARIANCE: Final = 1e-10
 """Share of the largest variance below which a direction does not vary in training."""
+
+LEAST_SPREAD: Final = 1e-6
+"""A product of sensors with less than this does not vary in training."""
+
+RIDGE: Final = 1e-6
+"""Variance that is added in every direction, as a share of that of one feature."""
+
+MOST_SENSORS: Final = 60
+"""Sensors of which all products are taken, 1 890 features with themselves."""
 
 
 class _Baseline(ABC):
@@ -103,7 +111,7 @@ class Comb(_Baseline):
 
 
 class _Scaled(_Baseline):
-    """A detector that learns mean and spread of every sensor, and saves what it learns.
+    """A detector that learns mean and spread of every sensor, and can hand over what it learns.
 
     The spread is the standard deviation in training, 1 where that is below 1e-6.
     """
@@ -121,19 +129,18 @@ class _Scaled(_Baseline):
         self.scale_ = scale
         return super().fit(nominal)
 
-    def save(self, directory: Path) -> None:
-        """Write the fit into a directory."""
-        from oodd_eval.plugins.state import save_state
+    def state(self) -> dict[str, Any]:
+        """Return the fit as arrays."""
+        from oodd_eval.plugins.state import labelled
 
-        arrays = {**self._scale().arrays(), **self._arrays()}
-        save_state(directory, kind=f"{self.name}/1", settings={}, arrays=arrays)
+        return labelled(f"{self.name}/1", {}, {**self._scale().arrays(), **self._arrays()})
 
-    def load(self, directory: Path) -> None:
-        """Take over what `save` wrote."""
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned; `FittedStateError` for another state."""
         from oodd_eval.plugins.forecasting import FeatureScale
-        from oodd_eval.plugins.state import load_state
+        from oodd_eval.plugins.state import unlabelled
 
-        arrays = load_state(directory, kind=f"{self.name}/1", settings={})
+        arrays = unlabelled(state, f"{self.name}/1", {})
         scale = FeatureScale.of(arrays)
         self.scale_ = None
         self._restore(arrays, len(scale.mean))
@@ -296,6 +303,88 @@ class Mahalanobis(_Scaled):
         self.root_ = take(arrays, "root", (sensors, None))
 
 
+class Manifold(_Scaled):
+    r"""`Mahalanobis` of a row's sensors and all their products: surfaces that rows stay on.
+
+    With z the standardized sensors and f those of z_i, z_i z_j that vary in training, standardized
+    too, and with eigenvalues w_k and eigenvectors v_k of the correlations of f in training,
+    ``s_t = sqrt(sum_k (v_k' f)^2 / (w_k + 1e-6))``. Directions in which training rows hardly vary
+    are equations that they obey, such as cos^2 + sin^2 = 1; what is added to w_k keeps rounding
+    from looking like a fault. Sensors that are constant in training are left out.
+    """
+
+    name = "manifold"
+
+    def score(self, trajectory: Trajectory) -> Scores:
+        """Return the score of every observation."""
+        self._scale().must_fit(trajectory)
+        return self._distances(trajectory.observations)
+
+    def _score(self, t: int, row: Row) -> float:  # noqa: ARG002
+        return float(self._distances(self._scale().checked(row)[None])[0])
+
+    def _distances(self, rows: Row) -> Scores:
+        import numpy as np
+
+        features = (self._products(rows) - self.centre_) / self.spread_
+        # One row at a time: the bits of a product of matrices depend on the number of rows.
+        lengths: Scores = np.array([np.linalg.norm(row @ self.root_) for row in features])
+        return lengths
+
+    def _products(self, rows: Row, scale: FeatureScale | None = None) -> NDArray[np.float64]:
+        """Return sensors, and products of pairs of them: shape (N, features)."""
+        import numpy as np
+
+        scale = scale or self._scale()
+        z = (rows - scale.mean) / scale.std
+        first, second = np.triu_indices(z.shape[1])
+        return np.concatenate([z, z[:, first] * z[:, second]], axis=1)[:, self.varies_]
+
+    def _learn(self, nominal: Sequence[Trajectory], scale: FeatureScale) -> None:
+        import numpy as np
+
+        sensors = len(scale.mean)
+        if sensors > MOST_SENSORS:
+            raise ContractError(
+                f"detector 'manifold' has the products of all pairs of sensors, got {sensors} "
+                f"sensors, expected at most {MOST_SENSORS}: use 'mahalanobis'"
+            )
+        rows = np.concatenate([x.observations for x in nominal])
+        moving = np.ptp(rows, axis=0) > 0
+        first, second = np.triu_indices(sensors)
+        self.varies_ = np.concatenate([moving, moving[first] & moving[second]])
+        blocks = [self._products(x.observations, scale) for x in nominal]
+        n = len(rows)
+        self.centre_ = sum(block.sum(axis=0) for block in blocks) / n
+        spread = np.sqrt(sum(((block - self.centre_) ** 2).sum(axis=0) for block in blocks) / n)
+        # The square of a sensor with two values of one size does not vary, but for rounding.
+        self.spread_ = np.where(spread < LEAST_SPREAD, 1.0, spread)
+        covariance = np.zeros((len(spread), len(spread)))
+        for block in blocks:
+            features = (block - self.centre_) / self.spread_
+            covariance += features.T @ features / n
+        values, vectors = np.linalg.eigh(covariance)
+        self.root_ = vectors / np.sqrt(np.maximum(values, 0.0) + RIDGE)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {
+            "varies": self.varies_.astype("int64"),
+            "centre": self.centre_,
+            "spread": self.spread_,
+            "root": self.root_,
+        }
+
+    def _restore(self, arrays: Mapping[str, NDArray[Any]], sensors: int) -> None:
+        from oodd_eval.plugins.state import take
+
+        n = sensors + sensors * (sensors + 1) // 2
+        self.varies_ = take(arrays, "varies", (n,), "i").astype(bool)
+        features = int(self.varies_.sum())
+        self.centre_ = take(arrays, "centre", (features,))
+        self.spread_ = take(arrays, "spread", (features,), "+")
+        self.root_ = take(arrays, "root", (features, features))
+
+
 def _standing(rows: Row) -> NDArray[np.int64]:
     """Return for how many rows in a row each value has been the same, itself included: (N, D)."""
     import numpy as np
@@ -320,4 +409,5 @@ def oodd_detectors() -> list[DetectorSpec]:
         DetectorSpec("comb", Comb, "a spike every 100 rows: matched AUC 0.5", **known),
         DetectorSpec("range", Range, unseen, **known),
         DetectorSpec("mahalanobis", Mahalanobis, "distance of single rows from the mean", **known),
+        DetectorSpec("manifold", Manifold, "mahalanobis of sensors and their products", **known),
     ]
