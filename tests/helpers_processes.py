@@ -8,14 +8,14 @@ import time
 import psutil
 
 SLOW = """
-def reached(point, harness):
+def reached(point):
     \"\"\"Kill the harness the n-th time that this point is reached, if KILL_AT is point:n.\"\"\"
     wanted, _, times = os.environ.get("KILL_AT", "").partition(":")
     if point == wanted:
         with open(os.environ["FITS"] + ".points", "a") as log:
             log.write("x")
             if log.tell() == int(times):
-                os.kill(harness, signal.SIGKILL)
+                os.kill(int(os.environ["HARNESS"]), signal.SIGKILL)
 
 class Slow(Good):
     \"\"\"Persistence that takes its time and writes a line per fit, with its process id.
@@ -27,47 +27,45 @@ class Slow(Good):
     def fit(self, nominal):
         with open(os.environ["FITS"], "a") as log:
             log.write(f"{os.getpid()} {nominal[0].observation_dim} {self.horizon} {self.seed}\\n")
-        self.harness = os.getppid()
-        reached("fit", self.harness)
+        reached("fit")
         time.sleep(3600 if os.environ.get("ENDLESS") == str(self.seed) else self.pause)
     def score(self, x):
-        reached("score", self.harness)  # the parent of a fork is the worker
+        reached("score")
         time.sleep(self.pause / 100)
         return super().score(x) + self.seed
 
 class Keeps(Slow):
-    \"\"\"The same with a fit that is slow to save, and shared by all horizons.\"\"\"
+    \"\"\"The same with a state that is slow to tell, and shared by all horizons.\"\"\"
     def fit(self, nominal):
         self.horizon = "any"
         super().fit(nominal)
         self.dimension = nominal[0].observation_dim
-    def save(self, directory):
-        for name in ("one", "two"):
-            (directory / name).write_text(str(self.dimension))
-            reached("save", os.getppid())
-            time.sleep(self.pause)
-    def load(self, directory):
-        self.harness = os.getppid()
-        reached("load", self.harness)
-        self.dimension = int((directory / "one").read_text())
+    def state(self):
+        reached("state")
+        time.sleep(self.pause)
+        return {"dimension": self.dimension}
+    def restore(self, state):
+        reached("restore")
+        self.dimension = state["dimension"]
 
 @hookimpl
 def oodd_run_started():
+    os.environ["HARNESS"] = str(os.getpid())
     def moving(move):
         def moved(*paths, **settings):
-            reached("move", os.getpid())
+            reached("move")
             move(*paths, **settings)
-            reached("moved", os.getpid())
+            reached("moved")
         return moved
     os.replace, os.rename = moving(os.replace), moving(os.rename)
 
 @hookimpl
 def oodd_cell_finished():
-    reached("cell", os.getpid())
+    reached("cell")
 
 @hookimpl
 def oodd_run_finished():
-    reached("finished", os.getpid())
+    reached("finished")
 
 @hookimpl
 def oodd_detectors():

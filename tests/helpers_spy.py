@@ -105,12 +105,12 @@ class Spy:
         note("fit", nominal)
         look("fit")
 
-    def save(self, directory):
-        (directory / "fit").write_text("1")
-        look("save")
+    def state(self):
+        look("state")
+        return {"fit": 1}
 
-    def load(self, directory):
-        look("load")
+    def restore(self, state):
+        look("restore")
 
     def score(self, x):
         return np.abs(x.observations).sum(axis=1).astype(np.float64)

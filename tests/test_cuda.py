@@ -7,6 +7,7 @@ import pytest
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.state import pack
 
 torch = pytest.importorskip("torch")
 
@@ -33,14 +34,14 @@ def visible(name, trajectories):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_fit_made_on_the_device_scores_alike_there_and_on_the_processor(name, hopper, tmp_path):
+def test_a_fit_made_on_the_device_scores_alike_there_and_on_the_processor(name, hopper):
     detector = unfitted(name, "cuda")
     detector.fit(visible(name, hopper.train[:8]))
     episodes = visible(name, hopper.twins[:3])
     scores = [detector.score(x) for x in episodes]
-    detector.save(tmp_path)
+    state = pack(detector.state()).state()
     processor = unfitted(name, "cpu")
-    processor.load(tmp_path)
+    processor.restore(state)
     for episode, score in zip(episodes, scores, strict=True):
         np.testing.assert_allclose(processor.score(episode), score, rtol=5e-3, atol=5e-3)
 

@@ -6,6 +6,7 @@ Each ends in a named state, the cells of the others are finished, and nothing is
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -56,10 +57,10 @@ QUICK = {
                 "invalid", r"returned nan at t = \d+ of cartpole/"),
     "ahead": ("""
         def score(self, x): return np.convolve(super().score(x), np.ones(9) / 9, mode="same")""",
-              "invalid", r"is not causal: .* at t = \d+ it is"),
+              "invalid", r"not those of its twin"),
     "lazy": ("""
         def score_many(self, xs):
-            return (self.score(x) if i < 3 else 1 / 0 for i, x in enumerate(xs))""",
+            return (self.score(x) if i < 1 else 1 / 0 for i, x in enumerate(xs))""",
              "error", "ZeroDivisionError"),
     "mapped": ("""
         def score(self, x):
@@ -132,11 +133,23 @@ QUICK = {
             x.observations.flags.writeable = True; x.observations[:] = np.nan
             return scores""",
                   "ok", ""),
-    "unsaves": ("""
-        def save(self, directory):
-            (directory / "fit").write_text("1"); shutil.rmtree(directory.parent)
-        def load(self, directory): raise RuntimeError("there is nothing")""",
-                "ok", ""),
+    "stateless": ("""
+        def state(self): return {"x": object(), **dict.fromkeys(map(str, range(9999)))}
+        def restore(self, state): raise RuntimeError("there is nothing")""",
+                  "ok", ""),
+    "realtime": ("def score(self, x): os.kill(os.getpid(), 40)",
+                 "error", "the worker was killed by signal 40 while scoring"),
+    "exits": ("def score(self, x): os._exit(200)",
+              "error", "the worker ended with exit code 200 while scoring"),
+    "unguarded": ("""
+        def fit(self, nominal): os.kill(os.getppid(), signal.SIGKILL); time.sleep(600)""",
+                  "error", "the worker was killed by SIGKILL while fitting, not by oodd-eval"),
+    "unguardedscores": ("""
+        def fit(self, nominal): self.guard = os.getppid()
+        def score(self, x): os.kill(self.guard, signal.SIGKILL); time.sleep(600)""",
+                        "error", "the worker was killed by SIGKILL while scoring, not by"),
+    "scored": ("def score(self, x): os._exit(93)",
+               "error", "the worker closed its pipe while scoring, without a result"),
     "leaves": ("""
         def fit(self, nominal):
             subprocess.Popen(["sleep", "600"], start_new_session=True)""",
@@ -223,6 +236,27 @@ def hostile(tiny_split, tmp_path_factory):
     hanging = run(HANGING, "--timeout", LIMIT, "--jobs", "12")
     time.sleep(0.2)
     return quick, hanging, left_running()
+
+
+@pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
+def test_a_hostile_plugin_in_a_sandbox_ends_in_its_state_too(tiny_split, tmp_path, monkeypatch):
+    ends = {"realtime": "", "exits": "", "segfault": "", "sysexit": "", "stateless": "ok"}
+    for name in ends:
+        code = f"class Hostile(Base):\n{indented(QUICK[name][0])}\n"
+        install(monkeypatch, tmp_path / "plugins", name, code, header=HEADER)
+    done = subprocess.run(
+        [sys.executable, "-m", "oodd_eval", "run", "--detector", ",".join(ends), "--env",
+         "cartpole", "--anomaly", "iid", "--split", tiny_split, "--output", tmp_path / "out",
+         "--sandbox"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "plugins")},
+        capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    lines = (tmp_path / "out" / "records.jsonl").read_text().splitlines()
+    for record in map(json.loads, lines):
+        _, status, reason = QUICK[record["detector"]]
+        assert record["status"] == status, record["reason"]
+        assert re.search(reason, record["reason"])
 
 
 def indented(body):

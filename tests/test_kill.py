@@ -13,7 +13,7 @@ from oodd_eval.results.directory import FitStore, ResultsDirectory
 pytestmark = pytest.mark.slow
 
 POINTS = (
-    "fit:1", "score:5", "save:1", "move:1", "moved:1", "load:1", "cell:1", "move:4",
+    "fit:1", "score:5", "state:1", "move:1", "moved:1", "restore:1", "cell:1", "move:4",
     "finished:1",
 )  # fmt: skip
 """Points in a run at which the harness is killed, when they are reached so many times.
@@ -122,7 +122,7 @@ def test_killed_at_chosen_points_it_ends_like_an_uninterrupted_run(tiny_split, p
         names = [{f.name for f in (place / part).iterdir()} for place in (whole, killed)]
         assert names[0] == names[1]
     for fit in (killed / "fitted").iterdir():
-        assert FitStore(killed / "fitted").find(fit.name), "a fit is not whole"
+        assert FitStore(killed / "fitted").find(fit.stem), "a fit is not whole"
 
 
 def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, plugin, tmp_path):

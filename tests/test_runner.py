@@ -2,26 +2,20 @@
 
 import dataclasses
 import json
-import os
 import re
 import textwrap
-from collections import deque
-from concurrent.futures import Future
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from helpers_plugins import install
 from oodd_trivial import Clock
 
 from oodd_eval import evaluate, load_split
-from oodd_eval.errors import ContractError, OutputError, ResultsError, UsageError
+from oodd_eval.errors import ContractError, OutputError, ResultsError, SplitError, UsageError
 from oodd_eval.names import expression, memory_bytes, seconds, select, whole_numbers
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation import Channel
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.supervisor import _send
+from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.scoring.executors import RunSettings
@@ -280,12 +274,29 @@ def test_an_error_of_reading_data_is_kept_for_the_caller():
         yield from ()
         raise OSError("disk gone")
 
-    with Path(os.devnull).open("wb") as file, pytest.raises(OSError, match="disk gone"):
-        _send(_child(os.dup(file.fileno())), {"train": 0}, broken(), [], [], Future(), deque())
+    request = {"plugin": "trivial", "detector": "clock", "parameters": {}, "seed": 0, "horizon": 1}
+    with pytest.raises(OSError, match="disk gone"):
+        run_isolated(request, [], [broken()], limits=Limits(60), stop=lambda: False)
 
 
-def _child(descriptor):
-    return SimpleNamespace(channel=Channel(descriptor), hang_up=lambda: None)
+@pytest.mark.parametrize(("error", "ends"), [(SplitError("gone"), True), (KeyError("x"), False)])
+def test_whatever_a_unit_raises_stays_in_it_but_for_what_the_user_can_mend(
+    tiny_split, monkeypatch, error, ends
+):
+    def raising(request, *_, **__):
+        if request["detector"] == "clock":
+            raise error
+        return Outcome("oom", "as ever")
+
+    monkeypatch.setattr("oodd_eval.scoring.unit.run_isolated", raising)
+    if ends:
+        with pytest.raises(SplitError):
+            run_tiny(tiny_split, ["clock", "random"])
+        return
+    found = {
+        (r.detector, r.status, r.reason) for r in run_tiny(tiny_split, ["clock", "random"]).records
+    }
+    assert found == {("clock", "error", "oodd-eval: KeyError: 'x'"), ("random", "oom", "as ever")}
 
 
 # Selection

@@ -8,7 +8,6 @@ import importlib.metadata
 import os
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,8 @@ from hypothesis import strategies as st
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.parts import parts_of
-from oodd_eval.plugins.contract import PROBES
-from oodd_eval.plugins.isolation import child, supervisor
-from oodd_eval.scoring.unit import groups
+from oodd_eval.plugins.isolation import child
+from oodd_eval.scoring import unit
 
 pytestmark = [
     pytest.mark.slow,
@@ -124,7 +122,7 @@ def findings(secrets, tmp_path_factory):
 
 def test_a_worker_holds_no_secret_anywhere(findings, secrets):
     assert findings.whens == [
-        "made", "fit", "save", "score", "score", "made", "load", "score", "score",
+        "made", "fit", "state", "score", "score", "made", "restore", "score", "score",
     ]  # fmt: skip
     assert secrets.seen_in(findings) == {}
     # The spy is no fool: it sees what it was told, in all places where it looked.
@@ -133,7 +131,7 @@ def test_a_worker_holds_no_secret_anywhere(findings, secrets):
         [SEED],
         {"a trajectory": secrets.twin[:50].tobytes()},
     )
-    assert told["frames"] >= {"spy", "oodd-results", SEED}
+    assert told["frames"] >= {"spy", SEED}
     assert told["objects"] >= {"spy", "oodd_eval.plugins.isolation.worker", SEED}
     assert told["memory"] >= {"spy", "a trajectory"}
     assert told["arguments"] == {"oodd_eval.plugins.isolation.worker"}
@@ -150,23 +148,23 @@ def test_nothing_of_the_harness_or_of_pytest_is_in_the_environment(findings):
 
 def test_the_spy_finds_what_a_harness_leaks(spying, secrets, monkeypatch):
     """The same search, where the harness tells too much in every way there is."""
-    send, popen = supervisor._send, subprocess.Popen
+    run_isolated, popen = unit.run_isolated, subprocess.Popen
 
-    def told(child, request, *trajectories):
+    def told(request, *trajectories, **settings):
         leak = {"environment": ENVIRONMENT, "onsets": secrets.onsets}
-        send(child, request | leak, *trajectories)
+        return run_isolated(request | leak, *trajectories, **settings)
 
     with (secrets.path / f"{ENVIRONMENT}.h5").open("rb") as split:
 
         def start(command, **settings):
             if "oodd_eval.plugins.isolation.worker" in command:
                 command = [command[0], "-X", f"data={secrets.path}", *command[1:]]
-                settings["pass_fds"] += (split.fileno(),)
+                settings["pass_fds"] = [*settings["pass_fds"], split.fileno()]
                 settings["env"]["SPLIT"] = str(secrets.path)
                 settings["cwd"] = secrets.path
             return popen(command, **settings)
 
-        monkeypatch.setattr(supervisor, "_send", told)
+        monkeypatch.setattr(unit, "run_isolated", told)
         monkeypatch.setattr(child.subprocess, "Popen", start)
         records = evaluate(
             "spy", split=secrets.path, environments=ENVIRONMENT, anomalies="wind-l2r"
@@ -205,88 +203,32 @@ def digest(x):
 
 @pytest.fixture(scope="module")
 def mini(tmp_path_factory):
-    """What arrived of the split `mini` in two runs, each with an order of its own."""
-    found = []
-    for i in range(2):
-        with pytest.MonkeyPatch.context() as patch:
-            seen = spy_in(tmp_path_factory.mktemp(f"mini{i}"), patch)
-            evaluate("spy", environments=ENVIRONMENT)
-        found.append(Findings(seen))
-    return found
+    """What arrived of the split `mini` in a run."""
+    with pytest.MonkeyPatch.context() as patch:
+        seen = spy_in(tmp_path_factory.mktemp("mini"), patch)
+        evaluate("spy", environments=ENVIRONMENT)
+        return Findings(seen)
 
 
-@pytest.fixture(scope="module")
-def sets():
-    return parts_of(load_split("mini").environment(ENVIRONMENT), TABLE1)
-
-
-def arrived(findings, sets):
-    """Return groups in the order in which they arrived: the part of each, or None for prefixes."""
-    size, order = len(sets["test/nominal"]), []
-    known = {digest(x): (part, i) for part, xs in sets.items() for i, x in enumerate(xs)}
-    rest = [known.get(found) for found, *_ in findings.arrived("score")]
-    while rest:
-        n = size if rest[0] else PROBES
-        group, rest = rest[:n], rest[n:]
-        assert all(one is None for one in group) or len({part for part, _ in group}) == 1
-        order.append(group[0] and group[0][0])
-        if group[0]:
-            assert [i for _, i in group] == list(range(group[0][1], group[0][1] + size))
-    return order
-
-
-def test_groups_arrive_in_an_order_that_no_two_runs_share(mini, sets):
-    orders = [arrived(findings, sets) for findings in mini]
-    calibration = len(sets["calibration"]) // len(sets["test/nominal"])
-    every = Counter({None: 1, "test/nominal": 1, "calibration": calibration})
-    every += Counter(f"test/{a}" for a in TABLE1)
-    assert all(Counter(order) == every for order in orders)
-    assert len(set(map(tuple, orders))) == len(mini)
-
-
-def test_trajectories_arrive_whole_and_in_one_form(mini, sets):
+def test_trajectories_arrive_whole_and_in_one_form(mini):
     """No end is cut at an onset or where the twin ends, nothing is padded, no action is shown."""
-    seen = mini[0].arrived("score")
-    lengths = Counter(length for _, length, _ in seen)
-    assert len(lengths) > 10
-    lengths -= Counter(int(n) + 1 for part in sets.values() for n in part.lengths)
-    assert lengths.total() == PROBES
-    forms = {str(form) for when in ("fit", "score") for *_, form in mini[0].arrived(when)}
+    data = load_split("mini").environment(ENVIRONMENT)
+    assert [found for found, *_ in mini.arrived("fit")] == [digest(x) for x in data.train]
+    sets = parts_of(data, TABLE1)
+    assert [found for found, *_ in mini.arrived("score")] == [
+        digest(x) for part in sets.values() for x in part
+    ]
+    forms = {str(form) for when in ("fit", "score") for *_, form in mini.arrived(when)}
     assert len(forms) == 1, forms
 
 
-def test_one_group_has_prefixes_of_different_seeds_and_no_run_those_of_another(mini, sets):
-    split = {digest(x) for part in sets.values() for x in part}
-    drawn = []
-    for findings in mini:
-        seen = [(found, length) for found, length, _ in findings.arrived("score")]
-        prefixes = [one for one in seen if one[0] not in split]
-        place = seen.index(prefixes[0])
-        assert seen[place : place + PROBES] == prefixes
-        owners = [
-            {(part == "calibration", i) for part, own in sets.items() for i, x in enumerate(own)
-             if len(x) > length and digest(x[:length]) == found}
-            for found, length in prefixes
-        ]  # fmt: skip
-        # A prefix that ends before the onset is that of every episode of one seed.
-        assert all(len(own) == 1 for own in owners)
-        assert len(set.union(*owners)) == PROBES
-        drawn.append(tuple(prefixes))
-    assert len(set(drawn)) == len(mini)
-
-
-def test_training_trajectories_arrive_in_the_order_of_the_split(mini):
-    train = load_split("mini").environment(ENVIRONMENT).train
-    assert [found for found, *_ in mini[0].arrived("fit")] == [digest(x) for x in train]
-
-
-@given(st.dictionaries(st.text(), st.lists(st.integers(1, 90), max_size=50)), st.integers(1, 20))
-def test_groups_have_one_part_and_one_size_and_miss_nothing(lengths, twins):
-    lengths["test/nominal"] = [7] * twins
-    found = groups(lengths)
-    assert Counter((p.part, p.index, p.rows) for g in found for p in g) == Counter(
-        (part, i, n) for part, own in lengths.items() for i, n in enumerate(own)
-    )
-    assert all(len({p.part for p in g}) == 1 for g in found)
-    assert all(0 < len(g) <= twins for g in found)
-    assert sum(len(g) < twins for g in found) <= len(lengths)
+@given(st.dictionaries(st.text(), st.integers(0, 50)), st.integers(1, 20))
+def test_groups_have_one_part_and_one_size_and_miss_nothing(sizes, twins):
+    sizes["test/nominal"] = twins
+    found = unit.groups(sizes)
+    assert [tuple(place) for group in found for place in group] == [
+        (part, i) for part, n in sizes.items() for i in range(n)
+    ]
+    assert all(len({place.part for place in group}) == 1 for group in found)
+    assert all(0 < len(group) <= twins for group in found)
+    assert sum(len(group) < twins for group in found) <= len(sizes)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, runtime_checkable
 
 from oodd_eval.errors import ContractError
@@ -25,8 +24,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from oodd_eval.data.trajectory import Trajectory
+    from oodd_eval.plugins.state import State
 
-CONTRACT: Final = 2
+CONTRACT: Final = 3
 """Version of how the harness fits and scores, part of every key of scores and fits.
 
 Raise it by hand when a change of the harness changes scores.
@@ -34,9 +34,6 @@ Raise it by hand when a change of the harness changes scores.
 
 MAX_WARM_UP: Final = 20
 """Longest leading block, in rows, that a detector may declare undefined beyond its horizon."""
-
-PROBES: Final = 4  # episodes of a unit that are scored twice, cut short: a few percent
-MIN_ROWS: Final = 8  # observations of the shortest episode that is cut
 
 TOLERANCE: Final = 1e-3
 """Difference that stands for the same score where matrices differ in shape: see `difference`.
@@ -49,6 +46,9 @@ ROLLOUT_TOLERANCE: Final = 5e-3
 
 Scores: TypeAlias = "NDArray[np.float64]"
 
+Training = Literal["nominal", "simulation", "anomalies", "external"]
+"""Data that a detector learns from, see `DetectorSpec`."""
+
 
 @runtime_checkable
 class Detector(Protocol):
@@ -60,7 +60,7 @@ class Detector(Protocol):
       at once, where batching is faster;
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
-    - ``save(directory)`` and ``load(directory)``: see `StorableDetector`;
+    - ``state()`` and ``restore(state)``: see `StorableDetector`;
     - ``explain(trajectory)`` and ``explain_last()``: see `oodd_eval.plugins.explanations`.
     """
 
@@ -136,30 +136,36 @@ class StreamingDetector(Detector, Protocol):
 
 @runtime_checkable
 class StorableDetector(Detector, Protocol):
-    """A detector whose fit can be kept in plain files: never pickle, as they may be anybody's."""
+    """A detector whose fit can be handed over as data: never as code, as it may be anybody's.
 
-    def save(self, directory: Path) -> None:
-        """Write the fitted state as files.
+    A sandboxed run scores each group in a process of its own, which takes over the state of one
+    fit; without these methods the detector is fitted again in each of them.
+    """
 
-        Parameters
-        ----------
-        directory : Path
-            An empty directory.
+    def state(self) -> State:
+        """Return the fitted state by name.
+
+        Returns
+        -------
+        mapping
+            NumPy arrays of numbers (at most 512 MB in all), and values that JSON knows (at most
+            1 MB): numbers, texts, truth values, None, lists and mappings of these.
         """
 
-    def load(self, directory: Path) -> None:
-        """Take over what `save` wrote, instead of `fit`: scores are the same, bit for bit.
+    def restore(self, state: State) -> None:
+        """Take over a state instead of `fit`: scores are the same, bit for bit.
 
         Parameters
         ----------
-        directory : Path
-            Written by a detector with the same parameters, except those that do not decide the fit
-            (`oodd_eval.plugins.parameters.parameter`).
+        state : mapping
+            From `state` of a detector with the same parameters, except those that do not decide the
+            fit (`oodd_eval.plugins.parameters.parameter`). Arrays have their dtypes and shapes;
+            tuples have become lists.
 
         Raises
         ------
         FittedStateError
-            For other files.
+            For another state.
         """
 
 
@@ -183,6 +189,11 @@ class DetectorSpec:
         declares observations is handed trajectories whose actions have width 0.
     deterministic
         Whether the seed changes nothing: results of one seed are then those of all.
+    training
+        What it learns from beyond parameters: ``"nominal"``, the trajectories given to `fit`, and
+        nothing else; ``"simulation"``, nominal episodes of its own besides; ``"anomalies"``,
+        anomalous ones; ``"external"``, other data, such as pretrained weights. Boards rank the
+        first.
     alarm
         The statistic of the guaranteed alarms: the CUSUM of standardized scores, or the score
         itself, for a detector that accumulates by itself.
@@ -216,6 +227,7 @@ class DetectorSpec:
     reference: str = ""
     inputs: Literal["observations", "observations+actions"] = "observations"
     deterministic: bool = False
+    training: Training = "nominal"
     alarm: Literal["cusum", "score"] = "cusum"
     adapts: Literal["", "baseline"] = ""
     parameters: type | None = None
@@ -327,49 +339,6 @@ def check_scores(
     else:
         return scores
     raise ContractError(f"detector {detector!r} returned {wrong}")
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """The first `rows` observations of trajectory `index` of a part, or all of them."""
-
-    part: str
-    index: int
-    rows: int
-
-
-def probes(lengths: Mapping[str, Sequence[int]], seed: int) -> list[Probe]:
-    """Draw prefixes of different episodes, at least a quarter of each, and one with most of it.
-
-    `lengths` are the observations of each trajectory, by part. No two are of one test seed, so that
-    they can be scored together. Equal seeds give equal probes. The first one is cut in the last
-    quarter of its episode.
-    """
-    import numpy as np  # noqa: PLC0415  see above
-
-    every = ((part, i, n) for part, counts in lengths.items() for i, n in enumerate(counts))
-    long = [(part, i, n) for part, i, n in every if n >= MIN_ROWS]
-    rng = np.random.default_rng([seed, PROBES])  # not the numbers that shuffle the groups
-    chosen: dict[tuple[bool, int], tuple[str, int, int]] = {}
-    for part, i, n in (long[c] for c in rng.permutation(len(long))):
-        chosen.setdefault((part.startswith("test/"), i), (part, i, n))
-    return [
-        Probe(part, i, int(rng.integers(n // 4 if k else 3 * n // 4, n)))
-        for k, (part, i, n) in enumerate([*chosen.values()][:PROBES])
-    ]
-
-
-def check_prefix(
-    scores: Scores, whole: Scores, *, detector: str, where: str, horizon: int = 1
-) -> None:
-    """Raise `ContractError` when the scores of a prefix differ from those of the whole episode."""
-    if problem := difference(scores, whole, TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE):
-        raise ContractError(
-            f"detector {detector!r} is not causal: scores of {where} change when only its first "
-            f"{len(scores)} of {len(whole)} observations are given: {problem}; a score may use "
-            "nothing after its time and nothing of other episodes "
-            f"(`oodd-eval check {detector} -k prefix`)"
-        )
 
 
 def difference(scores: Scores, whole: Scores, tolerance: float = 0.0) -> str:

@@ -80,8 +80,7 @@ class Observers:
         self._plugins = plugins
         self._foreign: list[tuple[EntryPoint, pluggy.HookRelay]] = []
         observing: dict[int, EntryPoint] = {}
-        loaded = [plugin.point for plugin in plugins.loaded.values()]
-        for point in (*loaded, *plugins.observer_points):
+        for point in plugins.observing:
             with plugins.blaming(point):
                 module = point.load()
                 # A module that is in both groups is called once.

@@ -21,7 +21,7 @@ from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
-from oodd_eval.plugins.contract import CONTRACT
+from oodd_eval.plugins.contract import CONTRACT, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
 from oodd_eval.results.identity import Cell, Setting
@@ -55,6 +55,7 @@ class Unit:
     alarm: Literal["cusum", "score"] = "cusum"
     adapts: Literal["", "baseline"] = ""
     deterministic: bool = False
+    training: Training = "nominal"
     scores_key: str = ""
     fit_key: str = ""
 
@@ -110,6 +111,7 @@ class Plan:
             inputs=unit.inputs,
             alarm=unit.alarm,
             deterministic=unit.deterministic,
+            training=unit.training,
             rolling=unit.setting.rolling,
             environment=unit.environment,
             anomaly=condition.anomaly,
@@ -261,6 +263,7 @@ def make_unit(
         alarm=spec.alarm,
         adapts=spec.adapts,
         deterministic=spec.deterministic,
+        training=spec.training,
         scores_key=scores,
         fit_key=fit,
     )

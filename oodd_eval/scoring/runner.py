@@ -9,13 +9,14 @@ import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from graphlib import TopologicalSorter
 from queue import SimpleQueue
 from typing import Any
 
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
+from oodd_eval.errors import UsageError
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
 from oodd_eval.results.evaluate import counts_of, evaluated
@@ -55,6 +56,8 @@ def run(
     `SplitError`, and what was finished is kept.
     """
     check_executor(settings.executor)
+    if settings.streamed and any(unit.local for unit in plan.units):
+        raise UsageError("rows are streamed to detectors of plug-ins only: name one")
     if results:
         results.prepare()
     executor = open_executor(settings, split, results)
@@ -65,7 +68,14 @@ def run(
     try:
         data = opened.enter_context(split.opened())
         jobs = [
-            UnitJob(plan, unit, data(unit.environment), plugins.offer(unit.setting.detector))
+            UnitJob(
+                plan,
+                # Scores that are streamed may differ in the last digits: they are kept apart.
+                replace(unit, scores_key=f"{unit.scores_key}-rows") if settings.streamed else unit,
+                data(unit.environment),
+                plugins.offer(unit.setting.detector),
+                settings.streamed,
+            )
             for unit in plan.units
         ]
         notify("oodd_run_started", plan=plan)
@@ -197,4 +207,6 @@ def _records(
     ]
     if scored.status != "ok":
         return records
-    return evaluated(records, scored.file, job.data, row_metrics=settings.row_metrics)
+    return evaluated(
+        records, scored.file, job.data, row_metrics=settings.row_metrics, streamed=settings.streamed
+    )

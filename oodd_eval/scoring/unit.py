@@ -2,11 +2,11 @@
 
 import copy
 import secrets
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
-from itertools import islice
-from typing import Final
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, islice
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,15 +19,15 @@ from oodd_eval.data.parts import (
     lengths_of,
     parts_of,
 )
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError
+from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
+from oodd_eval.errors import ContractError, OutputError, ResultsError, SplitError, UsageError
 from oodd_eval.plugins import contract, explanations
-from oodd_eval.plugins.contract import Probe, Scores
-from oodd_eval.plugins.discovery import Offer, printable
+from oodd_eval.plugins.discovery import Offer, describe, printable
 from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.isolation.child import Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
-from oodd_eval.results.directory import ORDER_BITS, FitStore, ResultsDirectory, ScoreFile
+from oodd_eval.plugins.state import PackedState
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
@@ -57,36 +57,57 @@ class Scored:
         self.reason = printable(self.reason)
 
 
+class Member(NamedTuple):
+    """A trajectory by its part, and its number there."""
+
+    part: str
+    number: int
+
+
 @dataclass(frozen=True, slots=True)
 class UnitJob:
-    """The work of one unit, to be called in a thread of its own."""
+    """The work of one unit, to be called in a thread of its own; row by row where `streamed`."""
 
     plan: Plan
     unit: Unit
     data: EnvironmentData
     offer: Offer
+    streamed: bool = False
 
     def __call__(
         self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
     ) -> Scored:
-        """Return the unit's scores, or how its detector failed."""
-        work = GroupedScoring(self, parts_of(self.data, self.unit.conditions))
+        """Return the unit's scores, or how it failed: only what the user can mend is raised."""
         if self.unit.local:
-            return work.in_process()
+            return GroupedScoring(self).in_process()
+        try:
+            return self._isolated(limits, stop, results, fresh=fresh)
+        except (SplitError, OutputError, ResultsError, UsageError):
+            raise
+        except Exception as error:  # noqa: BLE001  a plug-in that nobody thought of is one unit's
+            return Scored("error", f"oodd-eval: {describe(error)}", log=traceback.format_exc())
+
+    def _isolated(
+        self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
+    ) -> Scored:
         if reason := self.offer.unavailable():
             return Scored("unavailable", reason)
         if not fresh and (kept := self.kept(results)):
             return kept
-
-        def isolated(*, load: str = "", save: str = "") -> Outcome:
-            return work.isolated(limits, stop, load=load, save=save)
-
+        work = GroupedScoring(self)
         if results is None:
-            # It is this process that removes what was saved, however the worker ends.
-            with tempfile.TemporaryDirectory(prefix="oodd-eval-") as directory:
-                return work.checked(isolated(save=directory))
-        fits = results.fits
-        return work.checked(_with_kept_fit(isolated, fits, self.unit.fit_key, stop, fresh=fresh))
+            return work.checked(work.isolated(limits, stop))
+        fits, key = results.fits, self.unit.fit_key
+        if fit := fits.find(key, fresh=fresh):
+            outcome = work.isolated(limits, stop, state=fit.packed)
+            if outcome.seconds_fit is not None or outcome.status == "ok" or stop():
+                outcome.seconds_fit = fit.seconds_fit
+                return work.checked(outcome)
+            fits.distrust(key)  # It could not be restored.
+        outcome = work.isolated(limits, stop, keep=True)
+        if outcome.status == "ok" and outcome.state and outcome.seconds_fit is not None:
+            fits.keep(key, outcome.state, outcome.seconds_fit)
+        return work.checked(outcome)
 
     def kept(self, results: ResultsDirectory | None) -> Scored | None:
         """Return the scores that an earlier run has kept, if they are there and fit."""
@@ -101,17 +122,15 @@ class GroupedScoring:
     """The trajectories of one unit, the groups in which they are scored, and the checks of scores.
 
     A group holds no two trajectories of one seed: as many calibration trajectories as there are
-    test seeds, the twins, one anomaly, or prefixes of other trajectories (without twins: a part of
-    any of these). It is scored apart from all others. The order of groups, and which prefixes there
-    are, follow from a number drawn from the system's randomness, which is stored with the scores.
-    Within a group the order is that of the split, so that scores are the same bit for bit. A
+    test seeds, the twins, or one anomaly (without twins: a part of any of these). It is scored
+    apart from all others, in the order of the split, so that scores are the same bit for bit. A
     detector that explains is asked to in the same way, when all is scored: only the anomalous
-    trajectories, and prefixes of some of these.
+    trajectories. Where rows are streamed, groups hold all parts, see `mixed`.
     """
 
-    def __init__(self, job: UnitJob, sets: Mapping[str, TrajectorySet]) -> None:
-        self._job, self._sets = job, sets
-        self._lengths = lengths_of(sets, job.plan.limit)
+    def __init__(self, job: UnitJob) -> None:
+        self._job, self._sets = job, parts_of(job.data, job.unit.conditions)
+        self._lengths = lengths_of(self._sets, job.plan.limit)
         self._adapts = bool(job.unit.adapts)
         # Rows at the start of each episode that a detector is not shown, or learns from.
         self._rows = rows = job.data.baseline
@@ -122,21 +141,16 @@ class GroupedScoring:
         if rows and not self._adapts:
             self._baseline = Baseline.fit(islice(job.data.train, job.plan.limit), rows)
             self._lengths = {p: [n - rows for n in ns] for p, ns in self._lengths.items()}
-        self._order = secrets.randbits(ORDER_BITS)
-        self._probes = contract.probes(self._lengths, self._order)
-        self._ordered = [*groups(self._lengths), self._probes]
-        self._drawn = np.random.default_rng(self._order).permutation(len(self._ordered))
-        self._groups = [self._ordered[k] for k in self._drawn]
-        anomalous = {p: n for p, n in self._lengths.items() if p not in _NOMINAL}
-        again = [group for group in self._ordered[:-1] if group[0].part in anomalous]
-        again.append(contract.probes(anomalous, self._order))
-        order = np.random.default_rng([self._order, len(again)]).permutation(len(again))
-        self._explained = [again[k] for k in order]
+        self._train = _Visible(job.data.train, job.plan.limit, self._visible)
+        sizes = {part: len(lengths) for part, lengths in self._lengths.items()}
+        self._groups = mixed(sizes) if job.streamed else groups(sizes)
+        self._explained = [group for group in self._groups if group[0].part not in _NOMINAL]
 
-    def isolated(self, limits: Limits, stop: Stop, *, load: str, save: str) -> Outcome:
-        """Fit (or load a fit) and score in worker processes."""
-        unit, data = self._job.unit, self._job.data
-        train = 0 if load else len(data.train.lengths[: self._job.plan.limit])
+    def isolated(
+        self, limits: Limits, stop: Stop, *, state: PackedState | None = None, keep: bool = False
+    ) -> Outcome:
+        """Fit (or take over the state of a fit) and score in worker processes."""
+        unit = self._job.unit
         request = {
             "plugin": unit.plugin,
             "detector": unit.setting.detector,
@@ -144,37 +158,35 @@ class GroupedScoring:
             "horizon": unit.setting.horizon,
             "parameters": dict(unit.parameters),
             "baseline": self._adapting,
-            "train": train,
-            "load": load,
-            "save": save,
         }
-        nominal = map(self._visible, islice(data.train, train))
         parts, again = (map(self._members, g) for g in (self._groups, self._explained))
-        return run_isolated(request, nominal, parts, again, limits=limits, stop=stop)
+        return run_isolated(
+            request,
+            self._train,
+            parts,
+            again,
+            limits=limits,
+            stop=stop,
+            state=state,
+            keep=keep,
+            streamed=self._job.streamed,
+        )
 
     def checked(self, outcome: Outcome) -> Scored:
         """Check every score sequence of a worker and put them in their places."""
         if outcome.status != "ok":
             return Scored(outcome.status, outcome.reason, log=outcome.log)  # type: ignore[arg-type]
-        returned, sizes = iter(outcome.scores), [*map(len, self._groups)]
-        if (n := len(outcome.scores)) != sum(sizes):
-            wrong = f"{n} score arrays came back, expected {sum(sizes)}"
-            return Scored("invalid", wrong, log=outcome.log)
+        steps = sum(map(sum, self._lengths.values()))
+        cost = {name: value for name in COSTS if (value := getattr(outcome, name)) is not None}
         try:
-            parts = self._placed([[*islice(returned, n)] for n in sizes], outcome.warm_up)
-            explained = self._explanations(outcome.explained, parts)
+            scores = self._file(outcome.scores, outcome.explained, outcome.warm_up)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
-        # Prefixes, a few percent more, are others in every run, and records shall be the same.
-        steps = sum(map(sum, self._lengths.values()))
-        cost = {name: getattr(outcome, name) for name in COSTS}
-        known = {name: value for name, value in cost.items() if value is not None}
-        cost = {**known, "steps_scored": steps}
-        return Scored(file=self._whole(ScoreFile(parts, cost, self._order, explained)))
+        return Scored(file=replace(scores, cost={**cost, "steps_scored": steps}))
 
     def in_process(self) -> Scored:
         """Fit and score in this process, a copy each group; errors of the detector pass through."""
-        unit, limit = self._job.unit, self._job.plan.limit
+        unit = self._job.unit
         detector = contract.make_detector(
             self._job.offer.spec.factory,
             seed=unit.seed,
@@ -182,20 +194,18 @@ class GroupedScoring:
             parameters=unit.parameters,
             baseline=self._adapting,
         )
-        detector.fit([*map(self._visible, islice(self._job.data.train, limit))])
-        chunks = ([*self._members(group)] for group in self._groups)
-        returned = [contract.score_chunk(copy.deepcopy(detector), chunk) for chunk in chunks]
-        parts = self._placed(returned, getattr(detector, "warm_up", 0))
+        detector.fit([*self._train])
+
+        def returned(
+            groups: Iterable[list[Member]], work: Callable[..., list[object]]
+        ) -> list[object]:
+            chunks = ([*self._members(group)] for group in groups)
+            return [one for chunk in chunks for one in work(copy.deepcopy(detector), chunk)]
+
+        scores = returned(self._groups, contract.score_chunk)
         again = self._explained if explanations.explains(detector) else ()
-        explained = [
-            explanation
-            for group in again
-            for explanation in explanations.explain_chunk(
-                copy.deepcopy(detector), [*self._members(group)]
-            )
-        ]
-        scores = ScoreFile(parts, {}, self._order, self._explanations(explained, parts))
-        return Scored(file=self._whole(scores))
+        explained = returned(again, explanations.explain_chunk)
+        return Scored(file=self._file(scores, explained, getattr(detector, "warm_up", 0)))
 
     @property
     def _adapting(self) -> int:
@@ -219,8 +229,8 @@ class GroupedScoring:
         }
         return replace(scores, parts=parts, explained=explained)
 
-    def _members(self, group: Sequence[Probe]) -> Iterator[Trajectory]:
-        return (self._visible(self._sets[p.part][p.index])[: p.rows] for p in group)
+    def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
+        return (self._visible(self._sets[part][i]) for part, i in group)
 
     def _visible(self, trajectory: Trajectory) -> Trajectory:
         """Return what the detector may see: no actions, unless it declares that it uses them."""
@@ -228,79 +238,52 @@ class GroupedScoring:
         judged = self._baseline.judged(trajectory) if self._baseline else trajectory
         return judged.without_actions() if withheld else judged
 
-    def _placed(self, returned: list[list[object]], warm_up: object) -> dict[str, list[Scores]]:
-        """Check the scores of all groups; raise `ContractError`, or return them by part."""
-        parts: dict[str, list[Scores]]
-        parts = {p: [np.empty(0)] * len(n) for p, n in self._lengths.items()}
-        scores, unit = dict(zip(self._drawn, returned, strict=True)), self._job.unit
-        detector, horizon = unit.setting.detector, unit.setting.horizon
-        # In the order of the split: the first fault that is told is the same in every run.
-        for k, group in enumerate(self._ordered):
-            for (part, i, rows), array in zip(map(astuple, group), scores[k], strict=True):
-                where = f"{unit.environment}/{part}[{i}]"
-                checked = contract.check_scores(
-                    array,
+    def _file(
+        self, scores: Sequence[object], explained: Sequence[object], warm_up: object
+    ) -> ScoreFile:
+        """Check what came back; raise `ContractError`, or return it by part, in whole episodes."""
+        unit = self._job.unit
+        by_member = dict(zip(chain(*self._groups), scores, strict=True))
+        parts = {
+            part: [
+                contract.check_scores(
+                    by_member[Member(part, i)],
                     rows,
-                    horizon=horizon,
+                    horizon=unit.setting.horizon,
                     warm_up=warm_up,
-                    detector=detector,
-                    where=where,
+                    detector=unit.setting.detector,
+                    where=f"{unit.environment}/{part}[{i}]",
                     baseline=self._adapting,
                 )
-                if group is self._probes:
-                    contract.check_prefix(
-                        checked, parts[part][i], detector=detector, where=where, horizon=horizon
-                    )
-                else:
-                    parts[part][i] = checked
-        return parts
-
-    def _explanations(
-        self, returned: Sequence[object], parts: Mapping[str, Sequence[Scores]]
-    ) -> dict[str, list[Named]]:
-        """Check explanations, if there are any; raise `ContractError`, or return them by part."""
-        probes = [probe for group in self._explained for probe in group]
-        if returned and len(returned) != len(probes):
-            raise ContractError(f"{len(returned)} explanations came back, expected {len(probes)}")
-        explained: dict[str, list[Named]] = {}
-
-        def key(pair: tuple[Probe, object]) -> tuple[bool, str, int]:
-            probe = pair[0]  # whole ones before those that are cut
-            return probe.rows < len(parts[probe.part][probe.index]), probe.part, probe.index
-
-        for probe, array in sorted(zip(probes, returned, strict=False), key=key):
-            scores, named = parts[probe.part][probe.index], explained.setdefault(probe.part, [])
-            cut, where = probe.rows < len(scores), f"{probe.part}[{probe.index}]"
-            checked = explanations.check_named(
-                array,
-                scores[: probe.rows],
-                len(self._job.data.sensors),
-                f"{self._job.unit.environment}/{where}",
-                named[probe.index] if cut else None,
-            )
-            named += [] if cut else [checked]
-        return explained
+                for i, rows in enumerate(lengths)
+            ]
+            for part, lengths in self._lengths.items()
+        }
+        again = self._explained if explained else ()
+        named: dict[str, list[Named]] = {group[0].part: [] for group in again}
+        for (part, i), array in zip(chain(*again), explained, strict=True):
+            where = f"{unit.environment}/{part}[{i}]"
+            sensors = len(self._job.data.sensors)
+            named[part].append(explanations.check_named(array, parts[part][i], sensors, where))
+        return self._whole(ScoreFile(parts, {}, named))
 
 
-def _with_kept_fit(
-    isolated: Callable[..., Outcome], fits: FitStore, key: str, stop: Stop, *, fresh: bool
-) -> Outcome:
-    """Score with the fit that is kept under a key, or fit, score and keep the fit."""
-    fit = fits.find(key, fresh=fresh)
-    if fit is None:
-        with fits.filling() as directory:
-            outcome = isolated(save=str(directory.absolute()))
-            if outcome.status == "ok" and outcome.seconds_fit is not None:
-                fits.keep(key, directory, outcome.seconds_fit)
-        return outcome
-    outcome = isolated(load=str(fit.path.absolute()))
-    if outcome.seconds_fit is not None:
-        outcome.seconds_fit = fit.seconds_fit
-    elif outcome.status != "ok" and not stop():
-        # The kept fit could not be loaded: discard it and fit again.
-        fits.distrust(key)
-        return _with_kept_fit(isolated, fits, key, stop, fresh=True)
-    return outcome
+class _Visible(TrajectorySequence):
+    """The first trajectories of a set, as a detector sees them, read at every access."""
+
+    def __init__(
+        self, members: TrajectorySet, limit: int | None, view: Callable[[Trajectory], Trajectory]
+    ) -> None:
+        self._members, self._n, self._view = members, len(members.lengths[:limit]), view
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return map(self._view, islice(self._members, self._n))
+
+    def _one(self, i: int) -> Trajectory:
+        return self._view(self._members[i])
 
 
 def _behind(explained: Named, rows: int, shift: int) -> Named:
@@ -310,16 +293,39 @@ def _behind(explained: Named, rows: int, shift: int) -> Named:
     return np.concatenate([np.full((2, rows), -1), known], axis=1).astype(np.int32)
 
 
-def groups(lengths: Mapping[str, Sequence[int]]) -> list[list[Probe]]:
-    """Return whole trajectories in groups of one part, at most as many as there are twins.
+def groups(sizes: Mapping[str, int]) -> list[list[Member]]:
+    """Return the trajectories of parts, by their number, in groups of at most the twins' number.
 
     All have that size but the last one of calibration, where the twins do not divide it. Without
     twins test parts have sizes of their own: the smallest of these is the most, but for small ones
     `LEAST_GROUP`. So no size tells calibration from test.
     """
-    sizes = {len(ns) for part, ns in lengths.items() if part.startswith("test/") and ns}
-    size = min(sizes, default=1)
-    if len(sizes) > 1:
+    tests = {n for part, n in sizes.items() if part.startswith("test/") and n}
+    size = min(tests, default=1)
+    if len(tests) > 1:
         size = max(size, LEAST_GROUP)
-    every = [[Probe(part, i, n) for i, n in enumerate(ns)] for part, ns in lengths.items()]
-    return [part[i : i + size] for part in every for i in range(0, len(part), size)]
+    return [
+        [Member(part, i) for i in range(start, min(start + size, n))]
+        for part, n in sizes.items()
+        for start in range(0, n, size)
+    ]
+
+
+def mixed(sizes: Mapping[str, int]) -> list[list[Member]]:
+    """Return the trajectories of parts, by their number, in groups that hold some of all parts.
+
+    The episodes of one test seed are in different groups, drawn at random in every run. So nothing
+    that tells a group, such as the time since the fit, says which of its episodes are anomalous.
+    """
+    calibration = [Member(CALIBRATION, i) for i in range(sizes.get(CALIBRATION, 0))]
+    tests = {part: n for part, n in sizes.items() if part != CALIBRATION}
+    seeds = max(tests.values(), default=0) or len(calibration)
+    rows = [
+        [Member(part, i) for part, n in tests.items() if i < n] + calibration[i::seeds]
+        for i in range(seeds)
+    ]
+    drawn: list[list[Member]] = [[] for _ in range(max(map(len, rows), default=0))]
+    for row in rows:
+        for group, member in zip(secrets.SystemRandom().sample(drawn, len(row)), row, strict=True):
+            group.append(member)
+    return [group for group in drawn if group]

@@ -1,5 +1,6 @@
 """How a command ends: killed, told to go, or held up by what a plug-in has left in it."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,7 +25,8 @@ def held():
     ctypes.PyDLL(None).sleep(600)
 
 def begun():
-    Path(os.environ["FITS"]).write_text(str(os.getpid()))
+    if "FITS" in os.environ:  # not in a sandbox
+        Path(os.environ["FITS"]).write_text(str(os.getpid()))
 
 class Holds(Good):
     def fit(self, nominal): begun(); held()
@@ -59,23 +61,32 @@ class Deaf(Good):
 class Stops(Good):
     def fit(self, nominal): begun(); os.kill(os.getpid(), signal.SIGSTOP)
 
+class Tells(Good):
+    def state(self): begun(); held()
+    def restore(self, state): pass
+
+class Restores(Good):
+    def fit(self, nominal): threading.Thread(target=time.sleep, args=(600,)).start()
+    def state(self): return {}
+    def restore(self, state): begun(); held()
+
 class Quick(Good): pass
 
 @hookimpl
 def oodd_detectors():
     return offer(holds=Holds, scores=Scores, own=Own, bare=Bare, twice=Twice, deaf=Deaf,
-                 stops=Stops, quick=Quick)
+                 stops=Stops, quick=Quick, tells=Tells, restores=Restores)
 """
 
 
-def of_run(marker):
+def of_run(marker, started=()):
     """Processes whose environment has a mark, or that run in the directory which it names."""
     name, _, value = marker.partition("=")
     found = []
     for process in psutil.process_iter(["pid", "environ", "status", "cwd"]):
         info = process.info
         if info["status"] != psutil.STATUS_ZOMBIE and (
-            (info["environ"] or {}).get(name) == value or info["cwd"] == value
+            (info["environ"] or {}).get(name) == value or info["cwd"] == value or process in started
         ):
             found.append(info["pid"])
     return found
@@ -92,7 +103,10 @@ def begin(monkeypatch, tmp_path, tiny_split, detector, code=HOLDS, *more, name="
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("detector", ["holds", "scores", "own", "bare", "twice", "deaf", "stops"])
+@pytest.mark.parametrize(
+    "detector",
+    ["holds", "scores", "own", "bare", "twice", "deaf", "stops", "tells", "restores"],
+)  # fmt: skip
 def test_nothing_runs_on_when_the_command_is_ended(
     monkeypatch, tmp_path, tiny_split, number, detector
 ):
@@ -103,6 +117,32 @@ def test_nothing_runs_on_when_the_command_is_ended(
     assert process.returncode == (-number if number == signal.SIGKILL else 2), said
     assert "Traceback" not in said
     assert wait_until(lambda: not of_run(f"RUN={tmp_path}"), seconds=10)
+
+
+@pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
+@pytest.mark.parametrize("detector", ["holds", "scores", "twice", "deaf"])
+def test_no_sandbox_runs_on_when_the_command_is_killed(monkeypatch, tmp_path, tiny_split, detector):
+    """Its processes have none of the marks; the file that says that it has begun stays in it."""
+    process = begin(monkeypatch, tmp_path, tiny_split, detector, HOLDS, "--sandbox")
+    started = []
+
+    def busy():
+        started[:] = psutil.Process(process.pid).children(recursive=True)
+        return any("oodd_eval.plugins.isolation.worker" in command_of(p) for p in started)
+
+    assert wait_until(busy)
+    time.sleep(5)
+    assert busy(), "it should hold up the command until that is killed"
+    process.kill()
+    process.communicate(timeout=60)
+    assert wait_until(lambda: not of_run(f"RUN={tmp_path}", started), seconds=10)
+
+
+def command_of(process):
+    try:
+        return process.cmdline()
+    except psutil.Error:  # it has just ended
+        return []
 
 
 def test_what_was_finished_is_kept_when_the_command_is_told_to_go(

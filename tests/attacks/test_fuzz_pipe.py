@@ -7,8 +7,6 @@ import io
 import json
 import os
 import tempfile
-from collections import deque
-from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +16,12 @@ import pytest
 from helpers_fuzz import ANY, damaged
 from hypothesis import strategies as st
 
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
-from oodd_eval.plugins.isolation import Channel, supervisor
-from oodd_eval.results.directory import INDEX, RECORDS, FitStore, ResultsDirectory, ScoreFile
+from oodd_eval.plugins.isolation import Channel, ChannelClosedError, ChannelGarbledError, supervisor
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.state import pack
+from oodd_eval.results.directory import RECORDS, FitStore, ResultsDirectory, ScoreFile
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.scoring.unit import Scored
 
@@ -32,13 +33,16 @@ RECORD = Record(
 ).to_json()  # fmt: skip
 
 
+FLAG = st.booleans() | ANY
 FIT = st.fixed_dictionaries(
-    {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": st.booleans() | ANY}
-)
-NAMES = st.sampled_from(["status", "reason", "type", "seconds_score", "peak_rss_mb", "seconds_fit",
-                         "warm_up", "explains"])  # fmt: skip
-KNOWN = st.sampled_from(["array", "explanation", "error", "ok", "oom", "timeout", 0, 1.5, True])
-MESSAGE = FIT | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
+    {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": FLAG, "updates": FLAG,
+     "forks": FLAG, "state": FLAG}
+)  # fmt: skip
+STATE = st.fixed_dictionaries({"names": st.lists(st.text()) | ANY, "text": st.text() | ANY})
+NAMES = st.sampled_from(["status", "reason", "seconds_score", "peak_rss_mb", "seconds_fit",
+                         "warm_up", "explains", "updates", "forks", "state"])  # fmt: skip
+KNOWN = st.sampled_from(["error", "ok", "oom", "timeout", 0, 1.5, True])
+MESSAGE = FIT | STATE | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
 JSON = MESSAGE.map(lambda message: json.dumps(message).encode())
 
 
@@ -57,7 +61,10 @@ def framed(content):
 
 
 FRAME = (JSON | saved() | st.binary(max_size=50) | damaged(JSON)).map(framed)
-GOOD = [{"seconds_fit": 0.1, "warm_up": 0, "explains": False}, {"type": "array"}]
+GOOD = [
+    {"seconds_fit": 0.1, "warm_up": 0, "explains": False, "updates": True, "forks": True,
+     "state": True}, {"names": ["x"], "text": "{}"},
+]  # fmt: skip
 PREFIX = b"".join(framed(json.dumps(message).encode()) for message in GOOD)
 TALK = st.lists(FRAME, max_size=6).map(b"".join)
 TALKS = TALK | damaged(TALK) | TALK.map(PREFIX.__add__) | saved().map(lambda a: PREFIX + framed(a))
@@ -77,15 +84,19 @@ def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
             os.set_blocking(writing, False)
             os.write(writing, talk)
         os.close(writing)
-        child, outcome = child_of(reading), supervisor.Outcome()
-        child.end = lambda: ""
-        child.wait_for_exit = lambda seconds: False
-        expected = deque([("array", 30), ("array", 30)])
+        settings = {"keep": True, "streamed": bool(len(talk) % 2), "state": None}
+        unit = supervisor._UnitRun({}, [], Limits(), lambda: False, **settings)
+        child, outcome = child_of(reading), unit.outcome
+        for name in ("send", "send_array", "send_bytes"):
+            setattr(child.channel, name, lambda _: None)
+        one = Trajectory(np.zeros((30, 2)))
         try:
-            supervisor._converse(child, outcome, Future(), expected)
+            unit._fit(child, forks=True)
+            order = "stream" if unit.streamed else "score"
+            (unit._stream if unit.streamed else unit._score)(child.channel, [one] * 2, order)
         except supervisor.GivenUpError as error:
             outcome.status, outcome.reason = error.status, error.reason
-        except (OoddError, LookupError, TypeError, ValueError, OverflowError):
+        except (ChannelGarbledError, ChannelClosedError):
             outcome.status, outcome.reason = "error", "garbled"
         finally:
             child.channel.close()
@@ -136,7 +147,7 @@ def test_a_line_that_somebody_copied_is_one_record():
 
 def score_file():
     parts = {p: [np.arange(float(n)) for n in sizes] for p, sizes in LENGTHS.items()}
-    return ScoreFile(parts, {"seconds_fit": 1.0, "steps_scored": 18.0}, order=3)
+    return ScoreFile(parts, {"seconds_fit": 1.0, "steps_scored": 18.0})
 
 
 @pytest.fixture(scope="module")
@@ -169,16 +180,17 @@ def test_whatever_stands_in_a_score_file_is_read_or_not_used(fuzzed, scores, sea
     fuzzed(damaged(st.just(scores)), tried)
 
 
-def test_whatever_stands_in_the_index_of_a_fit_is_a_fit_or_none(fuzzed):
-    def tried(content):
-        with tempfile.TemporaryDirectory() as path:
-            store = FitStore(Path(path))
-            with store.filling() as place:
-                (place / "weights").write_text("1")
-                store.keep("key", place, 2.0)
-            (Path(path) / "key" / INDEX).write_bytes(content)
-            found = store.find("key")
-            assert found is None or 0 <= found.seconds_fit < np.inf
+def test_whatever_stands_in_the_file_of_a_fit_is_a_fit_or_none(fuzzed):
+    with tempfile.TemporaryDirectory() as path:
+        store = FitStore(Path(path))
+        store.keep("key", pack({"weights": np.ones(3), "name": "x"}), 2.0)
+        (file,) = Path(path).iterdir()
 
-    whole = b'{"files": {"weights": "%s"}, "seconds_fit": 2.0}'
-    fuzzed(damaged(st.just(whole)) | JSON | st.binary(max_size=50), tried)
+        def tried(content):
+            file.write_bytes(content)
+            kept = store.find("key")
+            assert kept is None or 0 <= kept.seconds_fit < np.inf
+
+        whole = file.read_bytes()
+        assert store.find("key").seconds_fit == 2.0
+        fuzzed(damaged(st.just(whole)) | st.binary(max_size=50), tried)

@@ -23,30 +23,41 @@ from oodd_eval.plugins.contract import score_chunk
 from oodd_eval.plugins.isolation import LONGEST_MESSAGE, Channel, child, supervisor
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.supervisor import run_isolated
+from oodd_eval.plugins.state import VALUES
 from oodd_eval.results.record import STATUSES
 
 ROWS = 30
 GARBLED = "the detector wrote into the pipe between worker and harness"
-FITTED = {"seconds_fit": 0.0, "warm_up": 0, "explains": False}
+FITTED = {"seconds_fit": 0.0, "warm_up": 0, "explains": False, "updates": True, "forks": True,
+          "state": False}  # fmt: skip
 SCORED = {"seconds_score": 0.0, "peak_rss_mb": 1.0}
-LAST = {"peak_rss_mb": 1.0}
 
 WORKER = """
-import os, sys, threading, time
-channel = int(sys.argv[1])
-told, groups = threading.Event(), int(os.environ["GROUPS"])
-def drain():
-    rest = b""
-    while part := os.read(channel, 1 << 16):
-        rest += part
-        if rest.count(b'{"score": 0}') == groups:  # the ends of all groups
-            told.set()
-threading.Thread(target=drain, daemon=True).start()
-told.wait()  # A worker cannot answer what it was not sent.
-with open(os.environ["SCRIPT"], "rb") as script:
-    while part := script.read(1 << 20):
-        while part: part = part[os.write(channel, part):]
-time.sleep(float(os.environ.get("STAY", 0)))
+import os, socket, sys, threading, time
+channel, stay = socket.socket(fileno=int(sys.argv[1])), float(os.environ["STAY"])
+
+def say(to, name):
+    with open(os.environ["SCRIPT"] + name, "rb") as script:
+        to.sendall(script.read())
+
+def serve(descriptor):
+    group = socket.socket(fileno=descriptor)
+    threading.Thread(target=drain, args=(group,), daemon=True).start()
+    time.sleep(float(os.environ["DELAY"]))
+    say(group, "group")
+    group.shutdown(socket.SHUT_RDWR) if not stay else time.sleep(stay)
+    os._exit(0)
+
+def drain(what):
+    while True:
+        part, descriptors, *_ = socket.recv_fds(what, 1 << 16, 1)
+        if not part: return
+        for descriptor in descriptors:
+            threading.Thread(target=serve, args=(descriptor,), daemon=True).start()
+
+threading.Thread(target=drain, args=(channel,), daemon=True).start()
+say(channel, "fit")
+time.sleep(stay or 0.5 if os.environ["SILENT"] else 600)
 """
 
 
@@ -72,21 +83,28 @@ def header(text, content=b""):
 
 @pytest.fixture
 def converse(tmp_path, monkeypatch):
-    """Run the harness's side against a script of bytes; return the outcome."""
+    """Run the harness's side against scripts of bytes; return the outcome.
 
-    def run(*parts, stay=0.0, limits=Limits(60), groups=1, stop=lambda: False):  # noqa: B008
+    The first part is said to begin with, and the others to the group.
+    """
+
+    def run(*parts, stay=0.0, delay=0.0, limits=Limits(60), streamed=False):  # noqa: B008
         (tmp_path / "oodd_script.py").write_text(WORKER)
-        (tmp_path / "script").write_bytes(b"".join(parts))
-        monkeypatch.setenv("SCRIPT", str(tmp_path / "script"))
+        (tmp_path / "fit").write_bytes(b"".join(parts[:1]))
+        (tmp_path / "group").write_bytes(b"".join(parts[1:]))
+        monkeypatch.setenv("SCRIPT", f"{tmp_path}/")
         monkeypatch.setenv("STAY", str(stay))
-        monkeypatch.setenv("GROUPS", str(groups))
+        monkeypatch.setenv("DELAY", str(delay))
+        monkeypatch.setenv("SILENT", "" if parts[1:] else "1")
         monkeypatch.syspath_prepend(str(tmp_path))
         child = supervisor.Child
         monkeypatch.setattr(supervisor, "Child", lambda _, *more: child("oodd_script", *more))
         one = Trajectory(np.zeros((ROWS, 2)))
-        request = {"plugin": "p", "detector": "d", "parameters": {}, "train": 1}
+        request = {"plugin": "p", "detector": "d", "parameters": {}}
         try:
-            return run_isolated(request, [one], [[one]] * groups, limits=limits, stop=stop)
+            return run_isolated(
+                request, [one], [[one]], limits=limits, stop=lambda: False, streamed=streamed
+            )
         finally:
             monkeypatch.setattr(supervisor, "Child", child)
 
@@ -95,7 +113,7 @@ def converse(tmp_path, monkeypatch):
 
 def test_a_worker_that_says_what_it_should_is_believed(converse):
     scores = np.arange(ROWS, dtype=np.float64)
-    out = converse(said(FITTED), said({"type": "array"}), saved(scores), said(SCORED), said(LAST))
+    out = converse(said(FITTED), said(SCORED), saved(scores))
     assert (out.status, out.reason) == ("ok", "")
     assert np.array_equal(out.scores[0], scores)
 
@@ -108,7 +126,7 @@ AT_FIT = {
     "a number as reason": {"status": "error", "reason": 7},
     "seconds as text": {**FITTED, "seconds_fit": "1"},
     "seconds that are no number": {**FITTED, "seconds_fit": float("nan")},
-    "no warm-up": {"seconds_fit": 0.0, "explains": False},
+    "no warm-up": {name: FITTED[name] for name in FITTED if name != "warm_up"},
     "text as explains": {**FITTED, "explains": "no"},
     "a list": [],
     "no JSON": b"garbage",
@@ -128,16 +146,13 @@ IN_SCORING = {
     "no memory": {"peak_rss_mb": None},
     "negative memory": {**SCORED, "peak_rss_mb": -1},
     "negative seconds": {**SCORED, "seconds_score": -1e9},
-    "no kind": {"kind": "array"},
-    "a list as kind": {"type": ["array"]},
-    "an explanation that nobody asked for": {"type": "explanation"},
+    "another message": FITTED,
 }
 
 
 @pytest.mark.parametrize("message", IN_SCORING.values(), ids=IN_SCORING)
 def test_a_wrong_message_in_scoring(converse, message):
-    rest = saved(np.zeros((2, ROWS), np.int32))
-    out = converse(said(FITTED), said(message), rest, said(LAST), stay=30)
+    out = converse(said(FITTED), said(message), saved(np.zeros(ROWS)), stay=30)
     assert (out.status, out.reason) == ("error", GARBLED)
 
 
@@ -160,28 +175,60 @@ ARRAYS = {
 
 @pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS)
 def test_a_wrong_array(converse, array):
-    out = converse(said(FITTED), said({"type": "array"}), array, said(SCORED), stay=30)
+    out = converse(said(FITTED), said(SCORED), array, stay=30)
     assert (out.status, out.reason) == ("error", GARBLED)
 
 
-def test_more_arrays_than_trajectories(converse):
-    one = said({"type": "array"}) + saved(np.zeros(ROWS))
-    out = converse(said(FITTED), one, one, stay=30)
+STATED = {**FITTED, "state": True}
+STATES = {
+    "no names": said({"text": "{}"}),
+    "a number of names": said({"names": 3, "text": "{}"}),
+    "a list as name": said({"names": [[]], "text": "{}"}) + saved(np.zeros(3)),
+    "no JSON": said({"names": [], "text": "{"}),
+    "a list": said({"names": [], "text": "[1]"}),
+    "NaN": said({"names": [], "text": '{"x": NaN}'}),
+    "deep": said({"names": [], "text": "[" * 10**5}),
+    "a number as text": said({"names": [], "text": 7}),
+    "text without end": said({"names": [], "text": json.dumps({"x": "x" * 2**21})}),
+    "letters": said({"names": ["x"], "text": "{}"}) + saved(np.array(["a"])),
+    "a reserved name": said({"names": [VALUES], "text": "{}"}) + saved(np.zeros(3)),
+    "an enormous array": said({"names": ["x"], "text": "{}"}) + (10**9).to_bytes(4, "big"),
+    "names without end": said({"names": [*map(str, range(10**6))], "text": "{}"})
+    + saved(np.zeros(0)) * 5000,
+}
+
+
+@pytest.mark.parametrize("state", STATES.values(), ids=STATES)
+def test_a_wrong_state(converse, state):
+    out = converse(said(STATED) + state, stay=30)
     assert (out.status, out.reason) == ("error", GARBLED)
+    assert out.state is None
 
 
-def test_arrays_that_are_too_large_are_not_held(converse):
-    """An audit had 110 arrays of 20 MB in the harness at once."""
-    one = said({"type": "array"}) + saved(np.zeros(2 * 10**6))
-    grown = []
+def test_rows_are_answered_one_by_one(converse):
+    scores = np.arange(ROWS, dtype="<f8")
+    sent = [frame(score.tobytes()) for score in scores]
+    out = converse(said(FITTED), *sent, said(SCORED), streamed=True, stay=30)
+    assert (out.status, out.reason) == ("ok", "")
+    assert np.array_equal(out.scores[0], scores)
+    out = converse(said(FITTED), sent[0], sent[1][:-3], streamed=True)
+    assert (out.status, "ended with exit code 0" in out.reason) == ("error", True)
 
-    def watching():
-        grown.append(psutil.Process().memory_info().rss)
-        return False
 
-    out = converse(said(FITTED), *[one] * 12, groups=12, stay=30, stop=watching)
-    assert out.status == "error"
-    assert max(grown) - grown[0] < 100e6
+@pytest.mark.parametrize(
+    ("said_instead", "status", "reason"),
+    [
+        (said(SCORED), "error", GARBLED),
+        (frame(bytes(7)), "error", GARBLED),
+        (frame(b""), "error", GARBLED),
+        (b"", "error", "the worker ended with exit code 0 while scoring"),
+        (said({"status": "invalid", "reason": "why"}), "invalid", "why"),
+    ],
+)
+def test_a_failure_in_place_of_a_score_says_why(converse, said_instead, status, reason):
+    stay = 30 if said_instead else 0
+    out = converse(said(FITTED), frame(bytes(8)), said_instead, streamed=True, stay=stay)
+    assert (out.status, out.reason) == (status, reason)
 
 
 def test_a_long_message_is_not_read(converse):
@@ -192,9 +239,8 @@ def test_a_long_message_is_not_read(converse):
 def test_costs_are_bounded_by_what_the_harness_knows(converse):
     start = time.monotonic()
     out = converse(
-        said({**FITTED, "seconds_fit": 1e9}), said({"type": "array"}), saved(np.zeros(ROWS)),
-        said({"seconds_score": 1e9, "peak_rss_mb": 1e12}),
-        said({"seconds_score": 1e300, "peak_rss_mb": 1.0}), said({"peak_rss_mb": 1e300}),
+        said({**FITTED, "seconds_fit": 1e9}), said({"seconds_score": 1e300, "peak_rss_mb": 1e12}),
+        saved(np.zeros(ROWS)),
     )  # fmt: skip
     spent = time.monotonic() - start
     assert out.status == "ok"
@@ -204,19 +250,14 @@ def test_costs_are_bounded_by_what_the_harness_knows(converse):
 
 
 def test_memory_is_at_least_what_was_seen(converse):
-    out = converse(
-        said(FITTED), said({"type": "array"}), saved(np.zeros(ROWS)), said(SCORED), said(LAST),
-        stay=30,  # so that it is there when it is looked at
-    )  # fmt: skip
+    out = converse(said(FITTED), said(SCORED), saved(np.zeros(ROWS)), delay=1.0)
     assert out.peak_rss_mb > 3.0  # an interpreter holds more than the megabyte that it told of
 
 
 @pytest.mark.parametrize("warm_up", [None, [], {}, "x", 1e300, 10**4000, {"a": [1] * 1000}])
 def test_a_warm_up_of_any_kind_is_the_business_of_the_contract(converse, warm_up):
-    out = converse(
-        said({**FITTED, "warm_up": warm_up}), said({"type": "array"}), saved(np.zeros(ROWS)),
-        said(SCORED), said(LAST),
-    )  # fmt: skip
+    fitted = said({**FITTED, "warm_up": warm_up})
+    out = converse(fitted, said(SCORED), saved(np.zeros(ROWS)))
     assert (out.status, out.warm_up) == ("ok", warm_up)
 
 
@@ -256,16 +297,12 @@ class Masked(Good):
 class Unmasked(Good):
     def score(self, x): return np.ma.MaskedArray(super().score(x))
 
-class Saves(Good):
-    def save(self, directory):
-        (directory / "half").write_text("x")
-        raise KeyboardInterrupt
-    def load(self, directory): raise RuntimeError("was not saved")
+class Tells(Good):
+    def state(self): raise KeyboardInterrupt
+    def restore(self, state): raise RuntimeError("there was no state")
 
-class Leaves(Saves):
-    def save(self, directory):
-        directory.rmdir()
-        sys.exit(0)
+class Leaves(Tells):
+    def state(self): sys.exit(0)
 
 class Wide(Good):
     def score(self, x): return np.zeros((len(x), 40))
@@ -278,14 +315,14 @@ class Odd(Good):
 
 @hookimpl
 def oodd_detectors():
-    return offer(masked=Masked, unmasked=Unmasked, saves=Saves, leaves=Leaves, wide=Wide,
+    return offer(masked=Masked, unmasked=Unmasked, tells=Tells, leaves=Leaves, wide=Wide,
                  wordy=Wordy, odd=Odd)
 """
 
 ENDS = {
     "masked": ("invalid", "score returned a masked array, expected NaN where it is undefined"),
     "unmasked": ("ok", ""),
-    "saves": ("ok", ""),
+    "tells": ("ok", ""),
     "leaves": ("ok", ""),
     "wide": ("invalid", r"score returned an array of shape \(\d+, 40\), expected a numpy array of"),
     "wordy": ("error", "ValueError: no no"),
@@ -296,7 +333,9 @@ ENDS = {
 @pytest.mark.parametrize("name", ENDS)
 def test_an_odd_detector_ends_in_a_state_that_says_why(tiny_split, monkeypatch, tmp_path, name):
     install(monkeypatch, tmp_path, "oddities", HOSTILE)
-    (record,) = evaluate(name, tiny_split, environments="cartpole", anomalies="iid")
+    (record,) = evaluate(
+        name, tiny_split, environments="cartpole", anomalies="iid", output=tmp_path / "out"
+    )
     status, reason = ENDS[name]
     assert record.status == status, record.reason
     assert record.status in STATUSES

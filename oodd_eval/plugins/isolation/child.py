@@ -74,57 +74,56 @@ class GivenUpError(OoddError, RuntimeError):
 
 
 class Child:
-    """A module run as ``python -m MODULE CHANNEL_FD LIFELINE_FD``, within limits.
+    """A module run as ``python -m MODULE CHANNEL_FD [LIFELINE_FD]``, within limits.
 
     It has no standard input, the import path of this process, one thread for numerical libraries,
-    and none of the variables that steer the harness. The system closes the lifeline when this
-    process is killed: see `oodd_eval.plugins.isolation.worker.connect`. A thread keeps the limits;
-    the limit of memory is for the process with all that it has started. After a limit was passed,
-    or the process has ended, what was sent can still be read, and `channel` then raises.
+    and none of the variables that steer the harness. Outside a sandbox it has a lifeline, which the
+    system closes when this process is killed: see `oodd_eval.plugins.isolation.worker.connect`. A
+    thread keeps the limits; the limit of memory is for the process with all that it has started,
+    and seconds count from `start`, which may be set.
+    After a limit was passed, or the process has ended, what was sent can still be read, and its
+    channels then raise.
     """
 
     def __init__(
         self, module: str, limits: Limits, stop: Stop | None = None, box: Sandbox | None = None
     ) -> None:
-        self._socket, remote = socket.socketpair()
+        self.start = time.monotonic()
+        self._limits, self._stop = limits, stop
+        self._verdict: GivenUpError | None = None
+        self.channel, remote = self._channel_pair()
+        self._channels = [self.channel]
         lifeline, self._held = os.pipe()
-        descriptors = [remote.detach(), lifeline]
+        passed = [remote] if box else [remote, lifeline]
         self._mark, self._box, self._looked = secrets.token_hex(8), box, -math.inf
-        command = [sys.executable, "-P", "-m", module, *map(str, descriptors)]
+        command = [sys.executable, "-P", "-m", module, *map(str, passed)]
         environment = {**_environment(box), MARK: self._mark}
         if box:
             command, arguments = box.command(command)
-            descriptors.append(arguments)
+            passed += arguments
         self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            pass_fds=tuple(descriptors),
+            pass_fds=passed,
             env=environment,
             start_new_session=True,
         )
-        for descriptor in descriptors:
+        for descriptor in {*passed, lifeline}:
             os.close(descriptor)
-        self.channel = Channel(os.dup(self._socket.fileno()), self._check)
-        self._limits, self._stop = limits, stop
-        self._verdict: GivenUpError | None = None
         self._seen = psutil.Process(self._process.pid)
+        self._family = [self._seen]
         self._printed, self.peak, self._killed = b"", 0, _killed_for_memory()
-        self.start_clock()
         self._ended = threading.Event()
         self._threads = [threading.Thread(target=f, daemon=True) for f in (self._read, self._watch)]
         for thread in self._threads:
             thread.start()
 
-    def start_clock(self) -> None:
-        """Count the seconds of the limit from now on."""
-        self._start = time.monotonic()
-
     @property
     def elapsed(self) -> float:
         """Seconds of the limit that are used up."""
-        return time.monotonic() - self._start
+        return time.monotonic() - self.start
 
     @property
     def exited(self) -> bool:
@@ -143,29 +142,43 @@ class Child:
             time.sleep(END_POLL_SECONDS)
         return True
 
-    def hang_up(self) -> None:
-        """Send nothing more: the process reads what was sent, and then the end."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_WR)
+    def fork(self) -> Channel:
+        """Have a worker fork, and return the channel of that process, in place of the last one."""
+        channel, remote = self._channel_pair()
+        self._channels[1:] = [channel]
+        with contextlib.suppress(ConnectionError):  # It has ended, as the channel will tell.
+            self.channel.send({"fork": True})
+            self.channel.send_descriptor(remote)
+        os.close(remote)
+        return channel
+
+    def check(self) -> None:
+        """Raise `GivenUpError` when a limit was passed."""
+        if self._verdict:
+            raise self._verdict
+
+    def _channel_pair(self) -> tuple[Channel, int]:
+        """Return a channel, and the descriptor of its other end for one other process."""
+        here, there = socket.socketpair()
+        return Channel(here.detach(), self.check), there.detach()
 
     def end(self) -> str:
         """Kill it with all that it has started, and return the end of what was printed."""
         self._ended.set()
         end_all(self._process.pid, self._mark)
         self.returncode = self._process.wait()
-        if self._box and self.returncode > 128:  # So bubblewrap tells of a signal.
+        if self._box and 128 < self.returncode <= 128 + signal.NSIG:  # bubblewrap's for a signal
             self.returncode = 128 - self.returncode
-        # A process that escaped could hold socket and output open for ever: do not wait for it.
-        self.hang_up()
+        # A process that escaped could hold the output open for ever: do not wait for it.
         for thread in self._threads:
             thread.join(timeout=1.0)
         os.close(self._held)
         return self._printed.decode(errors="replace")
 
     def close(self) -> None:
-        """Close the channel, once nothing is sent any more."""
-        self.channel.close()
-        self._socket.close()
+        """Close all channels."""
+        for channel in self._channels:
+            channel.close()
 
     def _read(self) -> None:
         """Read what is printed, and keep the end of it."""
@@ -175,32 +188,29 @@ class Child:
                     self._printed = (self._printed + part)[-LOG_BYTES:]
 
     def _watch(self) -> None:
-        """Close the channel when a limit is passed, or when the process has ended.
+        """Hang up when a limit is passed, or when the process has ended.
 
-        A process that it has started may hold the channel open, or send half a frame.
+        A process that it has started may hold a channel open, or send half a frame.
         """
-        with contextlib.suppress(GivenUpError):
-            while not self._ended.wait(POLL_SECONDS) and not self.exited:
-                self._check()
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RD)
+        while not self._ended.wait(POLL_SECONDS):
+            if not self.exited:
+                self._verdict = self._verdict or self._judge()
+                if not self._verdict:
+                    continue
+            for channel in self._channels:
+                channel.hang_up()
 
     def death(self) -> str:
         """Say how it ended, after `end`."""
         if self.returncode < 0:
-            return f"was killed by {signal.Signals(-self.returncode).name}"
+            names = {one.value: one.name for one in signal.Signals}  # not of all there are
+            return f"was killed by {names.get(-self.returncode, f'signal {-self.returncode}')}"
         return f"ended with exit code {self.returncode}"
 
     @property
     def out_of_memory(self) -> bool:
         """Tell whether it was killed while the system killed processes for want of memory."""
         return self.returncode == -signal.SIGKILL and _killed_for_memory() > self._killed
-
-    def _check(self) -> None:
-        """Raise `GivenUpError` when a limit is passed, and ever after."""
-        self._verdict = self._verdict or self._judge()
-        if self._verdict:
-            raise self._verdict
 
     def _judge(self) -> GivenUpError | None:
         if self._stop and self._stop():
@@ -223,19 +233,21 @@ class Child:
     def _used(self) -> tuple[int, int]:
         """Return the resident bytes and the number of its processes: now and then of all of them.
 
-        What processes share counts once.
+        What processes share counts once. In between, the largest counts.
         """
-        processes, held = [], 0
-        with contextlib.suppress(psutil.Error):
-            if time.monotonic() - self._looked < LOOK_SECONDS:
-                return int(self._seen.memory_info().rss), 1
+        looks, held = time.monotonic() - self._looked > LOOK_SECONDS, 0
+        if looks:
             self._looked = time.monotonic()
-            processes = [self._seen, *self._seen.children(recursive=True)]
-        for process in processes:
             with contextlib.suppress(psutil.Error):
-                info = process.memory_full_info()
-                held += int(getattr(info, "pss", info.uss))
-        return held, len(processes)
+                self._family = [self._seen, *self._seen.children(recursive=True)]
+        for process in self._family:
+            with contextlib.suppress(psutil.Error):
+                if looks:
+                    info = process.memory_full_info()
+                    held += int(getattr(info, "pss", info.uss))
+                else:
+                    held = max(held, int(process.memory_info().rss))
+        return held, len(self._family)
 
 
 def _killed_for_memory() -> int:

@@ -1,33 +1,37 @@
-"""Run one detector in a process of its own, and turn every way to fail into a status."""
+"""Run one detector in processes of its own, and turn every way to fail into a status."""
 
 import math
 import signal
-from collections import deque
-from collections.abc import Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
+import numpy as np
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.plugins.isolation import (
     CHUNK,
     CLOSED_SECONDS,
+    HEADER_BYTES,
+    LOG_BYTES,
+    MOST_PREFIXES,
     ROW_BYTES,
+    Channel,
     ChannelClosedError,
     ChannelGarbledError,
+    message_of,
 )
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
+from oodd_eval.plugins.isolation.reads import Reads
 from oodd_eval.plugins.isolation.sandbox import Sandbox
+from oodd_eval.plugins.state import PackedState
 
 _FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
 """The values that a worker reports of itself."""
-
-_T = TypeVar("_T")
-_Expected = deque[tuple[str, int]]  # of each trajectory sent: kind of the array to come, and rows
 
 
 @dataclass(slots=True)
@@ -36,8 +40,9 @@ class Outcome:
 
     `status` is as in a record, with a reason of one line unless ok. `scores`, `warm_up` and what is
     kept of explanations, if it has `explained`, are the detector's own, and checked only for their
-    number and size. Costs are None when the worker ended before they were known; what it told of
-    them is held within what this process knows. `log` is the end of the detector's output.
+    number and size. `state` is that of the fit, checked, where it was asked for and there is one.
+    Costs are None when the worker ended before they were known; what it told of them is held within
+    what this process knows. `log` is the end of the detector's output.
     """
 
     status: str = "ok"
@@ -45,6 +50,7 @@ class Outcome:
     scores: list[object] = field(default_factory=list)
     explained: list[object] = field(default_factory=list)
     warm_up: object = 0
+    state: PackedState | None = None
     seconds_fit: float | None = None
     seconds_score: float | None = None
     peak_rss_mb: float | None = None
@@ -53,147 +59,228 @@ class Outcome:
 
 def run_isolated(
     request: Mapping[str, Any],
-    train: Iterable[Trajectory],
+    train: Sequence[Trajectory],
     groups: Iterable[Iterable[Trajectory]],
     explained: Iterable[Iterable[Trajectory]] = (),
     *,
     limits: Limits,
     stop: Stop,
+    state: PackedState | None = None,
+    keep: bool = False,
+    streamed: bool = False,
 ) -> Outcome:
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
 
-    A detector that explains is asked to explain the groups `explained` in the same way, last.
+    A group's process is a fork of the fitted one. Where there can be none, as threads run on after
+    the fit or in a sandbox, it is a fresh one, which takes over the state of the fit; in a sandbox,
+    a detector without a state is fitted again in each. A detector that explains is asked to explain
+    the groups `explained` in the same way, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
-    perhaps ``baseline`` (see `make_detector`), and the number of trajectories to ``train`` on.
-    ``load`` is the directory of a kept fit, which replaces fitting; ``save`` is an empty directory
-    where the detector may save its fit. One of the two may be empty.
-    Each iterable is read once, lazily and from another thread, the next one when the one before is
-    exhausted. Scores come back in the order of the groups. When `stop` says True, the worker is
-    killed and the status is ``"error"``. Only errors of reading the trajectories are raised.
+    perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
+    fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row at a time,
+    and waits for its score before the next; then nothing is explained.
+
+    Groups are read once and lazily. Scores come back in their order. When `stop` says True, the
+    worker is killed and the status is ``"error"``. Only errors of reading the trajectories are
+    raised.
     """
-    outcome, expected, box, inside = Outcome(), _Expected(), None, request
-    with ExitStack() as stack:
-        if limits.hidden is not None:
-            box = stack.enter_context(closing(Sandbox(limits.hidden)))
-            inside = box.taken(request)
-        module = "oodd_eval.plugins.isolation.worker"
-        child = stack.enter_context(closing(Child(module, limits, stop, box)))
-        # From another thread, so that neither side can deadlock on a full socket.
-        pool = stack.enter_context(ThreadPoolExecutor(1))
-        explains: Future[bool] = Future()
-        sent = pool.submit(_send, child, inside, train, groups, explained, explains, expected)
-        try:
-            _converse(child, outcome, explains, expected)
-        except GivenUpError as error:
-            outcome.status, outcome.reason = error.status, error.reason
-        except (ChannelGarbledError, LookupError, TypeError, ValueError, OverflowError):
-            outcome.status = "error"
-            outcome.reason = "the detector wrote into the pipe between worker and harness"
-        except ChannelClosedError:
-            doing = "fitting" if outcome.seconds_fit is None else "scoring"
-            outcome.status = "error"
-            if not child.wait_for_exit(seconds=CLOSED_SECONDS):
-                outcome.reason = f"the worker closed its pipe while {doing}, without a result"
-        finally:
-            if not explains.done():
-                explains.set_result(False)
-            outcome.log = child.end()
-        if box:
-            box.give(request)
-    sent.result()
-    if outcome.status == "error" and not outcome.reason:
-        outcome.reason = f"the worker {child.death()} while {doing}"
-        if child.out_of_memory:
-            outcome.status = "oom"
-            outcome.reason = f"the system ran out of memory and killed the worker while {doing}"
-        elif child.returncode == -signal.SIGKILL:
-            outcome.reason += f", not by oodd-eval; it held {child.peak / 1e6:.0f} MB or more"
-    return outcome
+    unit = _UnitRun(request, train, limits, stop, state, keep, streamed)
+    try:
+        unit.run(groups, explained)
+    except GivenUpError as error:
+        unit.outcome.status, unit.outcome.reason = error.status, error.reason
+    return unit.outcome
 
 
-def _converse(
-    child: Child, outcome: Outcome, explains: "Future[bool]", expected: "_Expected"
-) -> None:
-    """Receive the worker's messages into `outcome` until the last one; raise for any other."""
-    channel, seconds, peak = child.channel, 0.0, 0.0
-    arrays = {"array": outcome.scores, "explanation": outcome.explained}
-    memory = psutil.virtual_memory().total / 1e6
-    while outcome.seconds_score is None:
-        message = channel.receive()
-        if "status" in message:
-            if message["status"] not in _FAILURES:
-                raise ValueError(message["status"])
-            raise GivenUpError(message["status"], _typed(message, "reason", str))
-        if outcome.seconds_fit is None:
-            outcome.warm_up, answer = message["warm_up"], _typed(message, "explains", bool)
-            outcome.seconds_fit = _number(message, "seconds_fit", child.elapsed)
-            explains.set_result(answer)
-        elif "peak_rss_mb" in message:
-            peak = max(peak, _number(message, "peak_rss_mb", memory))
-            if "seconds_score" in message:
-                seconds += _number(message, "seconds_score", child.elapsed)
+@dataclass(slots=True)
+class _UnitRun:
+    """The processes of one unit, one after the other, and what they come to."""
+
+    request: Mapping[str, Any]
+    train: Sequence[Trajectory]
+    limits: Limits
+    stop: Stop
+    state: PackedState | None
+    keep: bool
+    streamed: bool
+    outcome: Outcome = field(default_factory=Outcome)
+    start: float = field(default_factory=time.monotonic)
+    seconds: float = 0.0
+    peak: float = 0.0
+    explains: bool = False
+    updates: bool = False
+    box: Sandbox | None = None
+    reads: Reads | None = None
+
+    def __post_init__(self) -> None:
+        if self.limits.hidden is not None:
+            self.box = Sandbox(self.limits.hidden)
+            self.reads = self.box.reads() if self.streamed else None
+
+    def run(
+        self, groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]]
+    ) -> None:
+        """Fit and score; `GivenUpError` for any failure."""
+        with ExitStack() as stack:
+            fitted = None
+            if not (self.box and self.state):
+                fitted = stack.enter_context(self._process())
+                if not self._fit(fitted, forks=not self.box):
+                    stack.close()
+                    fitted = None
+            for group in groups:
+                self._group(fitted, group, "stream" if self.streamed else "score")
+            # Last, as only what comes again is anomalous: no process that scores is told so.
+            for group in explained if self.explains and not self.streamed else ():
+                self._group(fitted, group, "explain")
+        self.outcome.seconds_score = min(self.seconds, time.monotonic() - self.start)
+        self.outcome.peak_rss_mb = self.peak
+
+    def _group(self, fitted: Child | None, group: Iterable[Trajectory], order: str) -> None:
+        """Have a process of its own score, or explain, a group."""
+        with ExitStack() as stack:
+            if self.reads:
+                stack.enter_context(self.reads.forgotten())
+            if fitted:
+                channel = stack.enter_context(closing(fitted.fork()))
             else:
-                outcome.seconds_score = min(seconds, child.elapsed)
-                outcome.peak_rss_mb = max(peak, child.peak / 1e6)
-        elif (kind := _typed(message, "type", str)) in arrays:
-            expected_kind, rows = expected.popleft()
-            if kind != expected_kind:
-                raise ValueError(kind)
-            arrays[kind].append(channel.receive_array(4096 + ROW_BYTES * rows))
-        else:
-            wrong = f"score returned {kind}, expected a numpy array of float64"
-            raise GivenUpError("invalid", wrong)
+                child = stack.enter_context(self._process())
+                self._fit(child, forks=False)
+                channel = child.channel
+            (self._stream if order == "stream" else self._score)(channel, group, order)
+
+    @contextmanager
+    def _process(self) -> Iterator[Child]:
+        """Start a process, and end it after use; `GivenUpError` says how it failed."""
+        module, gone = "oodd_eval.plugins.isolation.worker", None
+        with closing(Child(module, self.limits, self.stop, self.box)) as child:
+            child.start = self.start
+            try:
+                yield child
+            except ChannelGarbledError:
+                reason = "the detector wrote into the pipe between worker and harness"
+                raise GivenUpError("error", reason) from None
+            except (ChannelClosedError, ConnectionError):
+                child.check()
+                gone = child.wait_for_exit(seconds=CLOSED_SECONDS)
+            finally:
+                self.outcome.log = (self.outcome.log + child.end())[-LOG_BYTES:]
+                self.peak = max(self.peak, child.peak / 1e6)
+            if gone is not None:
+                doing = "fitting" if self.outcome.seconds_fit is None else "scoring"
+                raise _ended(child, doing, gone=gone)
+
+    def _fit(self, child: Child, *, forks: bool) -> bool:
+        """Have a process fit, or take over the state; return whether groups can be forks of it."""
+        state, channel, outcome = self.state, child.channel, self.outcome
+        with suppress(ConnectionError):  # It has ended; what it said tells why.
+            train = () if state else self.train
+            wants = state is None and outcome.seconds_fit is None and (self.keep or not forks)
+            order = {"train": len(train), "restore": state is not None}
+            channel.send({**self.request, **order, "forks": forks, "state": wants})
+            if state:
+                channel.send_state(state)
+            for trajectory in train:
+                channel.send_trajectory(trajectory)
+        message = _receive(channel)
+        seconds = _number(message, "seconds_fit", child.elapsed)
+        outcome.seconds_fit = seconds if outcome.seconds_fit is None else outcome.seconds_fit
+        outcome.warm_up = _value(message, "warm_up", object)
+        self.explains, self.updates, can_fork, follows = (
+            _value(message, name, bool) for name in ("explains", "updates", "forks", "state")
+        )
+        if follows:
+            outcome.state = self.state = channel.receive_state()
+        if forks and not can_fork and not self.state:
+            raise GivenUpError(
+                "incompatible",
+                "threads or processes run on after fit, which groups would share, so that the "
+                "process cannot be forked, and there is no state to hand over: end them in fit, or "
+                "give the detector state and restore",
+            )
+        return bool(can_fork)
+
+    def _score(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
+        arrays = self.outcome.explained if order == "explain" else self.outcome.scores
+        rest = iter(group)
+        while chunk := list(islice(rest, CHUNK)):
+            with suppress(ConnectionError):
+                channel.send({order: len(chunk)})
+                for trajectory in chunk:
+                    channel.send_trajectory(trajectory)
+            self._cost(channel)
+            for trajectory in chunk:
+                most = HEADER_BYTES + ROW_BYTES * len(trajectory)
+                arrays.append(channel.receive_array(most))
+
+    def _stream(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
+        """Send a row, and wait for its score before the next one."""
+        for trajectory in group:
+            n, width, scores = len(trajectory), trajectory.action_dim, []
+            if not self.updates and n > MOST_PREFIXES:
+                reason = f"an episode has {n} rows, and without update at most {MOST_PREFIXES} are "
+                raise GivenUpError("incompatible", reason + "scored row by row")
+            channel.send({order: width})
+            actions = np.pad(trajectory.actions, ((1, 0), (0, 0)))
+            rows = np.hstack([actions, trajectory.observations]).tobytes()
+            size, skipped = len(rows) // n, 4 * width  # Before the first row there is no action.
+            for start in range(0, len(rows), size):
+                channel.send_bytes(rows[start + skipped : start + size])
+                scores.append(score := channel.receive_bytes())
+                if len(score) != 8:
+                    _checked(message_of(score))
+                    raise ChannelGarbledError("a message in place of a score")
+                skipped = 0
+            channel.send_bytes(b"")
+            self._cost(channel)
+            self.outcome.scores.append(np.frombuffer(b"".join(scores), "<f8").astype(np.float64))
+
+    def _cost(self, channel: Channel) -> None:
+        """Receive what scoring has cost."""
+        message = _receive(channel)
+        memory = psutil.virtual_memory().total / 1e6
+        self.seconds += _number(message, "seconds_score", time.monotonic() - self.start)
+        self.peak = max(self.peak, _number(message, "peak_rss_mb", memory))
 
 
-def _typed(message: Mapping[str, Any], name: str, kind: type[_T]) -> _T:
-    """Return a value of a message; raise for one of another type."""
-    if type(value := message[name]) is not kind:
-        raise TypeError(name)
-    return value
+def _ended(child: Child, doing: str, *, gone: bool) -> GivenUpError:
+    """Return how a process has failed that closed its channel without a result."""
+    if not gone:
+        return GivenUpError("error", f"the worker closed its pipe while {doing}, without a result")
+    if child.out_of_memory:
+        reason = f"the system ran out of memory and killed the worker while {doing}"
+        return GivenUpError("oom", reason)
+    reason = f"the worker {child.death()} while {doing}"
+    if child.returncode == -signal.SIGKILL:
+        reason += f", not by oodd-eval; it held {child.peak / 1e6:.0f} MB or more"
+    return GivenUpError("error", reason)
+
+
+def _receive(channel: Channel) -> dict[str, Any]:
+    return _checked(channel.receive())
+
+
+def _checked(message: dict[str, Any]) -> dict[str, Any]:
+    """Return a message that reports no failure; `GivenUpError` for one that does."""
+    if "status" in message:
+        status, reason = (_value(message, name, str) for name in ("status", "reason"))
+        if status not in _FAILURES:
+            raise ChannelGarbledError(f"status {status!r:.80}")
+        raise GivenUpError(status, reason)
+    return message
+
+
+def _value(message: Mapping[str, Any], name: str, kind: type[Any]) -> Any:
+    """Return a value of a message; raise for a missing one, or one of another type."""
+    if name not in message or (kind is not object and type(message[name]) is not kind):
+        raise ChannelGarbledError(f"{name} in {message!r:.80}")
+    return message[name]
 
 
 def _number(message: Mapping[str, Any], name: str, most: float) -> float:
-    """Return a number of a message, and at most what is possible; `ValueError` for no amount."""
-    value = message[name]
+    """Return a number of a message, and at most what is possible; raise for no amount."""
+    value = _value(message, name, object)
     if type(value) not in (int, float) or not 0 <= value < math.inf:
-        raise ValueError(name)
+        raise ChannelGarbledError(f"{name} = {value!r:.80}")
     return float(min(value, most))
-
-
-def _send(
-    child: Child,
-    request: Mapping[str, Any],
-    train: Iterable[Trajectory],
-    groups: Iterable[Iterable[Trajectory]],
-    explained: Iterable[Iterable[Trajectory]],
-    explains: "Future[bool]",
-    expected: "_Expected",
-) -> None:
-    """Send all; what has to come back of a trajectory is noted before it is sent."""
-    send = child.channel.send
-
-    def send_group(group: Iterable[Trajectory], kind: str) -> None:
-        send({"group": True})
-        rest = iter(group)
-        while chunk := list(islice(rest, CHUNK)):
-            send({"score": len(chunk), "explain": kind == "explanation"})
-            for trajectory in chunk:
-                expected.append((kind, len(trajectory)))
-                child.channel.send_trajectory(trajectory)
-        send({"score": 0})
-
-    try:
-        send({**request})
-        for trajectory in train:
-            child.channel.send_trajectory(trajectory)
-        for group in groups:
-            send_group(group, "array")
-        # Last, as only what comes again is anomalous: no process that scores is told so.
-        for group in explained if explains.result() else ():
-            send_group(group, "explanation")
-        send({"group": False})
-    except ConnectionError:
-        pass  # The worker ended; the receiving side finds out why.
-    finally:
-        child.hang_up()

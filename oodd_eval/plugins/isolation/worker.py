@@ -1,29 +1,26 @@
 """The process that holds one detector: it receives trajectories without names and returns scores.
 
-It never holds onsets, anomalies, twins' pairing or the name of the environment. Training
-trajectories come first, in the order of the split; then the trajectories to score, in groups.
-
-Each group is scored by a fork of the fitted process, which ends with it. So nothing that an honest
-detector remembers of a group reaches the next one, and two episodes with the same seed, which agree
-bit for bit before the onset, never meet. A process with further threads cannot be forked safely (a
-GPU starts some), and further processes would be shared by all groups: the fit is saved, and loaded
-by a fresh process for each group. Files and shared memory are not watched. When all is scored, some
-groups come once more to a detector that explains, each in a process of its own as before.
+It never holds onsets, anomalies, twins' pairing or the name of the environment. It makes the
+detector, which learns from training trajectories or takes over a state, and then does what it is
+ordered over its channel, until that ends: score or explain some trajectories, score rows one by
+one, or fork. Every fork has a channel of its own, gets one group and ends with it, so nothing that
+an honest detector remembers of a group reaches the next one, and two episodes with the same seed,
+which agree bit for bit before the onset, never meet.
 
 Messages have a descriptor of their own, so that nothing that a detector prints gets between them.
 """
 
 import faulthandler
 import gc
-import json
 import math
+import numbers
 import os
 import resource
-import shutil
 import signal
-import subprocess
+import struct
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -38,10 +35,28 @@ from numpy.typing import NDArray
 from oodd_eval.data.files import flush_streams
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, TrajectoryError
-from oodd_eval.plugins.contract import Detector, StorableDetector, make_detector, score_chunk
+from oodd_eval.plugins.contract import (
+    Detector,
+    StorableDetector,
+    StreamingDetector,
+    make_detector,
+    score_chunk,
+)
 from oodd_eval.plugins.discovery import describe, offer_of, printable
 from oodd_eval.plugins.explanations import explain_chunk, explains
-from oodd_eval.plugins.isolation import FIT_END_SECONDS, MARK, ROW_BYTES, SCORED, Channel, end_all
+from oodd_eval.plugins.isolation import (
+    CHILD_SUBREAPER,
+    FIT_END_SECONDS,
+    MARK,
+    ROW_BYTES,
+    SCORED,
+    Channel,
+    ChannelClosedError,
+    end_all,
+    end_with,
+    process_control,
+)
+from oodd_eval.plugins.state import PackedState, pack
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
     MemoryError: "oom",
@@ -105,38 +120,166 @@ def peak_rss_mb() -> float:
         return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def serve(channel: Channel, descriptors: Sequence[str]) -> None:
-    """Fit the requested detector and have every group that comes scored by a process of its own."""
+def serve(channel: Channel) -> None:
+    """Make the requested detector, have it fitted, tell of it, and do what is ordered."""
     threads, pid = psutil.Process().num_threads(), os.getpid()
     request = channel.receive()
-    train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
+    detector = _detector(request)
     start = time.perf_counter()
-    detector = _make_detector(request)
-    if request["load"]:
-        _load(detector, request["load"])
+    if request["restore"]:
+        if not isinstance(detector, StorableDetector):
+            raise ContractError("the detector has state but no restore")
+        detector.restore(channel.receive_state().state())
     else:
+        train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
+        start = time.perf_counter()
         detector.fit(train)
     if os.getpid() != pid:
         os._exit(1)  # The fit has forked, and one process answers.
-    seconds_fit = time.perf_counter() - start
-    saved = request["load"] or (request["save"] and _saved(detector, request["save"]))
-    process: Callable[[], int] = lambda: _fork(channel, detector)  # noqa: E731
-    if _runs_on(threads):
-        _end_children()
-        if not saved:
-            raise NotImplementedError(
-                "threads or processes run on after fit, which groups would share, so that the "
-                "process cannot be forked, and the fit cannot be saved: end them in fit, or give "
-                "the detector save and load"
-            )
-        order = json.dumps({**request, "load": saved, "train": 0})
-        process = lambda: _start(descriptors, order)  # noqa: E731
-    known = {"warm_up": getattr(detector, "warm_up", 0), "explains": explains(detector)}
-    channel.send({"seconds_fit": seconds_fit, **known})
-    while channel.receive()["group"]:
-        if (code := process()) != SCORED:
-            _end_like(code)
-    channel.send({"peak_rss_mb": peak_rss_mb()})
+    seconds = time.perf_counter() - start
+    forks = request["forks"] and not _runs_on(threads)
+    asked = request["state"] or (request["forks"] and not forks)
+    state = _state(detector) if asked and not request["restore"] else None
+    channel.send(
+        {
+            "seconds_fit": seconds,
+            "warm_up": getattr(detector, "warm_up", 0),
+            "explains": explains(detector),
+            "updates": isinstance(detector, StreamingDetector),
+            "forks": forks,
+            "state": state is not None,
+        }
+    )
+    if state is not None:
+        channel.send_state(state)
+    _obey(channel, detector)
+
+
+def _obey(channel: Channel, detector: Detector) -> None:
+    """Do what is ordered until the harness closes the channel."""
+    with suppress(ChannelClosedError):
+        while order := channel.receive():
+            if "fork" in order:
+                _fork(channel, detector)
+            elif "stream" in order:
+                _score_rows(channel, detector, **order)
+            else:
+                _score(channel, detector, **order)
+    _end_children()
+
+
+def _detector(request: dict[str, Any]) -> Detector:
+    gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
+    spec = offer_of(request["plugin"], request["detector"]).spec
+    arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
+    detector = make_detector(spec.factory, **arguments, baseline=request.get("baseline", 0))
+    gc.enable()
+    return detector
+
+
+def _state(detector: Detector) -> PackedState | None:
+    """Return a detector's state; None where it has none, or fails to tell it."""
+    if not isinstance(detector, StorableDetector):
+        return None
+    try:
+        return pack(detector.state())
+    except BaseException:  # noqa: BLE001  a detector may raise anything; it is fitted again
+        traceback.print_exc()
+        return None
+
+
+def _fork(channel: Channel, detector: Detector) -> None:
+    """Have a fork of this process serve the channel that follows; if it fails, end like it."""
+    descriptor, parent = channel.receive_descriptor(), os.getpid()
+    flush_streams()  # What is printed but not written yet would be written by every fork.
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            end_with(parent)
+            channel.close()
+            channel = Channel(descriptor)
+            code = _reported(channel, lambda: _obey(channel, detector)) or SCORED
+        finally:
+            os._exit(code)  # Whatever happens, a fork never goes on with the orders of its parent.
+    os.close(descriptor)
+    if (code := os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])) != SCORED:
+        _end_like(code)
+
+
+def _end_like(code: int) -> NoReturn:
+    """Exit with the group's exit code or signal."""
+    if code < 0:
+        if -code != signal.SIGKILL:
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code)
+
+
+def _score(channel: Channel, detector: Detector, *, score: int = 0, explain: int = 0) -> None:
+    """Score, or explain, so many trajectories, and return what came of each."""
+    chunk = [channel.receive_trajectory() for _ in range(score + explain)]
+    start = time.perf_counter()
+    returned = (explain_chunk if explain else score_chunk)(detector, chunk)
+    seconds = 0.0 if explain else time.perf_counter() - start
+    for trajectory, array in zip(chunk, returned, strict=True):
+        if not isinstance(array, np.ndarray):
+            wrong = type(array).__name__
+        elif array.nbytes > ROW_BYTES * len(trajectory):
+            wrong = f"an array of shape {array.shape}"
+        elif array.dtype.hasobject:
+            wrong = "ndarray of object"
+        else:
+            continue
+        raise ContractError(f"score returned {wrong}, expected a numpy array of float64")
+    channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
+    for array in returned:
+        channel.send_array(np.asarray(array))
+
+
+def _score_rows(channel: Channel, detector: Detector, *, stream: int) -> None:
+    """Score an episode row by row: each comes when the score of the one before was sent.
+
+    A row is an observation, behind the action of that width that came before it, if there is one.
+    """
+    streaming = detector if isinstance(detector, StreamingDetector) else _Prefixes(detector, stream)
+    seconds, width = 0.0, 0
+    streaming.reset()
+    while row := channel.receive_bytes():
+        values, start = np.frombuffer(row, np.float32), time.perf_counter()
+        action = values[:width] if width else None
+        score = _real(streaming.update(values[width:], action))
+        seconds, width = seconds + time.perf_counter() - start, stream
+        channel.send_bytes(struct.pack("<d", score))
+    channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
+
+
+def _real(score: object) -> float:
+    if not isinstance(score, numbers.Real):
+        raise ContractError(f"update returned {type(score).__name__}, expected a float")
+    return float(score)
+
+
+class _Prefixes:
+    """A detector without ``update``, run beside a robot: it scores all rows until now each time."""
+
+    def __init__(self, detector: Detector, actions: int) -> None:
+        self._detector, self._width = detector, actions
+
+    def reset(self) -> None:
+        self._observations: list[NDArray[np.float32]] = []
+        self._actions = np.zeros((0, self._width), np.float32)
+
+    def update(self, observation: NDArray[np.float32], action: NDArray[np.float32] | None) -> Any:
+        if self._observations:
+            self._actions = np.vstack([self._actions, np.zeros(0) if action is None else action])
+        self._observations.append(observation)
+        prefix = Trajectory(self._observations, self._actions)
+        (scores,) = score_chunk(self._detector, [prefix])
+        if not isinstance(scores, np.ndarray) or scores.shape != (len(prefix),):
+            form = getattr(scores, "shape", type(scores).__name__)
+            raise ContractError(f"score returned {form} for {len(prefix)} observations")
+        return scores[-1]
 
 
 def _runs_on(threads: int) -> bool:
@@ -174,123 +317,47 @@ def _end_children() -> None:
             child.kill()
 
 
-def _make_detector(request: dict[str, Any]) -> Detector:
-    gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
-    spec = offer_of(request["plugin"], request["detector"]).spec
-    arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    detector = make_detector(spec.factory, **arguments, baseline=request.get("baseline", 0))
-    gc.enable()
-    return detector
-
-
-def _load(detector: Detector, directory: str) -> None:
-    if not isinstance(detector, StorableDetector):
-        raise ContractError("the detector has save but no load")
-    detector.load(Path(directory))
-
-
-def _saved(detector: Detector, path: str) -> str:
-    """Let a detector save itself; return the directory, or nothing where that fails."""
-    if not isinstance(detector, StorableDetector):
-        return ""
-    directory = Path(path)
-    try:
-        detector.save(directory)
-    except BaseException:  # noqa: BLE001  a detector may raise anything; a later run fits again
-        traceback.print_exc()
-        # What is left of it is not kept, as nothing is in an empty or missing directory.
-        shutil.rmtree(directory, ignore_errors=True)
-        with suppress(OSError):
-            directory.mkdir(parents=True)
-        return ""
-    return path
-
-
-def _fork(channel: Channel, detector: Detector) -> int:
-    """Score a group in a fork of this process; return its exit code, negative for a signal."""
-    flush_streams()  # What is printed but not written yet would be written by every fork.
-    process = os.fork()
-    if process == 0:
-        code = 1
-        try:
-            code = _reported(channel, lambda: _score_group(channel, detector)) or SCORED
-        finally:
-            os._exit(code)  # Whatever happens, a fork never goes on with the loop over groups.
-    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-
-
-def _start(descriptors: Sequence[str], order: str) -> int:
-    """Score a group in a fresh process that loads the fit; return its exit code."""
-    command = [sys.executable, "-P", "-m", "oodd_eval.plugins.isolation.worker", *descriptors]
-    return subprocess.run(  # noqa: S603  our own interpreter and module
-        [*command, order], pass_fds=[int(d) for d in descriptors], check=False
-    ).returncode
-
-
-def _end_like(code: int) -> NoReturn:
-    """Exit with the group's exit code or signal."""
-    if code < 0:
-        if -code != signal.SIGKILL:
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    os._exit(code)
-
-
-def _score_group(channel: Channel, detector: Detector) -> None:
-    """Score, or explain, what comes until a chunk of zero, and end the processes of this."""
-    seconds = 0.0
-    while size := (order := channel.receive())["score"]:
-        chunk = [channel.receive_trajectory() for _ in range(size)]
-        start = time.perf_counter()
-        returned = (explain_chunk if order["explain"] else score_chunk)(detector, chunk)
-        seconds += 0.0 if order["explain"] else time.perf_counter() - start
-        for trajectory, array in zip(chunk, returned, strict=True):
-            if not isinstance(array, np.ndarray):
-                channel.send({"type": type(array).__name__})
-            elif array.nbytes > ROW_BYTES * len(trajectory):
-                channel.send({"type": f"an array of shape {array.shape}"})
-            elif array.dtype.hasobject:
-                channel.send({"type": "ndarray of object"})
-            else:
-                channel.send({"type": "explanation" if order["explain"] else "array"})
-                channel.send_array(np.asarray(array))
-    _end_children()
-    channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
-
-
-def connect(arguments: Sequence[str], *, guarded: bool = True) -> Channel:
+def connect(arguments: Sequence[str]) -> Channel:
     """Return the channel to the harness, from the command line of a process that it has started.
 
-    The harness never writes to the lifeline: reading it ends when the harness is no more. Where
-    this process is `guarded`, that ends it and whatever it has started, too.
+    Outside a sandbox, which ends by itself, a lifeline is named, too. The harness never writes to
+    it: reading it ends when the harness is no more.
     """
-    conversation, lifeline = descriptors = [int(a) for a in arguments]
+    descriptors = [int(a) for a in arguments]
     for descriptor in descriptors:
         os.set_inheritable(descriptor, False)
-    if guarded:
+    for lifeline in descriptors[1:]:
         _guard(lifeline)
     faulthandler.enable()
-    return Channel(conversation)
+    return Channel(descriptors[0])
 
 
 def _guard(lifeline: int) -> None:
-    """Start a process that waits for the end of the harness, and then ends all that is marked.
+    """Go on in a fork, which this process waits for and ends like; none of the two outlives either.
 
-    No thread could, as a detector may hold the interpreter's lock. It is nobody's child, so that it
-    is not taken for one of the detector's.
+    What the fork has started, and left behind, becomes this process's (Linux). It is ended with the
+    fork, and all is when the harness ends. No thread could do so beside a detector, which may hold
+    the interpreter's lock.
     """
-    worker, mark = os.getpid(), os.environ[MARK]
-    if (between := os.fork()) == 0:
-        try:
-            os.setsid()
-            if os.fork() == 0:
-                os.dup2(lifeline, 0)
-                os.closerange(1, 1024)  # The worker's channel has to end with the worker.
-                os.read(0, 1)
-                end_all(worker, mark)
-        finally:
-            os._exit(0)
-    os.waitpid(between, 0)
+    guard = os.getpid()
+    process_control(CHILD_SUBREAPER, 1)
+    if (worker := os.fork()) == 0:
+        end_with(guard)
+        return
+
+    def wait() -> None:
+        os.read(0, 1)
+        os.kill(worker, signal.SIGKILL)
+
+    os.dup2(lifeline, 0)
+    os.closerange(1, 1024)  # The worker's channel has to end with the worker.
+    threading.Thread(target=wait, daemon=True).start()
+    while (ended := os.wait())[0] != worker:
+        pass  # It was left behind.
+    while _children():
+        _end_children()
+    end_all(worker, os.environ[MARK])
+    _end_like(os.waitstatus_to_exitcode(ended[1]))
 
 
 def _reported(channel: Channel, work: Callable[[], None]) -> int:
@@ -309,22 +376,12 @@ def _reported(channel: Channel, work: Callable[[], None]) -> int:
 
 
 def main(arguments: Sequence[str]) -> NoReturn:
-    """Serve one request, or load a fit and score one group; then end the process.
+    """Serve the harness; then end the process.
 
     Threads and exit handlers of the detector have no say any more: the scores are sent.
     """
-    descriptors, order = arguments[:2], arguments[2:]
-    channel = connect(descriptors, guarded=not order)  # A group's process has its worker's mark.
-
-    def group() -> None:
-        request = json.loads(order[0])
-        detector = _make_detector(request)
-        _load(detector, request["load"])
-        _score_group(channel, detector)
-
-    if order:
-        os._exit(_reported(channel, group) or SCORED)
-    os._exit(_reported(channel, lambda: serve(channel, descriptors)))
+    channel = connect(arguments)
+    os._exit(_reported(channel, lambda: serve(channel)))
 
 
 if __name__ == "__main__":

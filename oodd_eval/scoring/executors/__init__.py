@@ -22,7 +22,9 @@ class RunSettings:
     `jobs` are units at a time (None: one per core, or per thread of a cluster), `limits` those of
     each worker. `fresh` fits again what the results directory has. `executor` is ``"local"`` or
     ``"dask://HOST:PORT"``. After `deadline` seconds nothing new is begun. `command` is the command
-    line, for the provenance of records. `row_metrics` adds metrics that are computed on request.
+    line, for the provenance of records. `streamed` hands a detector one row at a time and waits for
+    its score before the next, as re-runs do. `row_metrics` adds metrics that are computed on
+    request.
     """
 
     jobs: int | None = None
@@ -32,6 +34,7 @@ class RunSettings:
     executor: str = LOCAL
     deadline: float | None = None
     command: str = ""
+    streamed: bool = False
     row_metrics: bool = False
 
 

@@ -41,7 +41,7 @@ except ImportError as error:
 
 CONNECT_SECONDS: Final = 10.0
 WORKERLESS_SECONDS: Final = 60.0  # for which units wait while there is no worker
-_FILE: Final = ("parts", "cost", "order", "explained")  # what comes back of a unit's score file
+_FILE: Final = ("parts", "cost", "explained")  # what comes back of a unit's score file
 
 Message = dict[str, Any]
 
@@ -146,6 +146,7 @@ def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
             "limit": job.plan.limit,
         },
         "unit": asdict(job.unit),
+        "streamed": job.streamed,
         "limits": asdict(limits),
     }
 
@@ -194,7 +195,8 @@ def _scored(order: Message, stop: Stop) -> Message:
     data = _environment(
         order["split"]["path"], order["split"]["name"], plan.split_digest, unit.environment
     )
-    scored = UnitJob(plan, unit, data, offer)(Limits(**order["limits"]), stop, None, fresh=True)
+    job = UnitJob(plan, unit, data, offer, order["streamed"])
+    scored = job(Limits(**order["limits"]), stop, None, fresh=True)
     outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
     return {**outcome, **{name: getattr(scored.file, name) for name in _FILE}}
 

@@ -1,0 +1,151 @@
+"""Runs that hand over one row at a time: the same scores, and nothing of what comes later."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_plugins import install
+
+from oodd_eval import load_split
+from oodd_eval.data.parts import lengths_of, parts_of
+from oodd_eval.errors import UsageError
+from oodd_eval.plugins.contract import TOLERANCE, difference
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.isolation import supervisor
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.plan import make_plan
+from oodd_eval.scoring.runner import run
+
+boxed = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
+
+PLUGIN = """
+class Whole(Good):
+    \"\"\"Has no ``update``, no state, and the length of what it was handed as its score.\"\"\"
+    def fit(self, nominal):
+        self.scale = sum(len(x) for x in nominal)
+    def score(self, x):
+        assert x.action_dim in (0, 1)
+        return np.full(len(x), float(len(x))) + self.scale
+
+class Rows(Good):
+    \"\"\"Tells what it was handed.\"\"\"
+    def reset(self): self.n = 0
+    def update(self, observation, action=None):
+        self.n += 1
+        assert self.n > 1 or action is None
+        assert observation.dtype == np.float32 and observation.shape == (4,)
+        return float(observation.sum()) + (0.0 if action is None else 100.0 * float(action.sum()))
+    def score(self, x): raise RuntimeError("not asked")
+
+class NoFloat(Rows):
+    def update(self, observation, action=None): return None
+
+class LateNan(Rows):
+    def update(self, observation, action=None):
+        return float("nan") if super().update(observation, action) and self.n > 5 else 1.0
+
+class Raises(Rows):
+    def update(self, observation, action=None):
+        if super().update(observation, action) and self.n > 5: raise KeyError("row five")
+        return 1.0
+
+class Unfit(Rows):
+    def restore(self, state): raise ValueError("no such state")
+    def state(self): return {"x": np.ones(3)}
+
+@hookimpl
+def oodd_detectors():
+    both = DetectorSpec("rows", Rows, "a test's", inputs="observations+actions")
+    return [both, *offer(whole=Whole, no_float=NoFloat, late_nan=LateNan, raises=Raises,
+                         unfit=Unfit)]
+"""
+
+
+def run_rows(detector, split, output=None, *, streamed=True, sandboxed=False, **parameters):
+    opened, plugins = load_split(split), discover()
+    plan = make_plan(plugins, split=opened, detectors=[detector], environments=["cartpole"],
+                     anomalies=["iid"], parameters=parameters)  # fmt: skip
+    limits = Limits(120, hidden=() if sandboxed else None)
+    settings = RunSettings(jobs=1, limits=limits, streamed=streamed)
+    results = ResultsDirectory(output) if output else None
+    (record,) = run(plan, opened, plugins, settings, results).records
+    if not output:
+        return record
+    sets = parts_of(opened.environment("cartpole"), ["iid"])
+    scores = results.scores(record.scores, lengths_of(sets, None)) if record.ok else None
+    return record, scores and scores.parts, sets
+
+
+@pytest.mark.parametrize(
+    ("detector", "parameters"),
+    [
+        *((name, {}) for name in ("mewma", "mahalanobis", "range", "persistence", "clock", "comb")),
+        ("random", {}), ("rf", {"trees": 3}),
+        *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn")),
+    ],
+)  # fmt: skip
+def test_scores_row_by_row_are_those_of_batches(tiny_split, tmp_path, detector, parameters):
+    batch, expected, _ = run_rows(detector, tiny_split, tmp_path, streamed=False, **parameters)
+    record, parts, _ = run_rows(detector, tiny_split, tmp_path, **parameters)
+    assert record.ok, record.reason
+    assert record.scores == f"{batch.scores}-rows"
+    for part, sequences in parts.items():
+        for one, other in zip(sequences, expected[part], strict=True):
+            assert not difference(one, other, TOLERANCE)
+
+
+@pytest.fixture
+def plugin(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "plugin", "streamed", PLUGIN)
+
+
+def test_a_row_comes_with_the_action_before_it(plugin, tiny_split, tmp_path):
+    record, parts, sets = run_rows("rows", tiny_split, tmp_path / "out")
+    assert record.ok, record.reason
+    for part, sequences in parts.items():
+        for found, x in zip(sequences, sets[part], strict=True):
+            expected = x.observations.astype(float).sum(axis=1)
+            expected[1:] += 100 * x.actions.sum(axis=1)
+            assert np.allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("sandboxed", [False, pytest.param(True, marks=boxed)])
+def test_without_update_a_row_is_the_last_of_a_prefix(plugin, tiny_split, tmp_path, sandboxed):
+    record, parts, sets = run_rows("whole", tiny_split, tmp_path / "out", sandboxed=sandboxed)
+    assert record.ok, record.reason
+    scale = sum(map(len, load_split(tiny_split).environment("cartpole").train))
+    for part, sequences in parts.items():
+        for found, x in zip(sequences, sets[part], strict=True):
+            assert found.tolist() == [scale + n + 1.0 for n in range(len(x))]
+
+
+def test_without_update_long_episodes_are_incompatible(plugin, tiny_split, monkeypatch):
+    monkeypatch.setattr(supervisor, "MOST_PREFIXES", 20)
+    record = run_rows("whole", tiny_split)
+    assert record.status == "incompatible"
+    assert "without update at most 20 are scored row by row" in record.reason
+
+
+@pytest.mark.parametrize(
+    ("detector", "status", "reason"),
+    [
+        ("no-float", "invalid", "update returned NoneType, expected a float"),
+        ("late-nan", "invalid", "returned nan at t = 5 of cartpole/"),
+        ("raises", "error", "KeyError: 'row five'"),
+        pytest.param("unfit", "error", "ValueError: no such state", marks=boxed),
+    ],
+)
+def test_a_failure_at_a_row_is_a_state_with_a_reason(plugin, tiny_split, detector, status, reason):
+    record = run_rows(detector, tiny_split, sandboxed=detector == "unfit")
+    assert (record.status, reason in record.reason) == (status, True), record.reason
+
+
+def test_a_detector_of_this_process_has_no_rows_sent(tiny_split):
+    opened = load_split(tiny_split)
+    plan = make_plan(discover(), split=opened, detectors=["clock"], environments=["cartpole"])
+    plan = replace(plan, units=tuple(replace(unit, plugin="") for unit in plan.units))
+    with pytest.raises(UsageError, match="streamed to detectors of plug-ins only"):
+        run(plan, opened, discover(), RunSettings(streamed=True))
