@@ -26,9 +26,9 @@ def offer(**factories):
 """
 
 
-def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", header=HEADER,
-            group="oodd_eval"):  # fmt: skip
-    """Put a plug-in of one module ``oodd_<name>`` on the path, under the entry point `name`."""
+def write_plugin(path, name, code, *, distribution=None, version="1.0", header=HEADER,
+                 group="oodd_eval"):  # fmt: skip
+    """Write a plug-in of one module ``oodd_<name>`` into a directory; return the module's file."""
     module = f"oodd_{name}"
     distribution = distribution or f"oodd-{name}"
     path.mkdir(parents=True, exist_ok=True)
@@ -39,12 +39,18 @@ def install(monkeypatch, path, name, code, *, distribution=None, version="1.0", 
         f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
     )
     (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}\n")
-    monkeypatch.delitem(sys.modules, module, raising=False)
+    return path / f"{module}.py"
+
+
+def install(monkeypatch, path, name, code, **settings):
+    """Put a plug-in, as `write_plugin` writes it, on the path, under the entry point `name`."""
+    file = write_plugin(path, name, code, **settings)
+    monkeypatch.delitem(sys.modules, file.stem, raising=False)
     monkeypatch.syspath_prepend(str(path))
     # Imported by the test, it must not stay for the next one.
-    monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.delitem(sys.modules, module)
-    return path / f"{module}.py"
+    monkeypatch.setitem(sys.modules, file.stem, None)
+    monkeypatch.delitem(sys.modules, file.stem)
+    return file
 
 
 def install_adversaries(monkeypatch, path, code=""):

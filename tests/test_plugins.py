@@ -18,7 +18,7 @@ OFFER = """
 def oodd_detectors():
     return offer({name}=Good)
 """
-BUILT_IN = {"random", "persistence", "clock", "comb", "range", "mahalanobis"}
+BUILT_IN = {"random", "persistence", "clock", "comb", "range", "mahalanobis", "manifold"}
 
 
 def broken(plugins):

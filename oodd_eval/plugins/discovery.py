@@ -7,24 +7,24 @@ and silently drops the second of two that share a name.)
 
 from __future__ import annotations
 
-import functools
 import inspect
 import os
-import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import chdir, contextmanager
-from dataclasses import dataclass, fields, is_dataclass
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 import pluggy
 
 from oodd_eval import plugins as hooks
 from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownNameError, UsageError
-from oodd_eval.names import PARAMETER_NAME, SPEC_NAME, check_known, select
+from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
+from oodd_eval.plugins.installed import named, points_of
+from oodd_eval.plugins.specs import MOST_SPECS, plain_spec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class _Named(Protocol):
-    """What plug-ins offer under a name."""
+    """Something that plug-ins offer under a name."""
 
     @property
     def name(self) -> str: ...
@@ -86,6 +86,30 @@ class Broken(NamedTuple):
     reason: str
 
 
+class Offering(Protocol):
+    """The offer of a plug-in: one that is loaded, or one that a sandbox has described."""
+
+    @property
+    def point(self) -> EntryPoint:
+        """Its entry point."""
+
+    @property
+    def form(self) -> str:
+        """The form of names with a colon that it knows, in its words; empty if none."""
+
+    def specs(self) -> list[DetectorSpec]:
+        """Return its detectors, checked."""
+
+    def from_spec(self, text: str) -> DetectorSpec | None:
+        """Return the detector that it makes of a name with a colon; None for one it handles not."""
+
+    def custom_specs(self) -> list[Spec]:
+        """Return its environments and anomalies, checked."""
+
+    def readers(self) -> list[Reader]:
+        """Return its readers of logs, checked."""
+
+
 @dataclass(frozen=True, slots=True)
 class Plugin:
     """A loaded plug-in: its entry point and its hooks."""
@@ -94,16 +118,31 @@ class Plugin:
     hook: pluggy.HookRelay
 
     def __str__(self) -> str:
-        return f"plug-in {self.point.name!r} of {_distribution(self.point)}"
+        return name_of(self.point)
 
     def specs(self) -> list[DetectorSpec]:
         """Return what its `oodd_detectors` returns, checked."""
         specs: list[DetectorSpec] = []
         for returned in self.hook.oodd_detectors():
-            specs += _list_of(returned, DetectorSpec, f"oodd_detectors of {self}")
-        for spec in specs:
-            check_detector_spec(spec)
+            specs += map(plain_spec, _list_of(returned, DetectorSpec, f"oodd_detectors of {self}"))
         return specs
+
+    @property
+    def form(self) -> str:
+        """The form of names with a colon that it knows, in its words; empty if none."""
+        makers = self.hook.oodd_detector_from_spec.get_hookimpls()
+        if not makers:
+            return ""
+        known = inspect.getdoc(makers[0].function) or "names with a colon"
+        return printable(known.partition("\n")[0].removesuffix("."))
+
+    def from_spec(self, text: str) -> DetectorSpec | None:
+        """Return the detector that it makes of a name with a colon; None for one it handles not."""
+        spec = self.hook.oodd_detector_from_spec(spec=text)
+        if type(spec) not in (DetectorSpec, type(None)):
+            expected = "None or a DetectorSpec whose name has a colon"
+            raise PluginError(f"{self} made {spec!r:.80} of {text!r}, expected {expected}")
+        return None if spec is None else plain_spec(spec)
 
     def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
@@ -129,11 +168,6 @@ class Plugin:
             check_reader(reader)
         return readers
 
-    def offer(self, spec: DetectorSpec) -> Offer:
-        """Return a spec as an offer; its version names the library that does the work, too."""
-        version = "+".join(filter(None, (_metadata(self.point.dist)[1], spec.version)))
-        return Offer(spec, self.point.name, self.point.module, _distribution(self.point), version)
-
 
 class Plugins:
     """The installed plug-ins, loaded as far as they were needed; made by `discover`.
@@ -142,28 +176,41 @@ class Plugins:
     did, and `observer_points` the entry points of plug-ins that observe runs.
     """
 
-    def __init__(self, points: list[EntryPoint], observer_points: list[EntryPoint]) -> None:
-        self.loaded: dict[str, Plugin] = {}
+    def __init__(
+        self,
+        points: list[EntryPoint],
+        observer_points: list[EntryPoint],
+        load: Callable[[EntryPoint], Offering] | None = None,
+    ) -> None:
+        self.loaded: dict[str, Offering] = {}
         self.broken: list[Broken] = []
-        self.observer_points = observer_points
-        self._points, self._waiting = points, list(points)
+        self.points, self.observer_points = points, observer_points
+        self._load_point, self._waiting = load or _loaded, list(points)
+        self._observed = load is None
         self._offers: dict[str, Offer] = {}
+        self._forms: dict[str, str] = {}
         self._listener: Callable[[Broken], object] | None = None
 
     @property
     def names(self) -> set[str]:
         """Names of all plug-ins, loaded or not."""
-        return {point.name for point in (*self._points, *self.observer_points)}
+        return {point.name for point in (*self.points, *self.observer_points)}
+
+    @property
+    def observing(self) -> list[EntryPoint]:
+        """Entry points of plug-ins that may observe a run: none that only a sandbox loads."""
+        loaded = [plugin.point for plugin in self.loaded.values()]
+        return [*loaded, *self.observer_points] if self._observed else []
 
     @property
     def custom_specs(self) -> dict[str, tuple[Spec, str]]:
         """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
-        return self._offered(Plugin.custom_specs)
+        return self._offered(lambda plugin: plugin.custom_specs())
 
     @property
     def readers(self) -> dict[str, tuple[Reader, str]]:
         """Readers of logs of plug-ins by name, with their origin; all are loaded."""
-        return self._offered(Plugin.readers)
+        return self._offered(lambda plugin: plugin.readers())
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -202,13 +249,10 @@ class Plugins:
 
     def spec_forms(self) -> list[tuple[str, str, str]]:
         """Return who makes detectors of names with a colon: plug-in, origin, and which names."""
-        forms = []
-        for maker in self._makers():
-            function = maker.hook.oodd_detector_from_spec.get_hookimpls()[0].function
-            known = (inspect.getdoc(function) or "").partition("\n")[0].removesuffix(".")
-            origin = " ".join(_metadata(maker.point.dist))
-            forms.append((maker.point.name, origin, known))
-        return forms
+        return [
+            (maker.point.name, " ".join(named(maker.point.dist)), form)
+            for maker, form in self._makers()
+        ]
 
     def report_broken_to(self, listener: Callable[[Broken], object]) -> None:
         """Call a function with every broken plug-in: with those found so far, and later ones."""
@@ -229,11 +273,11 @@ class Plugins:
             raise
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything
             reason = printable(doing + describe(error))
-            self.broken.append(Broken(point.name, _distribution(point), reason))
+            self.broken.append(Broken(point.name, distribution_of(point), reason))
             if self._listener:
                 self._listener(self.broken[-1])
 
-    def _offered(self, of: Callable[[Plugin], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
+    def _offered(self, of: Callable[[Offering], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
         """Return what all plug-ins offer by name, with its origin; no name is offered twice."""
         for point in list(self._waiting):
             self._load(point)
@@ -244,9 +288,9 @@ class Plugins:
                 for spec in of(plugin):
                     name = spec.name
                     if previous := offered.get(name) or of_plugin.get(name):
-                        by = f"{previous[1]} and by {plugin}"
+                        by = f"{previous[1]} and by {name_of(plugin.point)}"
                         raise PluginError(f"{name!r} is offered twice, by {by}")
-                    of_plugin[name] = (spec, str(plugin))
+                    of_plugin[name] = (spec, name_of(plugin.point))
                 offered |= of_plugin
         return offered
 
@@ -255,67 +299,71 @@ class Plugins:
         self._waiting.remove(point)
         with self.blaming(point):
             if other := self.loaded.get(point.name):
-                owner = _distribution(other.point)
+                owner = distribution_of(other.point)
                 raise PluginError(f"{owner} has a plug-in of the same name: uninstall one of them")
-            plugin = Plugin(point, register(point.load()))
+            plugin = self._load_point(point)
             offers: dict[str, Offer] = {}
             for spec in plugin.specs():
                 if previous := self._offers.get(spec.name) or offers.get(spec.name):
-                    by = f"plug-in {previous.plugin!r} of {previous.distribution} and by {plugin}"
+                    by = f"plug-in {previous.plugin!r} of {previous.distribution}"
+                    by = f"{by} and by {name_of(point)}"
                     advice = f"uninstall one of them, or leave it out with -p no:{point.name}"
                     raise PluginError(f"detector {spec.name!r} is offered twice, by {by}: {advice}")
-                offers[spec.name] = plugin.offer(spec)
+                offers[spec.name] = _offer(point, spec)
+            self._forms[point.name] = plugin.form
             self._offers |= offers
             self.loaded[point.name] = plugin
 
-    def _makers(self) -> Iterator[Plugin]:
-        """Yield plug-ins that make detectors of names with a colon, this distribution's first."""
-        for point in self._points:
+    def _makers(self) -> Iterator[tuple[Offering, str]]:
+        """Yield plug-ins that make detectors of names with a colon, this distribution's first.
+
+        Each comes with the names that it knows.
+        """
+        for point in self.points:
             if point in self._waiting:
                 self._load(point)
             plugin = self.loaded.get(point.name)
-            if (
-                plugin
-                and plugin.point is point
-                and plugin.hook.oodd_detector_from_spec.get_hookimpls()
-            ):
-                yield plugin
+            if plugin and plugin.point is point and (form := self._forms[point.name]):
+                yield plugin, form
 
     def _from_spec(self, text: str) -> Offer:
         """Ask one plug-in after the other; a failure is told as that plug-in's."""
         asked = []
-        for maker in self._makers():
+        for maker, _ in self._makers():
             try:
                 with chdir("."):
-                    spec = maker.hook.oodd_detector_from_spec(spec=text)
-            except OoddError:
+                    spec = maker.from_spec(text)
+            except (OoddError, KeyboardInterrupt):
                 raise
-            except (Exception, SystemExit) as error:
-                reason = f"{maker} failed to make detector {text!r}: {printable(describe(error))}"
-                raise PluginError(reason) from error
-            if isinstance(spec, DetectorSpec):
-                check_detector_spec(spec)
-                if ":" in spec.name:
-                    return maker.offer(spec)
-            if spec is not None:
+            except BaseException as error:
+                reason = f"failed to make detector {text!r}: {printable(describe(error))}"
+                raise PluginError(f"{name_of(maker.point)} {reason}") from error
+            if spec and ":" in spec.name:
+                return _offer(maker.point, spec)
+            if spec:
                 expected = "None or a DetectorSpec whose name has a colon"
-                raise PluginError(f"{maker} made {spec!r:.80} of {text!r}, expected {expected}")
+                what = f"made {spec.name!r} of {text!r}, expected {expected}"
+                raise PluginError(f"{name_of(maker.point)} {what}")
             asked.append(maker.point.name)
         whom = f"asked {', '.join(asked)}" if asked else "none that is loaded knows such names"
         where = "oodd-eval list detectors says which names there are"
         raise UsageError(f"no plug-in makes a detector of {text!r}: {whom} ({where})")
 
 
-def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = None) -> Plugins:
+def discover(
+    disabled: Collection[str] = (),
+    *,
+    only: Collection[str] | None = None,
+    load: Callable[[EntryPoint], Offering] | None = None,
+) -> Plugins:
     """Find the installed plug-ins, without loading any; those `disabled` are left out.
 
     `only` names those to take, beside the built-in rows. None means all, or those that the
-    environment variable ``OODD_EVAL_PLUGINS`` names.
+    environment variable ``OODD_EVAL_PLUGINS`` names. `load` is used in place of importing them.
     """
-    every = entry_points()
+    every, broken = points_of((hooks.PROJECT, "oodd_eval.observers"))
     points, observers = (
-        sorted(every.select(group=group), key=lambda p: (_foreign(p), _distribution(p), p.name))
-        for group in (hooks.PROJECT, "oodd_eval.observers")
+        sorted(group, key=lambda p: (_foreign(p), distribution_of(p), p.name)) for group in every
     )
     names = {point.name for point in (*points, *observers)}
     if only is None and RESTRICT in os.environ:
@@ -326,7 +374,30 @@ def discover(disabled: Collection[str] = (), *, only: Collection[str] | None = N
         built_in = point.name == _BUILT_IN and not _foreign(point)
         return point.name not in disabled and (only is None or built_in or point.name in only)
 
-    return Plugins([*filter(selected, points)], [*filter(selected, observers)])
+    plugins = Plugins([*filter(selected, points)], [*filter(selected, observers)], load)
+    plugins.broken += [Broken("unknown", where, reason) for where, reason in broken]
+    return plugins
+
+
+def _loaded(point: EntryPoint) -> Plugin:
+    return Plugin(point, register(point.load()))
+
+
+def plugin_of(distribution: str, name: str) -> Plugin:
+    """Return a loaded plug-in, whatever it raises when it is."""
+    (points,), _ = points_of((hooks.PROJECT,))
+    return _loaded(next(p for p in points if p.name == name and distribution_of(p) == distribution))
+
+
+def _offer(point: EntryPoint, spec: DetectorSpec) -> Offer:
+    """Return a spec as an offer; its version names the library that does the work, too."""
+    version = "+".join(filter(None, (named(point.dist)[1], spec.version)))
+    return Offer(spec, point.name, point.module, distribution_of(point), version)
+
+
+def name_of(point: EntryPoint) -> str:
+    """Return what messages call a plug-in."""
+    return f"plug-in {point.name!r} of {distribution_of(point)}"
 
 
 def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
@@ -356,52 +427,28 @@ def offer_of(plugin: str, detector: str) -> Offer:
 
 
 def _list_of(returned: object, kind: type[_Spec], hook: str) -> list[_Spec]:
-    """Return what a hook returned, if it is a list of specs of one kind."""
-    if not isinstance(returned, list) or not all(isinstance(spec, kind) for spec in returned):
+    """Return what a hook returned, if it is a list of specs of one kind: of no class of its own."""
+    if type(returned) is not list or not all(type(spec) is kind for spec in returned):
         expected = f"a list of oodd_eval.{kind.__name__}"
         raise PluginError(f"{hook} returned {returned!r:.80}, expected {expected}")
+    if len(returned) > MOST_SPECS:
+        raise PluginError(f"{hook} returned {len(returned)}, expected at most {MOST_SPECS}")
+    for spec in returned:
+        if type(spec.name) is not str:
+            raise PluginError(f"name of a {kind.__name__} is {spec.name!r:.80}, expected a text")
     return returned
-
-
-def check_detector_spec(spec: DetectorSpec) -> None:
-    """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
-    for names, expected, fits in _FIELDS:
-        for name in names.split():
-            if not fits(value := getattr(spec, name)):
-                raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
-
-
-def _text(pattern: str) -> Callable[[object], bool]:
-    """Return a function that tells whether a value is a text of a pattern."""
-    return lambda value: isinstance(value, str) and bool(re.fullmatch(pattern, value, re.ASCII))
-
-
-def _is_line(value: object) -> bool:
-    return isinstance(value, str) and len(value) <= 1000 and value.isprintable()
-
-
-def _are_lines(value: object) -> bool:
-    return isinstance(value, tuple | list) and all(map(_is_line, value))
-
-
-def _is_truth(value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _declares(parameters: Any) -> bool:
-    if parameters is None:
-        return True
-    declares = isinstance(parameters, type) and is_dataclass(parameters)
-    return declares and all(_text(PARAMETER_NAME)(f.name) for f in fields(parameters))
 
 
 def describe(error: BaseException) -> str:
     """Return an exception in one line: its type and its message."""
+    kind = type.__dict__["__name__"].__get__(type(error))  # its metaclass may say otherwise
     try:
-        message = " ".join(str(error).split())
-    except Exception:  # noqa: BLE001  foreign exceptions may fail to say what they are
+        message = " ".join(str.split(str(error)))
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # noqa: BLE001  foreign exceptions may fail to say what they are
         message = "(no message)"
-    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+    return f"{kind}: {message}" if message else str(kind)
 
 
 def printable(reason: str) -> str:
@@ -413,45 +460,18 @@ def printable(reason: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in reason)
 
 
-_INPUTS: Final = ("observations", "observations+actions")
-_FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
-    (
-        "name",
-        "lower-case letters, digits, '-', at most 64, perhaps ':' and a name",
-        _text(SPEC_NAME),
-    ),
-    ("factory", "a function or class", callable),
-    ("summary reference extra fit_name", "a printable line of at most 1000 characters", _is_line),
-    ("inputs", " or ".join(_INPUTS), _INPUTS.__contains__),
-    ("alarm", "cusum or score", ("cusum", "score").__contains__),
-    ("adapts", "'' or baseline", ("", "baseline").__contains__),
-    ("deterministic other_parameters horizon_decides_fit", "True or False", _is_truth),
-    ("requires", "names of modules", _are_lines),
-    ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),
-    ("parameters", "a dataclass with fields of ASCII names, or None", _declares),
-)
-"""Fields of a spec, what is expected of them, and whether a value is."""
-
-
 def _foreign(point: EntryPoint) -> bool:
-    return _distribution(point) != "oodd-eval"
+    return distribution_of(point) != "oodd-eval"
 
 
-def _distribution(point: EntryPoint) -> str:
-    return _metadata(point.dist)[0]
-
-
-@functools.lru_cache(maxsize=64)
-def _metadata(distribution: Distribution | None) -> tuple[str, str]:
-    """Return name and version, for which a distribution reads its files anew every time."""
-    if distribution is None:
-        return "unknown distribution", ""
-    return distribution.name, distribution.version
+def distribution_of(point: EntryPoint) -> str:
+    """Return the name of the distribution that pip installed."""
+    return named(point.dist)[0]
 
 
 def _importable(name: str) -> bool:
-    """Tell whether a module could be imported; only its parents are."""
+    """Tell whether a module could be imported, by the package that it is in: nothing is."""
     try:
-        return find_spec(name) is not None
-    except (ImportError, ValueError):
+        return find_spec(name.partition(".")[0]) is not None
+    except (ImportError, ValueError, AttributeError):
         return False

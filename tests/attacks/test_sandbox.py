@@ -1,5 +1,7 @@
 """What a plug-in finds, and can do, in a sandbox; the same without one shows that it knows how."""
 
+import ctypes
+import fcntl
 import json
 import mmap
 import os
@@ -9,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
@@ -29,7 +32,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblew
 SYSTEM = sys.prefix, "/usr", "/etc", "/"
 NAME = "verysecret"  # in the path of the split, in files, variables, arguments and sockets
 LOOKS = '''
-import ctypes, pwd, socket
+import ctypes, fcntl, mmap, pwd, resource, socket, struct
 
 NAME = "very" + "secret"
 PORT, PARENT, PATHS = int("@PORT@"), int("@PARENT@"), json.loads("""@PATHS@""")
@@ -93,7 +96,120 @@ def unshares():
         os._exit(ctypes.CDLL(None).unshare(0x10000000) and 1)
     return os.waitpid(child, 0)[1] == 0
 
+TOKEN = os.urandom(8).hex()  # of this process and its forks
+SHARED = os.__file__  # a file that every sandbox reads
+ALLOWED = set("core fd full null ptmx pts random shm stderr stdin stdout tty urandom zero".split())
+
+def system(number, *arguments):
+    """Make a system call of x86-64 and tell whether the kernel takes it."""
+    return ctypes.CDLL(None).syscall(number, *arguments) >= 0
+
+def writable():
+    """Open, to write, all that is in /proc but what is of other processes, and in /sys."""
+    for root in ("/proc/sys", "/proc/self", "/sys/devices/system/cpu", "/proc"):
+        for place, directories, files in os.walk(root):
+            directories[:] = [] if root in ("/proc", "/proc/self") else directories
+            for name in files:
+                try:
+                    os.close(os.open(os.path.join(place, name), os.O_WRONLY | os.O_NONBLOCK))
+                except OSError:
+                    continue
+                yield os.path.join(place, name)
+
+def places():
+    for place, directories, _ in os.walk("/"):
+        directories[:] = [d for d in directories if os.path.join(place, d) != "/proc"]
+        if place.split("/")[1] != "tmp" and place != "/dev/shm":
+            try:
+                path = os.path.join(place, "made-" + NAME)
+                os.close(os.open(path, os.O_CREAT | os.O_WRONLY))
+                os.unlink(path)
+            except OSError:
+                continue
+            yield place
+
+def counters():
+    for name in ("loadavg", "vmstat", "uptime", "interrupts", "locks", "diskstats", "zoneinfo"):
+        try:
+            yield Path("/proc", name).read_bytes()[:10]
+        except OSError:
+            pass
+
+def locked():
+    with open(SHARED, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+
+def range_locked():
+    with open(SHARED, "rb") as file:
+        asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, 0, 0, 0, 0)
+        answer = fcntl.fcntl(file, fcntl.F_GETLK, asked)
+        return struct.unpack("hhqqi4x", answer)[0] != fcntl.F_UNLCK
+
+def cached():
+    with open(SHARED, "rb") as file:
+        return os.preadv(file.fileno(), [bytearray(1)], 0, os.RWF_NOWAIT) == 1
+
+def resident():
+    with open(SHARED, "rb") as file:
+        mapped = mmap.mmap(file.fileno(), 4096, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(mapped))
+    return system(27, ctypes.c_void_p(address), 4096, ctypes.create_string_buffer(1))
+
+def kept():
+    """What another process of this fit has left; and leave something."""
+    left = [Path(d, "kept-" + str(PORT)) for d in ("/tmp", "/dev/shm")]
+    found = [p for p in left if p.exists() and p.read_text() != TOKEN + str(os.getppid())]
+    for path in left:
+        path.write_text(TOKEN + str(os.getppid()))
+    return found
+
+def passed():
+    """Open descriptors beside standard streams, the channel, and the one that lists them."""
+    links = [os.readlink("/proc/self/fd/" + n) for n in os.listdir("/proc/self/fd") if int(n) > 2]
+    sockets = [x for x in links if x.startswith("socket:")]
+    return sockets[1:] + [x for x in links if x not in sockets and not x.startswith(
+        ("/proc/self/fd", f"/proc/{os.getpid()}/fd", "/tmp/#", "/dev/null"))]
+
+def status(key, expected):
+    lines = dict(x.split(":", 1) for x in Path("/proc/self/status").read_text().splitlines())
+    return lines[key].split() != expected
+
 LOOKS = {
+    "writable": lambda: [*writable()],
+    "places": lambda: [*places()] if "@ROOT@" == "/" else ["/"],
+    "sizes": lambda: [d for d in ("/tmp", "/dev/shm") if os.statvfs(d).f_blocks * os.statvfs(
+        d).f_frsize > 2.1e9],
+    "kept": kept,
+    "counters": lambda: [*counters()],
+    "devices": lambda: {*os.listdir("/dev")} - ALLOWED,
+    "passed": passed,
+    "user": lambda: os.getuid() != 65534 or os.getgid() != 65534,
+    "groups": lambda: {*os.getgroups()} - {65534},
+    "rights": lambda: status("CapEff", ["0" * 16]),
+    "privileges": lambda: status("NoNewPrivs", ["1"]),
+    "unfiltered": lambda: status("Seccomp", ["2"]),
+    "shadow": lambda: open("/etc/shadow").read(),
+    "host": lambda: os.uname().nodename != "sandbox",
+    "locked": locked,
+    "range-locked": range_locked,
+    "cached": cached,
+    "resident": resident,
+    "watched": lambda: ctypes.CDLL(None).inotify_init() >= 0,
+    "key-ring": lambda: system(250, 0, -3, 1),
+    "key": lambda: system(248, b"user", NAME.encode(), b"x", 1, -3),
+    "kernel-log": lambda: system(103, 10, 0, 0),
+    "perf": lambda: system(298, struct.pack("IIQ104x", 1, 120, 0), 0, -1, -1, 0),
+    "bpf": lambda: system(321, 0, struct.pack("IIII56x", 2, 4, 8, 1), 72),
+    "faults": lambda: system(323, 0),
+    "ring": lambda: system(425, 1, ctypes.create_string_buffer(120)),
+    "machines": lambda: socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM),
+    "algorithms": lambda: socket.socket(socket.AF_ALG, socket.SOCK_SEQPACKET),
+    "segment": lambda: ctypes.CDLL(None).shmget(PORT, 0, 0) >= 0,
+    "priority": lambda: os.setpriority(os.PRIO_PROCESS, 0, -5) is None,
+    "dumps": lambda: resource.getrlimit(resource.RLIMIT_CORE)[1] != 1,
     "names": lambda: [*names()],
     "split": lambda: [p for p in PATHS["files"] if os.path.exists(p)],
     "mini": lambda: [p for p in (IN_PACKAGE,) if os.listdir(p)],
@@ -128,6 +244,7 @@ class Looks(Good):
         print("FOUND", json.dumps({k: str(v)[:300] for k, v in found.items() if v}), flush=True)
     def fit(self, nominal):
         self.look()
+        quiet((Path(PATHS["writes"][0]) / "tools.py").read_text)
         for place in PATHS["writes"]:
             quiet(lambda: writes(place))
     def score(self, x):
@@ -163,12 +280,20 @@ def _look(place, option):
         for line in Path("/proc/self/maps").read_text().splitlines()
         if "/dev/zero" in line or "rw-s" in line
     )
-    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as unix:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.socket(socket.AF_UNIX) as unix,
+        ExitStack() as stack,
+    ):
         port = server.getsockname()[1]
         unix.bind(f"\0{NAME}{port}")
         unix.listen()
         shared = Path("/dev/shm", f"{NAME}{port}")  # noqa: S108
         shared.write_text(NAME)
+        segment = ctypes.CDLL(None).shmget(port, 4096, 0o1600)
+        fcntl.flock(stack.enter_context(Path(os.__file__).open("rb")), fcntl.LOCK_EX)
+        fcntl.lockf(stack.enter_context(Path(os.__file__).open("rb")), fcntl.LOCK_SH)
+        os.utime(lab / "tools.py", (0, 10**9))
         paths = {
             "files": [str(split / "cartpole.h5"), str(output / "records.jsonl"), str(home)],
             "home": str(home),
@@ -195,12 +320,16 @@ def _look(place, option):
             capture_output=True, text=True, timeout=120, check=False,
         )  # fmt: skip
         shared.unlink()
+        ctypes.CDLL(None).shmctl(segment, 0, None)
+    for directory in ("/tmp", "/dev/shm"):  # noqa: S108
+        Path(directory, f"kept-{port}").unlink(missing_ok=True)
     record = ResultsDirectory(output).records()[0]
     assert "looked" in record.reason, (record.reason, done.stderr)
     log = next((output / "logs").iterdir()).read_text()
     found = [json.loads(x[6:]) for x in log.splitlines() if x.startswith("FOUND ")]
     assert len(found) >= 3  # made, fit, score
     written = {"writes": [p for p in paths["writes"] if (Path(p) / "written").exists()]}
+    written["access"] = (lab / "tools.py").stat().st_atime != 0
     found.append({name: value for name, value in written.items() if value})
     return {name: value for one in found for name, value in one.items()}
 
@@ -212,14 +341,20 @@ def test_a_plug_in_finds_nothing_in_a_sandbox(looked):
 @pytest.mark.parametrize(
     "what",
     ["names", "split", "mini", "home", "arguments", "environments", "variables", "links",
-     "kills", "tcp", "abstract", "shared", "writes"],
+     "kills", "tcp", "abstract", "shared", "writes", "places", "sizes", "kept", "counters",
+     "devices", "user", "privileges", "unfiltered", "host", "locked", "range-locked", "cached",
+     "resident", "watched", "key", "machines", "segment", "dumps", "access"],
 )  # fmt: skip
 def test_the_same_plug_in_finds_it_without_a_sandbox(looked, what):
     assert what in looked[""]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="the system forbids them to others in any case")
-@pytest.mark.parametrize("what", ["memory", "attached", "users"])
+@pytest.mark.parametrize(
+    "what",
+    ["memory", "attached", "users", "writable", "rights", "shadow", "kernel-log", "perf", "faults",
+     "priority"],
+)  # fmt: skip
 def test_root_finds_it_without_a_sandbox(looked, what):
     assert what in looked[""]
 
@@ -252,41 +387,46 @@ class Daemon(Good):
 
 class Caches(Good):
     def fit(self, nominal):
+        super().fit(nominal)
         Path.home().joinpath("cache").write_text("x")
         assert os.environ["HOME"] == os.getcwd() == "/tmp"
-    def save(self, place): (place / "fit").write_text("x")
-    def load(self, place): assert (place / "fit").read_text() == "x"
+    def score(self, x):
+        assert Path.home().joinpath("cache").exists()
+        scored = [*Path.home().glob("scored-*")]
+        assert len(scored) < 3, scored
+        Path.home().joinpath("scored-" + str(len(scored))).touch()
+        return super().score(x)
 
-class Links(Good):
-    def save(self, place):
-        (place / "kept").write_text("x"); (place / "in").mkdir()
-        (place / "in" / "kept").write_text("x")
-        os.symlink("/etc/passwd", place / "link"); os.mkfifo(place / "pipe")
-        os.symlink("/etc", place / "directory")
-    def load(self, place): pass
+class Fills(Good):
+    def fit(self, nominal):
+        for directory in ("/tmp", "/dev/shm"):
+            with open(directory + "/full", "wb") as file:
+                try:
+                    os.posix_fallocate(file.fileno(), 0, 3 * 10**9)
+                except OSError as error:
+                    assert error.errno == 28
+                else:
+                    raise AssertionError(directory)
+        raise RuntimeError("full")
 
 @hookimpl
 def oodd_detectors():
-    return offer(forks=Forks, spread=Spread, daemon=Daemon, caches=Caches, links=Links)
+    return offer(forks=Forks, spread=Spread, daemon=Daemon, caches=Caches, fills=Fills)
 """
 
 
 @pytest.fixture
 def acts(monkeypatch, tmp_path):
-    """Fit and score a detector in a sandbox: the outcome, its directory, and the seconds."""
+    """Fit and score a detector in a sandbox: the outcome."""
     install(monkeypatch, tmp_path / "plugin", "acts", ACTS.replace("@SLEEP@", SLEEP))
-    save = tmp_path / "save"
-    save.mkdir()
 
-    def run(name, *, load="", hidden=(), **limits):
+    def run(name, **limits):
         nominal = [Trajectory([[0.0, 1.0]] * 20)] * 3
         request = {
             "plugin": "acts", "detector": name, "parameters": {}, "seed": 0, "horizon": 1,
-            "train": 0 if load else 3, "save": "" if load else str(save), "load": load,
         }  # fmt: skip
-        limits = Limits(**{"seconds": 60, "memory": 10**9} | limits, hidden=hidden)
-        train = [] if load else nominal
-        return run_isolated(request, train, [nominal], limits=limits, stop=lambda: False)
+        limits = Limits(**{"seconds": 60, "memory": 10**9} | limits, hidden=())
+        return run_isolated(request, nominal, [nominal] * 2, limits=limits, stop=lambda: False)
 
     return run
 
@@ -327,17 +467,14 @@ def test_a_daemon_ends_with_its_sandbox(acts):
     assert out.status in {"ok", "incompatible"}, out.reason
 
 
-def test_a_fit_is_saved_and_loaded_through_the_sandbox(acts, tmp_path):
-    assert acts("caches").status == "ok"
-    assert (tmp_path / "save" / "fit").read_text() == "x"
-    out = acts("caches", load=str(tmp_path / "save"))
-    assert (out.status, out.reason) == ("ok", "")
+def test_each_group_has_a_home_of_its_own(acts):
+    out = acts("caches")  # three episodes a group, and what its own fit has left
+    assert (out.status, out.reason, len(out.scores)) == ("ok", "", 6)
 
 
-def test_links_and_pipes_of_a_saved_fit_are_left_out(acts, tmp_path):
-    assert acts("links").status == "ok"
-    kept = {str(p.relative_to(tmp_path / "save")) for p in (tmp_path / "save").rglob("*")}
-    assert kept == {"kept", "in", "in/kept"}
+def test_what_can_be_written_is_memory_of_limited_size(acts):
+    out = acts("fills")
+    assert "RuntimeError: full" in out.reason
 
 
 def test_scores_are_those_of_a_plain_worker(tmp_path):
@@ -374,11 +511,11 @@ def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path, monkeypatch
     monkeypatch.syspath_prepend(str(tmp_path / "path"))
     box = Sandbox([package / "data", package / "file", tmp_path / "nowhere"])
     look = f"ls {package}/data; cat {package}/file; ls {package}"
-    command, descriptor = box.command(["/bin/sh", "-c", look])
+    command, descriptors = box.command(["/bin/sh", "-c", look])
     done = subprocess.run(
-        command, pass_fds=[descriptor], env=box.environment(), capture_output=True, text=True,
+        command, pass_fds=descriptors, env=box.environment(), capture_output=True, text=True,
         check=True,
     )  # fmt: skip
-    os.close(descriptor)
-    box.close()
+    for descriptor in descriptors:
+        os.close(descriptor)
     assert done.stdout.split() == ["__init__.py", "data", "file"]

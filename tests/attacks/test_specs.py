@@ -69,6 +69,110 @@ def test_a_wrong_spec_is_told_and_the_others_go_on(changed, monkeypatch, tmp_pat
         plugins.offer("fine")
 
 
+STOPS = """
+class Text(str):
+    def __format__(self, spec): raise SystemExit("format")
+    def __eq__(self, other): raise SystemExit("equal")
+    def __hash__(self): raise SystemExit("hash")
+    def __repr__(self): raise SystemExit("repr")
+    def isprintable(self): return True
+
+class Mute(Exception):
+    def __str__(self): raise SystemExit("mute")
+
+class Meta(type):
+    __name__ = property(lambda self: sys.exit("name"))
+    def __getattribute__(self, name): sys.exit(name)
+
+class MetaError(Exception, metaclass=Meta):
+    pass
+
+class Endless(list):
+    def __iter__(self):
+        while True: yield DetectorSpec("odd", Good, "")
+
+class Spec(DetectorSpec):
+    def __getattribute__(self, name): raise SystemExit(name)
+
+def endless():
+    while True: yield DetectorSpec("odd", Good, "")
+
+class Odd(metaclass=Meta):
+    pass
+
+Shown = type("Shown", (), {"__repr__": lambda self: sys.exit("shown")})
+
+@hookimpl
+def oodd_detectors(): return [DetectorSpec("fine", Good, ""), *first()]
+def first(): @RETURNS@
+"""
+RETURNED = {
+    "text": "return [DetectorSpec(Text('odd'), Good, '')]",
+    "summary": "return [DetectorSpec('odd', Good, Text('odd'))]",
+    "inputs": "return [DetectorSpec('odd', Good, '', inputs=Text('observations'))]",
+    "alarm": "return [DetectorSpec('odd', Good, '', alarm=Text('cusum'))]",
+    "requires": "return [DetectorSpec('odd', Good, '', requires=(Text('json'),))]",
+    "subclass": "return [Spec('odd', Good, '')]",
+    "no-spec": "return [Shown()]",
+    "mute": "raise Mute",
+    "metaclass": "raise MetaError",
+    "exit": "sys.exit(Shown())",
+    "group": "raise BaseExceptionGroup('x', [SystemExit()])",
+    "cancelled": "raise GeneratorExit",
+    "parameters": "return [DetectorSpec('odd', Good, '', parameters=Odd)]",
+    "shown-parameters": "return [DetectorSpec('odd', Good, '', parameters=Shown())]",
+    "default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Shown()}))]",
+    "text-default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Text()}))]",
+    "many-parameters": "return [DetectorSpec('odd', Good, '', parameters=declared_by("
+    "dict.fromkeys(map('a{}'.format, range(999)))))]",
+    "many": "return [DetectorSpec(f'odd-{i}', Good, '') for i in range(5000)]",
+    "huge": "return [DetectorSpec('odd', Good, 'x' * 10**8)]",
+}
+
+
+@pytest.mark.parametrize("returns", RETURNED.values(), ids=RETURNED)
+def test_a_hook_that_stops_those_who_ask_breaks_its_plug_in(returns, monkeypatch, tmp_path, capsys):
+    install(monkeypatch, tmp_path, "odd", STOPS.replace("@RETURNS@", returns))
+    assert cli.main(["list", "detectors"]) == 1
+    out, _ = capsys.readouterr()
+    assert {"rf", "clock"} <= {line.split()[0] for line in out.splitlines() if line.strip()}
+    assert "[broken plug-in]" in out
+    assert "fine" not in out.split()
+
+
+@pytest.mark.parametrize("hook", ["oodd_environments", "oodd_anomalies", "oodd_readers"])
+@pytest.mark.parametrize("returned", ["Endless()", "endless()", "[Shown()]", "Text()"])
+def test_other_hooks_are_asked_in_the_same_way(hook, returned, monkeypatch, tmp_path):
+    code = STOPS.replace("@RETURNS@", "return []")
+    install(monkeypatch, tmp_path, "odd", f"{code}\n@hookimpl\ndef {hook}(): return {returned}\n")
+    plugins = discover()
+    offered = plugins.readers if hook == "oodd_readers" else plugins.custom_specs
+    assert offered is not None
+    assert [broken.plugin for broken in plugins.broken] == ["odd"]
+
+
+@pytest.mark.parametrize("returned", ["Endless()", "endless()", "Text()", "Shown()"])
+def test_what_is_no_list_is_not_read(returned, monkeypatch, tmp_path):
+    code = STOPS.replace('return [DetectorSpec("fine", Good, ""), *first()]', f"return {returned}")
+    install(monkeypatch, tmp_path, "odd", code.replace("@RETURNS@", "pass"))
+    plugins = discover()
+    assert "clock" in plugins.offers
+    assert [broken.plugin for broken in plugins.broken] == ["odd"]
+
+
+@pytest.mark.parametrize("raises", ["SystemExit", "RuntimeError", "KeyboardInterrupt"])
+def test_what_is_required_is_not_imported(raises, monkeypatch, tmp_path, capsys):
+    (tmp_path / "parent").mkdir()
+    (tmp_path / "parent" / "__init__.py").write_text(f"raise {raises}")
+    code = """
+        @hookimpl
+        def oodd_detectors(): return [DetectorSpec("odd", Good, "", requires=("parent.child",))]
+    """
+    install(monkeypatch, tmp_path, "odd", code)
+    assert cli.main(["list", "detectors"]) == 0
+    assert "odd " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", [5, "../../etc", "a\nb", "RF", "x" * 300])
 def test_a_wrong_name_of_a_detector_of_ones_own(name, tiny_split):
     with pytest.raises(PluginError, match="name of a DetectorSpec is"):

@@ -1,23 +1,33 @@
 """A sandbox for one worker, by bubblewrap: what it may read, where it may write, and nothing else.
 
 The worker sees the system's programs and libraries, the interpreter and what can be imported, all
-read-only. Its home is ``/tmp``: an empty directory, which is removed when the worker ends. It has
-no network, sees no process but its own, and has no capabilities.
+read-only. Its home is ``/tmp``: memory of limited size, which is gone when the worker ends. It has
+no network, sees no process but its own, has no rights, and is nobody. No directory of the system
+is its to write, and none outlives it.
 """
 
+import functools
 import importlib.machinery
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from oodd_eval.errors import UsageError
+from oodd_eval.plugins.isolation.reads import Reads
+from oodd_eval.plugins.isolation.syscalls import syscall_filter
 
-SCRATCH: Final = Path("/tmp")  # noqa: S108  of the sandbox, not of the system
+SCRATCH: Final = "/tmp"  # noqa: S108  of the sandbox, not of the system
+SCRATCH_BYTES: Final = 2 * 10**9  # of /tmp, beside --memory: the training episodes lie there
+SHARED_BYTES: Final = 256 * 10**6  # of /dev/shm
+NOBODY: Final = "65534"
 
 _READ_ONLY: Final = (
     "/usr",
@@ -27,7 +37,9 @@ _READ_ONLY: Final = (
     "/lib32",
     "/lib64",
     "/libx32",
-    "/sys/devices/system/cpu",
+    "/sys/devices/system/cpu/online",
+    "/sys/devices/system/cpu/possible",
+    "/sys/devices/system/cpu/present",
     "/etc/alternatives",
     "/etc/fonts",
     "/etc/group",
@@ -37,6 +49,12 @@ _READ_ONLY: Final = (
     "/etc/passwd",
     "/etc/timezone",
 )
+_FROZEN: Final = ("cpuinfo", "filesystems", "meminfo", "stat", "version")
+"""Files of /proc that libraries read: they are as they were when the command first looked.
+
+Of the others, which tell what all processes of the system do, none is to be seen.
+"""
+
 _KEPT: Final = ("LANG", "LANGUAGE", "PATH", "TZ")  # of the user's environment
 _SUFFIXES: Final = (
     *importlib.machinery.all_suffixes(),
@@ -49,95 +67,154 @@ _SUFFIXES: Final = (
 
 
 class Sandbox:
-    """The place of one worker; to be closed.
+    """The place of workers, each of which has one of its own.
 
-    `hidden` are paths that it must not see, wherever they lie. A fit is saved in the sandbox and
-    loaded from there: its own directory would tell the user's paths.
+    `hidden` are paths that they must not see, wherever they lie.
     """
 
     def __init__(self, hidden: Iterable[str | Path]) -> None:
-        self._outside = Path(tempfile.mkdtemp(prefix="oodd-eval-"))
-        self._hidden = [Path(os.path.realpath(path)) for path in hidden]
+        self._readable = readable = tuple(dict.fromkeys(_readable()))
+        self._nobody = _may_be_nobody(readable)
+        self._mounts = [*_mounts(readable, [Path(os.path.realpath(path)) for path in hidden])]
 
-    def close(self) -> None:
-        """Remove what the worker has written."""
-        shutil.rmtree(self._outside, ignore_errors=True)
+    def reads(self) -> Reads:
+        """Return what was opened of the files that are shown, from the first call on."""
+        return _reads(self._readable)
 
-    def taken(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a request for a worker in here: a kept fit is brought, a place to save is made."""
-        inside = dict(request)
-        if request["load"]:
-            _copy_plain(Path(request["load"]), self._outside / "load")
-            inside["load"] = str(SCRATCH / "load")
-        if request["save"]:
-            (self._outside / "save").mkdir()
-            inside["save"] = str(SCRATCH / "save")
-        return inside
-
-    def give(self, request: Mapping[str, Any]) -> None:
-        """Copy what the worker has saved to where the request wants it; links are left out."""
-        if request["save"]:
-            _copy_plain(self._outside / "save", Path(request["save"]))
-
-    def command(self, command: Sequence[str]) -> tuple[list[str], int]:
-        """Return the command that runs another one in here, and a descriptor that it reads."""
-        # Not on the command line, which every process in the sandbox can read.
-        arguments = tempfile.TemporaryFile()  # noqa: SIM115  its descriptor is for the caller
-        arguments.write(b"\0".join(map(os.fsencode, self._arguments())))
-        arguments.seek(0)
-        descriptor = os.dup(arguments.fileno())
-        arguments.close()
-        return [_program(), "--args", str(descriptor), *command], descriptor
+    def command(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
+        """Return the command that runs another one in here, and descriptors that it reads."""
+        return _bubblewrap(self._mounts, command, nobody=self._nobody)
 
     def environment(self) -> dict[str, str]:
         """Return the variables of a worker: few of the user's, and an empty directory as home."""
         kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
-        return kept | dict.fromkeys(("HOME", "TMPDIR", "XDG_CACHE_HOME"), str(SCRATCH))
-
-    def _arguments(self) -> Iterator[str]:
-        yield from ("--unshare-all", "--unshare-user", "--disable-userns", "--die-with-parent")
-        yield from ("--cap-drop", "ALL", "--hostname", "sandbox")
-        yield from ("--proc", "/proc", "--dev", "/dev", "--bind", str(self._outside), str(SCRATCH))
-        targets: dict[Path, Path] = {}  # real paths by those in the sandbox
-        for path in _readable():
-            if any(path.is_relative_to(other) for other in targets):
-                continue
-            if path.is_symlink() and path.parent == Path("/"):  # such as /lib
-                yield from ("--symlink", str(path.readlink()), str(path))
-                continue
-            targets[path] = Path(os.path.realpath(path))
-            yield from ("--ro-bind", str(path), str(path))
-        for hidden in self._hidden:
-            for path, target in targets.items():
-                if hidden.exists() and hidden.is_relative_to(target):
-                    mask = ("--tmpfs",) if hidden.is_dir() else ("--ro-bind", os.devnull)
-                    yield from (*mask, str(path / hidden.relative_to(target)))
-        yield from ("--remount-ro", "/", "--chdir", str(SCRATCH))
+        return kept | dict.fromkeys(("HOME", "TMPDIR", "XDG_CACHE_HOME"), SCRATCH)
 
 
 def require_sandbox() -> None:
     """Raise `UsageError` if bubblewrap is not installed, or may not make a sandbox here."""
     box = Sandbox(())
-    try:
-        command, descriptor = box.command([sys.executable, "-I", "-c", ""])
-        done = subprocess.run(  # noqa: S603  bubblewrap and our own interpreter
-            command,
-            pass_fds=[descriptor],
-            env=box.environment(),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
-        os.close(descriptor)
-    finally:
-        box.close()
-    if done.returncode:
+    code, error = _run(*box.command([sys.executable, "-I", "-c", ""]), box.environment())
+    if code:
         raise UsageError(
-            f"--sandbox: bubblewrap cannot make a sandbox here: {done.stderr.strip()[-300:]}; "
+            f"--sandbox: bubblewrap cannot make a sandbox here: {error.strip()[-300:]}; "
             "user namespaces have to be allowed"
         )
+
+
+def _run(
+    command: Sequence[str], descriptors: Sequence[int], environment: dict[str, str]
+) -> tuple[int, str]:
+    """Run a command that reads descriptors, which are closed; return its exit code and errors."""
+    done = subprocess.run(  # noqa: S603  bubblewrap and our own interpreter
+        command,
+        pass_fds=descriptors,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    for descriptor in descriptors:
+        os.close(descriptor)
+    return done.returncode, done.stderr
+
+
+_reads: Final = functools.cache(Reads)
+
+
+@functools.cache
+def _may_be_nobody(readable: tuple[Path, ...]) -> bool:
+    """Tell whether the superuser's workers can be nobody, who has to be able to read the files.
+
+    Otherwise, as for other users, a worker has the user's number outside, and nobody's inside.
+    """
+    if os.geteuid() != 0 or not shutil.which("setpriv"):
+        return False
+    looks = ["/bin/sh", "-c", 'for path; do [ -r "$path" ] || exit 1; done', "sh"]
+    looks += [str(path) for path in readable if not path.is_symlink()]
+    return _run(*_bubblewrap([*_mounts(readable, [])], looks, nobody=True), {})[0] == 0
+
+
+def _bubblewrap(
+    mounts: Sequence[str], command: Sequence[str], *, nobody: bool
+) -> tuple[list[str], list[int]]:
+    """Return the command that runs another one in a sandbox, and descriptors that it reads."""
+    descriptors = [_readable_file(syscall_filter())]
+    arguments = ["--unshare-ipc", "--unshare-pid", "--unshare-net", "--unshare-uts"]
+    arguments += ["--unshare-cgroup-try", "--die-with-parent", "--hostname", "sandbox"]
+    arguments += ["--seccomp", str(descriptors[0]), "--cap-drop", "ALL"]
+    if shutil.which("prlimit"):
+        # One byte: with none, the system would still hand a dump to a program of its own.
+        command = ["prlimit", "--core=1:1", *command]
+    if nobody:
+        for right in ("SETUID", "SETGID", "SETPCAP"):  # gone once they are used
+            arguments += ["--cap-add", f"CAP_{right}"]
+        become = ["setpriv", "--reuid", NOBODY, "--regid", NOBODY, "--clear-groups"]
+        become += ["--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all"]
+        command = [*become, *command]
+    else:
+        arguments += ["--unshare-user", "--disable-userns", "--uid", NOBODY, "--gid", NOBODY]
+    arguments += mounts
+    for name, content in _frozen().items():
+        descriptors.append(_readable_file(content))
+        arguments += ["--perms", "0444", "--ro-bind-data", str(descriptors[-1]), f"/proc/{name}"]
+    arguments += ["--remount-ro", "/proc", "--remount-ro", "/dev", "--remount-ro", "/"]
+    # Not on the command line, which every process in the sandbox can read.
+    descriptors.append(_readable_file(b"\0".join(map(os.fsencode, arguments))))
+    return [_program(), "--args", str(descriptors[-1]), *command], descriptors
+
+
+def _readable_file(content: bytes) -> int:
+    """Return the descriptor of a file with some content, which has no name."""
+    with tempfile.TemporaryFile() as file:
+        file.write(content)
+        file.seek(0)
+        return os.dup(file.fileno())
+
+
+@functools.cache
+def _frozen() -> dict[str, bytes]:
+    frozen = {}
+    for name in _FROZEN:
+        with suppress(OSError):
+            frozen[name] = Path("/proc", name).read_bytes()
+    return frozen
+
+
+def _mounts(readable: Iterable[Path], hidden: Sequence[Path]) -> Iterator[str]:
+    """Yield the arguments that mount what a worker sees."""
+    yield from ("--proc", "/proc", "--dev", "/dev", "--chdir", SCRATCH)
+    for writable, size in ((SCRATCH, SCRATCH_BYTES), ("/dev/shm", SHARED_BYTES)):  # noqa: S108
+        yield from ("--perms", "1777", "--size", str(size), "--tmpfs", writable)
+    for entry in os.scandir("/proc"):
+        if not entry.name.isdigit() and entry.name not in _FROZEN and not entry.is_symlink():
+            yield from _masked(entry.path, directory=entry.is_dir())
+    # Bubblewrap makes directories above what it mounts, but for their owner alone.
+    for directory in dict.fromkeys(d for path in readable for d in reversed(path.parents)):
+        yield from ("--perms", "0755", "--dir", str(directory))
+    targets: dict[Path, Path] = {}  # real paths by those in the sandbox
+    for path in readable:
+        if any(path.is_relative_to(other) for other in targets):
+            continue
+        if path.is_symlink() and path.parent == Path("/"):  # such as /lib
+            yield from ("--symlink", str(path.readlink()), str(path))
+            continue
+        targets[path] = Path(os.path.realpath(path))
+        yield from ("--ro-bind", str(path), str(path))
+    for secret in hidden:
+        for path, target in targets.items():
+            if secret.exists() and secret.is_relative_to(target):
+                inside = path / secret.relative_to(target)
+                yield from _masked(str(inside), directory=secret.is_dir())
+
+
+def _masked(path: str, *, directory: bool) -> tuple[str, ...]:
+    """Return the arguments that put an empty directory, or file, in place of one."""
+    if directory:
+        return ("--size", "4096", "--tmpfs", path, "--remount-ro", path)
+    return ("--ro-bind", os.devnull, path)
 
 
 def _program() -> str:
@@ -158,25 +235,21 @@ def _readable() -> Iterator[Path]:
             yield entry.absolute()
         elif entry.is_dir():
             yield from (path.absolute() for path in sorted(entry.iterdir()) if _importable(path))
-    # Editable installs may find modules elsewhere.
-    for name, module in sorted(sys.modules.items()):
-        if "." not in name:
-            for path in (*getattr(module, "__path__", ()), getattr(module, "__file__", None)):
-                if path and Path(path).exists():
-                    yield Path(path).absolute()
+    # Editable installs may find modules elsewhere, and those of plug-ins are not imported here.
+    points = (p for g in ("oodd_eval", "oodd_eval.observers") for p in entry_points(group=g))
+    for name in sorted({*(name for name in sys.modules if "." not in name), *map(_top, points)}):
+        with suppress(ImportError, ValueError, AttributeError):
+            if spec := find_spec(name):
+                for path in (*(spec.submodule_search_locations or ()), spec.origin):
+                    if path and Path(path).exists():
+                        yield Path(path).absolute()
+
+
+def _top(point: EntryPoint) -> str:
+    return point.module.partition(".")[0]
 
 
 def _importable(path: Path) -> bool:
     if path.name.endswith(_SUFFIXES):
         return True
     return path.is_dir() and path.name.isidentifier() and any(path.glob("*.py"))
-
-
-def _copy_plain(source: Path, target: Path) -> None:
-    """Copy a directory's files and directories: a link or pipe in it could name another file."""
-    target.mkdir(parents=True, exist_ok=True)
-    for entry in os.scandir(source):
-        if entry.is_dir(follow_symlinks=False):
-            _copy_plain(Path(entry.path), target / entry.name)
-        elif entry.is_file(follow_symlinks=False):
-            shutil.copy2(entry.path, target / entry.name)

@@ -1,0 +1,67 @@
+"""Entry points of installed distributions, any of which may have broken metadata."""
+
+import functools
+from collections.abc import Sequence
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, distributions, entry_points
+from typing import NamedTuple
+
+
+class BrokenMetadata(NamedTuple):
+    """A distribution whose metadata cannot be used: what it calls itself, and the reason."""
+
+    distribution: str
+    reason: str
+
+
+def points_of(groups: Sequence[str]) -> tuple[list[list[EntryPoint]], list[BrokenMetadata]]:
+    """Return the entry points of some groups, and distributions that are left out as broken."""
+    broken: list[BrokenMetadata] = []
+    try:
+        every = [entry_points(group=group) for group in groups]
+    except Exception:  # noqa: BLE001  one is broken; which one is found by looking at each
+        points = EntryPoints(_each(broken))
+        every = [points.select(group=group) for group in groups]
+    return [[p for p in points if _is_sound(p, broken)] for points in every], broken
+
+
+def _is_sound(point: EntryPoint, broken: list[BrokenMetadata]) -> bool:
+    try:
+        named(point.dist)
+        return bool(point.name.isprintable() and point.name and point.module.isprintable())
+    except Exception as error:  # noqa: BLE001
+        broken.append(_broken(point.dist, error))
+        return False
+
+
+def _each(broken: list[BrokenMetadata]) -> list[EntryPoint]:
+    """Return the entry points of every sound distribution, and add the others to a list.
+
+    Of two with one name the first on the path counts, as it is the one that is imported.
+    """
+    points: dict[str, list[EntryPoint]] = {}
+    for distribution in distributions():
+        try:
+            name = named(distribution)[0].lower().replace("_", "-").replace(".", "-")
+            points.setdefault(name, [*distribution.entry_points])
+        except Exception as error:  # noqa: BLE001
+            broken.append(_broken(distribution, error))
+    return [point for listed in points.values() for point in listed]
+
+
+@functools.lru_cache(maxsize=256)
+def named(distribution: Distribution | None) -> tuple[str, str]:
+    """Return name and version, for which a distribution reads its files anew every time."""
+    if distribution is None:
+        return "unknown distribution", ""
+    texts = distribution.metadata["Name"], distribution.metadata["Version"]
+    for kind, text in zip(("name", "version"), texts, strict=True):
+        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= 200:
+            raise ValueError(f"its {kind} is {text!r:.100}, expected a short line")
+    return texts
+
+
+def _broken(distribution: Distribution | None, error: Exception) -> BrokenMetadata:
+    """Return a broken distribution; its directory is named, as its metadata cannot be trusted."""
+    where = str(getattr(distribution, "_path", "unknown distribution"))
+    reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+    return BrokenMetadata(where, f"its metadata cannot be read, reinstall or remove it: {reason}")

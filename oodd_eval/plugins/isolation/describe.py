@@ -1,0 +1,184 @@
+"""Plug-ins described in a sandbox: the command imports none of them, and believes none.
+
+A process in a sandbox loads the plug-ins of one distribution and says what they offer, as plain
+data. A plug-in that floods, hangs, dies or tells what no plug-in says is broken, with the reason;
+whatever it has changed in its process ends with that. What a name, a version or a source stands for
+is never the plug-in's to say: the command reads it from the installed distribution.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import chdir, closing, contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from oodd_eval.errors import PluginError, UsageError
+from oodd_eval.plugins.contract import Detector, DetectorSpec
+from oodd_eval.plugins.discovery import (
+    Plugin,
+    Plugins,
+    describe,
+    discover,
+    distribution_of,
+    plugin_of,
+    printable,
+)
+from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
+from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
+from oodd_eval.plugins.isolation.sandbox import Sandbox
+from oodd_eval.plugins.isolation.worker import connect
+from oodd_eval.plugins.specs import MOST_SPECS, description_of, is_line, spec_of
+
+if TYPE_CHECKING:
+    from oodd_eval.data.logs import Reader
+    from oodd_eval.data.registry import Spec
+
+SECONDS: Final = (
+    60.0  # for the plug-ins of one distribution to be imported and to say what they offer
+)
+_EXIT_SECONDS: Final = 2.0  # for a process that has closed its channel to end
+
+Answer = Mapping[str, Any]
+
+
+def discover_in_sandbox(disabled: Collection[str], limits: Limits) -> Plugins:
+    """Find the installed plug-ins, as `discover` does; what is needed of them a sandbox loads.
+
+    They neither observe runs nor offer environments, anomalies and readers. Of the limits, the
+    memory and the hidden paths count.
+    """
+    return _Describer(disabled, limits).plugins
+
+
+@dataclass(frozen=True, slots=True)
+class DescribedPlugin:
+    """A plug-in as a sandbox has described it; its detectors can run in sandboxes alone."""
+
+    point: EntryPoint
+    form: str
+    described: Sequence[DetectorSpec]
+    ask: Callable[[str], Answer] = field(repr=False)
+
+    def specs(self) -> list[DetectorSpec]:
+        """Return its detectors."""
+        return [*self.described]
+
+    def from_spec(self, text: str) -> DetectorSpec | None:
+        """Have a sandbox ask it what it makes of a name with a colon."""
+        answer = self.ask(text)
+        if refused := answer.get("refused"):
+            raise UsageError(printable(str(refused)))
+        with _wrong_form():
+            return None if answer["spec"] is None else spec_of(answer["spec"], _in_a_sandbox)
+
+    def custom_specs(self) -> list["Spec"]:
+        """Return nothing: what can be recorded is recorded outside."""
+        return []
+
+    def readers(self) -> list["Reader"]:
+        """Return nothing: logs are read outside."""
+        return []
+
+
+class _Describer:
+    """Has a sandbox load the plug-ins of a distribution, all at once, when one is needed."""
+
+    def __init__(self, disabled: Collection[str], limits: Limits) -> None:
+        self.plugins = discover(disabled, load=self._load)
+        self._limits = Limits(SECONDS, limits.memory, limits.hidden or ())
+        self._answers: dict[tuple[str, str], Answer] = {}
+
+    def _load(self, point: EntryPoint) -> DescribedPlugin:
+        distribution = distribution_of(point)
+        key = distribution, point.name
+        if key not in self._answers:
+            points = self.plugins.points
+            names = [p.name for p in points if distribution_of(p) == distribution]
+            answers = self._ask(distribution, names)
+            self._answers |= {(distribution, name): answers[name] for name in names}
+        answer = _unbroken(self._answers[key])
+        with _wrong_form():
+            form, described = answer["form"], answer["specs"]
+            if not is_line(form) or len(described) > MOST_SPECS:
+                raise PluginError(f"it describes {len(described)} detectors, and {form!r:.80}")
+            specs = [spec_of(one, _in_a_sandbox) for one in described]
+
+        def ask(text: str) -> Answer:
+            return _unbroken(self._ask(distribution, [point.name], text)[point.name])
+
+        return DescribedPlugin(point, form, specs, ask)
+
+    def _ask(self, distribution: str, names: list[str], text: str = "") -> dict[str, Answer]:
+        """Return the answers of plug-ins by name: nothing but a mapping is sure of each."""
+        box = Sandbox(self._limits.hidden or ())
+        with closing(Child(__name__, self._limits, None, box)) as child:
+            ending, answers = "", {}
+            try:
+                child.channel.send({"distribution": distribution, "plugins": names, "make": text})
+                answers = child.channel.receive()
+            except GivenUpError as error:
+                ending = error.ending or error.reason
+            except ChannelClosedError:
+                ended = child.wait_for_exit(seconds=_EXIT_SECONDS)
+                ending = "" if ended else "closed its pipe"
+            except (ChannelGarbledError, ConnectionError):
+                ending = "wrote into the pipe to the command"
+            child.end()
+        ending = f"the process that loads it in a sandbox {ending or child.death()}"
+        every = {name: answers.get(name, {"broken": ending}) for name in names}
+        nothing = {"broken": "said nothing of itself"}
+        return {name: a if isinstance(a, dict) else nothing for name, a in every.items()}
+
+
+def _unbroken(answer: Answer) -> Answer:
+    """Return an answer, unless it tells why the plug-in is broken."""
+    if "broken" in answer:
+        raise PluginError(printable(str(answer["broken"])))
+    return answer
+
+
+@contextmanager
+def _wrong_form() -> Iterator[None]:
+    """Raise `PluginError` for whatever is wrong with an answer."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise PluginError(
+            f"described itself in a wrong form: {printable(describe(error))}"
+        ) from None
+
+
+def _in_a_sandbox(**_: Any) -> Detector:
+    raise PluginError("this detector is loaded in sandboxes alone, not in the command")
+
+
+def _answer(plugin: Plugin, text: str) -> Answer:
+    """Return what a plug-in offers, or what it makes of a name with a colon."""
+    if not text:
+        return {"form": plugin.form, "specs": [description_of(spec) for spec in plugin.specs()]}
+    try:
+        spec = plugin.from_spec(text)
+    except UsageError as error:
+        return {"refused": printable(str(error))}
+    return {"spec": spec and description_of(spec)}
+
+
+def main(arguments: Sequence[str]) -> NoReturn:
+    """Load the plug-ins of a distribution, tell what they offer, and end."""
+    channel = connect(arguments)
+    request, answers = channel.receive(), {}
+    for name in request["plugins"]:
+        try:
+            with chdir("."):
+                plugin = plugin_of(request["distribution"], name)
+                answers[name] = _answer(plugin, request["make"])
+        except BaseException as error:  # noqa: BLE001  foreign code may raise anything
+            answers[name] = {"broken": printable(describe(error))}
+    channel.send(answers)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,183 @@
+"""Plug-ins under --sandbox: the command imports none, believes none, and waits for none."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+
+import pytest
+from helpers_plugins import install
+
+from oodd_eval.data.split import load_split
+from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.plugins.isolation import describe
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.describe import discover_in_sandbox
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.plan import make_plan, source_digest
+
+pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
+LIMITS = Limits(60, 10**9, ())
+
+HOOK = "\n@hookimpl\ndef oodd_detectors(): return offer(odd=Good)\n"
+ANSWERS = """
+from oodd_eval.plugins.isolation import Channel
+describe = sys.modules["__main__"]
+def answer(**changes):
+    plain = describe._answer
+    describe._answer = lambda plugin, text: plain(plugin, text) | changes
+def spec(**changes):
+    plain = describe.description_of
+    describe.description_of = lambda spec: plain(spec) | changes
+"""
+IMPORTED = {
+    "exits": ("os._exit(0)", "ended with exit code 0"),
+    "exits with a code": ("os._exit(200)", "ended with exit code 200"),
+    "a signal": ("os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL"),
+    "a real-time signal": ("os.kill(os.getpid(), 40)", "was killed by signal 40"),
+    "sys.exit": ("sys.exit(3)", "SystemExit"),
+    "hangs": ("time.sleep(600)", "not done after"),
+    "hangs deaf": ("signal.pthread_sigmask(0, range(1, 60)); time.sleep(600)", "not done after"),
+    "memory": ("held = np.ones(3 * 10**8); time.sleep(600)", "more than"),
+    "interrupt": ("raise KeyboardInterrupt", "KeyboardInterrupt"),
+    "mute error": (
+        "class E(Exception):\n    def __str__(self): sys.exit(1)\nraise E()", "E: (no message)"
+    ),
+    "writes into the pipe": (
+        "for fd in range(3, 99):\n    try: os.write(fd, b'x' * 999)\n    except OSError: pass",
+        "wrote into the pipe",
+    ),
+    "closes the pipe": ("os.closerange(3, 999)", ""),
+    "no mapping": (ANSWERS + "describe._answer = lambda *_: 5", ""),
+    "nothing": (ANSWERS + "Channel.send = lambda *_: None", "ended with exit code 0"),
+    "a list": (ANSWERS + "answer(specs=5)", "wrong form"),
+    "too many": (ANSWERS + "answer(specs=[{}] * 2000)", "2000"),
+    "too much": (ANSWERS + "answer(form='x' * 2**25)", "pipe"),
+    "an escape": (ANSWERS + r"answer(form='\x1b[31m')", "describes"),
+    "deep": (ANSWERS + "x = []\nfor _ in range(500): x = [x]\nanswer(specs=x)", ""),
+    "long numbers": (ANSWERS + "answer(specs=[10**4000])", ""),
+    "no specs": (ANSWERS + "describe._answer = lambda *_: {}", "wrong form"),
+    "unknown field": (ANSWERS + "spec(origin='oodd-eval')", "wrong form"),
+    "a factory": (ANSWERS + "spec(factory='os.system')", "wrong form"),
+    "a number": (ANSWERS + "spec(summary=5)", "summary of a DetectorSpec is 5"),
+    "a name": (ANSWERS + "spec(name='../x')", "name of a DetectorSpec is"),
+    "another's name": (ANSWERS + "spec(name='rf')", "offered twice"),
+    "a type": (ANSWERS + "spec(parameters={'a': {'types': ['os']}})", "wrong form"),
+    "no type": (
+        ANSWERS + "spec(parameters={'a': {'types': [], 'items': [], 'default': 1, 'low': None,"
+        "'above': None, 'high': None, 'choices': [], 'decides': 'fit', 'help': ''}})", "wrong form",
+    ),
+    "a dunder": (
+        ANSWERS + "spec(parameters={'__class__': {'types': ['int'], 'items': [], 'default': 1,"
+        "'low': None, 'above': None, 'high': None, 'choices': [], 'decides': 'fit', 'help': ''}})",
+        "ASCII name",
+    ),
+    "many parameters": (ANSWERS + "spec(parameters={str(i): {} for i in range(999)})", "999"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("code", "reason"), IMPORTED.values(), ids=IMPORTED)
+def test_what_a_plug_in_does_at_import_breaks_it_alone(code, reason, monkeypatch, tmp_path):
+    monkeypatch.setattr(describe, "SECONDS", 12)
+    install(monkeypatch, tmp_path, "odd", code + HOOK)
+    start = time.monotonic()
+    plugins = discover_in_sandbox((), LIMITS)
+    assert {"rf", "clock"} <= plugins.offers.keys()
+    assert plugins.offers["rf"].distribution == "oodd-eval"
+    (broken,) = plugins.broken
+    assert (broken.plugin, broken.distribution) == ("odd", "oodd-odd")
+    assert reason in broken.reason
+    assert broken.reason.isprintable()
+    assert time.monotonic() - start < 60
+
+
+PATCHES = """
+try: Path("@AT@/imported").touch()
+except OSError: pass
+import oodd_eval.metrics.auc, oodd_eval.results.evaluate
+for module in (oodd_eval.metrics.auc, oodd_eval.results.evaluate):
+    for name in dir(module):
+        if callable(getattr(module, name)) and name[0].islower():
+            setattr(module, name, lambda *_, **__: 1.0)
+os.environ["OODD_EVAL_PLUGINS"] = "nobody"
+sys.modules["numpy"] = None
+
+class Odd(Good):
+    def score(self, x): return np.zeros(len(x))
+
+@hookimpl
+def oodd_detectors(): return offer(odd=Odd)
+"""
+
+
+@pytest.mark.parametrize("option", ["--sandbox", ""])
+def test_a_command_with_a_sandbox_imports_no_plug_in(option, monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "odd", "odd", PATCHES.replace("@AT@", str(tmp_path)))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "odd"))
+    done = subprocess.run(
+        [sys.executable, "-m", "oodd_eval", "run", "--detector", "odd", "--env", "cartpole",
+         "--anomaly", "iid", "--limit", "4", "--output", tmp_path / "out", *filter(None, [option])],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert (tmp_path / "imported").exists() == (not option)
+    if option:
+        (record,) = ResultsDirectory(tmp_path / "out").records()
+        assert (done.returncode, record.status) == (0, "ok"), done.stderr + record.reason
+        assert record.value("auc_matched") == 0.5
+
+
+def test_a_run_in_a_sandbox_has_the_plan_of_a_plain_one():
+    split = load_split("mini")
+    plain, boxed = discover(), discover_in_sandbox((), LIMITS)
+    names = [*plain.select("all"), *plain.select("sklearn:IsolationForest")]
+    assert names == [*boxed.select("all"), *boxed.select("sklearn:IsolationForest")]
+    assert plain.spec_forms() == boxed.spec_forms()
+    plans = [
+        make_plan(plugins, split=split, detectors=names, environments=["cartpole"])
+        for plugins in (plain, boxed)
+    ]
+    assert plans[0].units == plans[1].units
+    assert boxed.broken == plain.broken == []
+
+
+def test_names_and_parameters_that_nobody_offers_are_told_as_in_a_plain_run():
+    boxed = discover_in_sandbox((), LIMITS)
+    with pytest.raises(UnknownNameError, match="did you mean 'mewma'"):
+        boxed.offer("mewna")
+    with pytest.raises(UsageError, match="IsolationForrest"):
+        boxed.offer("sklearn:IsolationForrest")
+    with pytest.raises(UsageError, match="no plug-in makes a detector of 'other:x'"):
+        boxed.offer("other:x")
+
+
+def test_one_sandbox_describes_a_distribution(monkeypatch):
+    asked, plain = [], describe._Describer._ask
+    monkeypatch.setattr(describe._Describer, "_ask", lambda *a: asked.append(a[1]) or plain(*a))
+    boxed = discover_in_sandbox((), LIMITS)
+    assert boxed.offer("rf").spec.name == "rf"
+    assert boxed.offer("pe").spec.name == "pe"
+    assert asked == ["oodd-eval"]
+
+
+def test_a_detector_of_a_sandbox_cannot_be_made_in_the_command():
+    offer = discover_in_sandbox((), LIMITS).offer("clock")
+    with pytest.raises(ImportError, match="sandboxes alone"):
+        offer.spec.factory(seed=0, horizon=1)
+
+
+def test_a_digest_of_a_plug_in_s_source_imports_nothing(monkeypatch, tmp_path):
+    code = f"open({str(tmp_path / 'imported')!r}, 'w')"
+    install(monkeypatch, tmp_path / "odd", "odd", code)
+    assert len(source_digest("oodd_odd")) == 64
+    assert "oodd_odd" not in sys.modules
+    assert not (tmp_path / "imported").exists()
+
+
+def test_an_editable_plug_in_is_found_in_a_sandbox(monkeypatch, tmp_path):
+    # As an install with an import hook: the module is nowhere on the import path.
+    install(monkeypatch, tmp_path / "odd", "odd", HOOK)
+    os.renames(tmp_path / "odd" / "oodd_odd.py", tmp_path / "elsewhere" / "oodd_odd.py")
+    monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
+    assert discover_in_sandbox((), LIMITS).offer("odd").plugin == "odd"
