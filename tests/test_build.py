@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("gymnasium")
 from oodd_recording import build
 from oodd_recording.benchmark import FROZEN
-from oodd_recording.build import Chunk, build_split
+from oodd_recording.build import Chunk, build_split, digest_of_bits, seed_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
@@ -72,6 +72,52 @@ def test_a_built_split_holds_what_recording_gives(built):
     assert data.sensors == ENVIRONMENTS["cartpole"].sensors
     assert stored.parameters[1] == episode.parameters
     assert stored.returns[1] == episode.rewards.sum()
+
+
+BITS = 0x0123456789ABCDEF_FEDCBA9876543210
+DRAWN = dataclasses.replace(SMALL, seed_base=0, drawn=digest_of_bits(BITS))
+
+
+def test_drawn_bits_decide_all_episodes_and_are_nowhere_in_the_split(tmp_path):
+    built = build_split(DRAWN, tmp_path / "drawn", bits=BITS, jobs=1, **FEW)
+    split = load_split(built)
+    assert all(check.ok for check in split.verify())
+    assert split.manifest["definition"]["drawn"] == digest_of_bits(BITS)
+    data = split.environment("cartpole")
+    assert data.train.seeds.tolist() == [0, 1, 2, 3]
+    assert data.twins.seeds.tolist() == data.anomalous("gravity").seeds.tolist()
+    gravity = Condition("gravity")
+    seed = seed_of(int(data.twins.seeds[1]), BITS)
+    assert seed.bit_length() > 100
+    options = {"policy": load_policy("cartpole"), "episode_cap": 60}
+    episode = record_seed("cartpole", seed, [gravity], **options)[gravity]
+    stored = data.anomalous("gravity")
+    np.testing.assert_array_equal(stored[1].observations, episode.trajectory.observations)
+    assert stored.parameters[1] == episode.parameters
+    for file in built.iterdir():
+        content = file.read_bytes()
+        for secret in (BITS, seed):
+            texts = (b"%d" % secret, b"%x" % secret, secret.to_bytes(16, "big"))
+            assert not any(text in content or text[::-1] in content for text in texts)
+    other = dataclasses.replace(DRAWN, drawn=digest_of_bits(BITS + 1))
+    build_split(other, tmp_path / "other", bits=BITS + 1, jobs=1, **FEW)
+    first = load_split(tmp_path / "other").environment("cartpole").train[0].observations
+    assert not np.array_equal(first[0], data.train[0].observations[0])
+
+
+def test_episodes_have_seeds_of_their_own_that_numbers_alone_decide():
+    numbers = [*range(50), *range(300_000, 300_050), *range(600_000, 600_050)]
+    assert len({seed_of(number, BITS) for number in numbers}) == len(numbers)
+    assert seed_of(7, BITS) == 0xC0BCBF75_1500C421_01149DB8_3C32A991
+    assert seed_of(950_600_001, None) == 950_600_001
+
+
+@pytest.mark.parametrize("bits", [None, 1])
+def test_seeds_that_are_drawn_need_their_bits(tmp_path, bits):
+    with pytest.raises(UsageError, match="expected these bits"):
+        build_split(DRAWN, tmp_path / "drawn", bits=bits, **FEW)
+    with pytest.raises(UsageError, match=r"\(none\)"):
+        build_split(SMALL, tmp_path / "small", bits=1, **FEW)
 
 
 def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
@@ -159,14 +205,14 @@ def test_a_killed_build_resumes_and_leaves_no_worker(built, tmp_path, monkeypatc
 
 
 def test_a_chunk_is_named_by_everything_its_content_depends_on(monkeypatch):
-    chunk = Chunk("cartpole", "train", 7, 5, 60, 0.0, (), "a" * 64, "")
+    chunk = Chunk("cartpole", "train", 7, 5, 60, 0.0, (), None, "a" * 64, "")
     changes = [
         {"environment": "ant"}, {"part": "test"}, {"first_seed": 8}, {"count": 6},
-        {"episode_cap": None}, {"policy_digest": "b" * 64}, {"noise": 0.01},
+        {"episode_cap": None}, {"policy_digest": "b" * 64}, {"noise": 0.01}, {"bits": 1},
         {"conditions": (("iid@kept99", 0.1),)}, {"conditions": (("iid@kept99", 0.2),)},
     ]  # fmt: skip
     names = {dataclasses.replace(chunk, **change).file_name for change in [{}, *changes]}
-    assert len(names) == 10
+    assert len(names) == 11
     assert dataclasses.replace(chunk, policy="elsewhere.npz").file_name == chunk.file_name
     monkeypatch.setattr(build, "GENERATOR_VERSION", 999)
     assert chunk.file_name not in names

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from helpers_simulate import Reflex, record
 from oodd_recording import record as recording
+from oodd_recording.environments import make
 from oodd_recording.faults import Fault
 from oodd_recording.record import TwinTooShortError, record_nominal
 
+from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 
@@ -32,6 +34,18 @@ def test_seeds_and_anomalies_have_streams_of_their_own():
              for s in (1, 2) for k in (0, 1)]  # fmt: skip
     firsts = {recording.generator(*n).integers(2**62) for n in names}
     assert len(firsts) == len(names)
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_every_part_of_128_bits_reaches_the_simulator_and_the_anomaly(environment):
+    seeds = [2**127 + 5, *(2**127 + 5 + 2**bit for bit in (0, 31, 32, 63, 64, 95, 96, 126))]
+    firsts = set()
+    for seed in seeds:
+        simulator = make(environment)
+        firsts.add(simulator.reset(seed).tobytes())
+        simulator.close()
+    draws = {recording.generator(environment, "gravity", seed, 0).integers(2**62) for seed in seeds}
+    assert len(firsts) == len(draws) == len(seeds)
 
 
 def test_the_cap_ends_an_episode_without_terminating_it():

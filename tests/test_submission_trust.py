@@ -10,12 +10,11 @@ from helpers_submission import Draft, assert_refused
 
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import GRANTS, read_entry
 from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify_entry
-from oodd_eval.leaderboard.verify.rerun import COMPARED, LEVEL, by_chance
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.leaderboard.verify import grant, verify_entry
+from oodd_eval.leaderboard.verify.rerun import RerunOrder, compare_rerun
 from oodd_eval.results.record import Record
 
 THREE = ("cartpole", "acrobot", "hopper")
@@ -32,11 +31,10 @@ def entry(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
-    """A run on a split of fresh seeds with the same sizes."""
+    """Records of a run on a split of fresh seeds with the same sizes."""
     home = tmp_path_factory.mktemp("fresh")
     split = make_split(home / "split", THREE, calibration=20, name="fresh", seed_base=77)
-    evaluate("persistence", split, output=home / "out")
-    return home / "out"
+    return list(evaluate("persistence", split, output=home / "out"))
 
 
 def verify(submissions, path, *options):
@@ -116,59 +114,74 @@ def test_who_grants_is_plain_text(submissions, tmp_path, name, capsys):
 # re-run
 
 
-def test_fresh_seeds_confirm_within_what_chance_explains(
-    submissions, entry, tmp_path, fresh, capsys
-):
+def compared(draft, fresh, **changes):
+    """The verdict on an entry with a re-run of these records, under an order of seeds."""
+    verdict = verify_entry(draft.path)
+    order = RerunOrder(verdict.digest, "0" * 32, "2026-11-26", list(THREE), **changes)
+    again = compare_rerun(verdict.records, fresh, order, verdict.findings)
+    return dataclasses.replace(verdict, rerun=again)
+
+
+def test_fresh_seeds_confirm_within_what_chance_explains(entry, tmp_path, fresh):
     draft = of_three(entry, tmp_path)
-    arguments = ["leaderboard", "verify", str(draft.path), "--rerun", str(fresh)]
-    code = cli.main(arguments)
-    out = capsys.readouterr().out
-    assert code == 0, out
-    assert "trust level established here: re-run" in out
-    assert "persistence: 24 of 24 cells run again; auc_matched" in out
+    verdict = compared(draft, fresh)
+    assert verdict.reached == "re-run", verdict.findings.problems
     assert trust(draft) == "reported"
-    assert cli.main([*arguments, "--grant", "M. Aintainer"]) == 0
+    grant(draft.path, verdict, "M. Aintainer")
     granted = read_entry(draft.path).grant
     assert (granted.trust, granted.by) == ("re-run", "M. Aintainer")
-    assert granted.how.startswith("fresh seeds (split fresh, digest ")
     assert granted.how.endswith("24 of 24 cells")
     entry, again = (
-        np.mean([r.value("auc_matched") for r in records if r.detector == "persistence"])
-        for records in (read_entry(draft.path).records, ResultsDirectory(fresh).records())
+        np.mean([r.value("auc_matched") for r in records])
+        for records in (read_entry(draft.path).records, fresh)
     )
     assert granted.means["persistence"]["auc_matched"] == pytest.approx((entry, again), rel=1e-5)
 
 
-def test_an_honest_row_is_rarely_refused_and_a_raised_one_is_found():
-    """Of 2000 rows in seven environments; each has a noise of its own in every environment."""
-    rng = np.random.default_rng(0)
-    change = rng.normal(0, 0.02, (2000, len(COMPARED), 7)) * rng.uniform(0.5, 2, (2000, 1, 7))
-
-    def refused(raised):
-        return [any(m.mean() > by_chance(m) for m in own) for own in change + raised]
-
-    assert 0 < np.mean(refused(0.0)) < LEVEL + 3 * np.sqrt(LEVEL * (1 - LEVEL) / 2000)
-    assert np.mean(refused(0.1)) > 0.95
-
-
-def test_what_differs_by_the_same_in_few_environments_may_be_chance():
-    same = np.array([0.02, 0.0200001, 0.02])
-    assert same.mean() > by_chance(same)
-    assert same.mean() < by_chance(same, episodes=0.01)
-
-
 def test_a_row_that_is_worse_than_its_run_again_is_honest(entry, tmp_path, fresh):
-    draft = of_three(entry, tmp_path)
-    records = changed(ResultsDirectory(fresh).records(), auc_matched=lambda v: (1 + v) / 2)
-    assert verify_entry(draft.path, rerun=records).reached == "re-run"
+    records = changed(fresh, auc_matched=lambda v: (1 + v) / 2)
+    assert compared(of_three(entry, tmp_path), records).reached == "re-run"
 
 
-def test_a_row_that_is_better_than_its_run_again_is_refused(entry, tmp_path, fresh):
-    draft = of_three(entry, tmp_path)
-    records = changed(ResultsDirectory(fresh).records(), auc_matched=lambda v: v * 0.5)
-    verdict = verify_entry(draft.path, rerun=records)
-    assert_refused(verdict, "persistence auc_matched", "in the entry: chance explains")
+def test_a_row_that_is_better_in_all_environments_is_refused(entry, tmp_path, fresh):
+    records = changed(fresh, auc_matched=lambda v: v * 0.7)
+    verdict = compared(of_three(entry, tmp_path), records)
+    assert_refused(verdict, "persistence auc_matched mean", "in the re-run: better by")
     assert verdict.reached is None
+
+
+def test_a_row_that_is_better_in_one_environment_is_refused(entry, tmp_path, fresh):
+    lies = changed([r for r in fresh if r.environment == "hopper"], auc_matched=lambda v: v * 0.5)
+    records = [r for r in fresh if r.environment != "hopper"] + lies
+    verdict = compared(of_three(entry, tmp_path), records)
+    assert_refused(verdict, "persistence auc_matched hopper", "in the re-run: better by")
+
+
+def test_an_entry_does_not_hide_a_lie_behind_its_own_spread(entry, tmp_path, fresh):
+    """Episodes that are 1 or 0.7 have a standard error of which no re-run knows."""
+    draft = of_three(entry, tmp_path)
+    for index, record in enumerate(draft.records):
+        terms = record["per_trajectory"]["auc_matched"]
+        terms[0] = [1.0, 1.0, *[0.4] * (len(terms[0]) - 2)]
+        terms[1] = [1.0] * len(terms[0])
+        draft.consistent(index, "auc_matched")
+    draft.write()
+    records = changed(fresh, auc_matched=lambda v: 0.4)
+    assert_refused(compared(draft, records), "persistence auc_matched mean", "better by")
+
+
+def test_what_is_found_everywhere_may_be_missed_by_a_hair(entry, tmp_path, fresh):
+    """Without any spread on either side one episode more may have gone otherwise."""
+    draft = of_three(entry, tmp_path)
+    for index, record in enumerate(draft.records):
+        terms = record["per_trajectory"]["auc_matched"]
+        terms[0] = list(terms[1])
+        draft.consistent(index, "auc_matched")
+    draft.write()
+    hair = changed(fresh, auc_matched=lambda v: 0.97)
+    assert compared(draft, hair).reached == "re-run"
+    more = changed(fresh, auc_matched=lambda v: 0.7)
+    assert compared(draft, more).reached is None
 
 
 @pytest.mark.parametrize(
@@ -180,63 +193,54 @@ def test_a_row_that_is_better_than_its_run_again_is_refused(entry, tmp_path, fre
     ],
 )
 def test_every_compared_metric_can_fail(entry, tmp_path, fresh, metric, change):
+    # The entry's numbers are made better, as the re-run's decide what chance explains.
     draft = of_three(entry, tmp_path)
-    records = changed(ResultsDirectory(fresh).records(), **{metric: change})
-    verdict = verify_entry(draft.path, rerun=records)
-    assert_refused(verdict, f"persistence {metric}", "not the whole difference")
-
-
-def test_results_on_seeds_that_were_known_confirm_nothing(entry, tmp_path):
-    draft = of_three(entry, tmp_path)
-    verdict = verify_entry(draft.path, rerun=read_entry(draft.path).records)
-    assert_refused(verdict, "split", "seeds that nobody could know before")
+    records = changed(fresh, **{metric: change})
+    assert_refused(compared(draft, records), f"persistence {metric} mean", "better by")
 
 
 OTHERWISE = {
     "version": ({"detector_version": "9.9"}, "detector_version", "expected '9.9'"),
     "failure": ({"status": "timeout", "reason": "slow"}, "status", "timeout"),
-    "limited": ({"limit": 3}, "split", "is none without --limit"),
-    "protocol": ({"protocol": PROTOCOL + 1}, "split", "is none without --limit"),
-    "another-row": ({"horizon": 5}, "persistence", "in 0 environments, expected 3"),
-    "sizes": ({"counts": {"train": 1, "calibration": 20, "test": 3}}, "counts", "but for test"),
+    "training": ({"training": "anomalies"}, "training", "expected 'anomalies'"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", OTHERWISE)
 def test_a_run_of_something_else_confirms_nothing(entry, tmp_path, fresh, case):
     changes, field, message = OTHERWISE[case]
-    draft = of_three(entry, tmp_path)
-    records = [dataclasses.replace(r, **changes) for r in ResultsDirectory(fresh).records()]
-    verdict = verify_entry(draft.path, rerun=records)
-    places = [f"{p.field} {p.message}" for p in verdict.findings.problems]
-    assert not verdict.ok
-    assert any(field in place and message in place for place in places), places
+    records = [dataclasses.replace(r, **changes) for r in fresh]
+    verdict = compared(of_three(entry, tmp_path), records)
+    assert_refused(verdict, field, message)
 
 
-def test_single_anomalies_and_few_environments_are_not_enough(entry, tmp_path, fresh):
+def test_what_is_undefined_in_an_entry_alone_is_refused(entry, tmp_path, fresh):
     draft = of_three(entry, tmp_path)
-    records = ResultsDirectory(fresh).records()
-    for some in (records[:-1], [r for r in records if r.environment != "hopper"]):
-        verdict = verify_entry(draft.path, rerun=some)
-        assert_refused(verdict, "persistence", "in 2 environments, expected 3")
+    record = draft.records[0]
+    record["per_trajectory"]["auc_matched"] = [[0.0] * 3, [0.0] * 3]
+    record["metrics"]["auc_matched"] = {"value": None, "low": None, "high": None, "n": 0}
+    draft.write()
+    verdict = compared(draft, fresh)
+    assert_refused(verdict, "auc_matched", "is undefined, and defined in the re-run")
+
+
+def test_a_grant_needs_every_cell_of_every_row(entry, tmp_path, fresh):
+    draft = of_three(entry, tmp_path)
+    others = [dataclasses.replace(r, horizon=5) for r in fresh]
+    hopper = [r for r in fresh if r.environment != "hopper"]
+    for some in (fresh[:-1], hopper, others, []):
+        verdict = compared(draft, some)
+        assert verdict.reached == "reported"
+        with pytest.raises(UsageError, match="leaderboard rerun of all its rows"):
+            grant(draft.path, verdict, "me")
 
 
 def test_where_it_was_computed_makes_no_other_detector(entry, tmp_path, fresh):
-    draft = of_three(entry, tmp_path)
-    there = [
-        dataclasses.replace(r, provenance=r.provenance | {"device": "cuda"})
-        for r in ResultsDirectory(fresh).records()
-    ]
-    assert verify_entry(draft.path, rerun=there).reached == "re-run"
+    there = [dataclasses.replace(r, provenance={"device": "cuda"}) for r in fresh]
+    assert compared(of_three(entry, tmp_path), there).reached == "re-run"
 
 
-def test_runs_again_and_grants_are_of_one_entry(submissions, tmp_path, fresh, capsys):
+def test_grants_are_of_one_entry(submissions, capsys):
     both = [submissions.plain, submissions.full]
-    arguments = ["leaderboard", "verify", *map(str, both)]
-    assert cli.main([*arguments, "--grant", "me"]) == 4
-    assert cli.main([*arguments, "--rerun", str(fresh)]) == 4
-    assert capsys.readouterr().err.count("name a single PATH") == 2
-    assert verify(submissions, submissions.plain.parent, "--rerun", fresh) == 4
-    assert "is a directory of entries" in capsys.readouterr().err
-    assert verify(submissions, submissions.plain, "--rerun", tmp_path) == 4
-    assert "no results in" in capsys.readouterr().err
+    assert cli.main(["leaderboard", "verify", *map(str, both), "--grant", "me"]) == 4
+    assert "name a single PATH" in capsys.readouterr().err

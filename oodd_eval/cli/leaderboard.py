@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -13,6 +12,7 @@ from rich.console import Console
 
 from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expression_option, say
 from oodd_eval.cli.terminal import make_console
+from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale
@@ -21,8 +21,6 @@ from oodd_eval.leaderboard.entry import GRANTS, read_entries, suite_sections
 from oodd_eval.leaderboard.verify import EntryVerdict, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
-from oodd_eval.leaderboard.verify.rerun import read_order
-from oodd_eval.results.directory import ResultsDirectory
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
 
@@ -46,13 +44,14 @@ def build(options: Options) -> int:
     The exit code is 1 when --check finds a difference, and 5 when there are no entries.
     """
     output = options.output
-    with part_shown(quiet=options.verbosity < 0) as show, tempfile.TemporaryDirectory() as fresh:
+    with part_shown(quiet=options.verbosity < 0) as show, temporary_directory() as fresh:
         show("entries")
         entries = read_entries(options.results)
         if not entries:
             return say(f"no entries in {options.results}", 5)
-        target = Path(fresh) if options.check else output
-        written = build_board(entries, target, suite_sections(output), on_part=show)
+        target = fresh if options.check else output
+        with only_writer(target):
+            written = build_board(entries, target, suite_sections(output), on_part=show)
         lines = differences(target, output) if options.check else []
     if not options.check:
         if options.verbosity >= 0:
@@ -70,7 +69,7 @@ def build(options: Options) -> int:
 @contextmanager
 def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
     """Show the part of a build that is being made; nothing where standard error is no terminal."""
-    console = Console(stderr=True, quiet=quiet)
+    console = make_console(quiet=quiet, stderr=True)
     if quiet or not console.is_terminal:
         yield str
         return
@@ -147,7 +146,6 @@ def submit(options: Options) -> int:
     help="check a pull request: entries changed since the branch, nothing else, and the board",
 )
 @_split_option
-@click.option("--rerun", type=DIRECTORY, help="results of a re-run to compare one entry with")
 @click.option("--grant", help=f"write the trust level that was reached into {GRANTS}, in this name")
 def verify(options: Options) -> int:
     """Check entries as data, running none of their code.
@@ -157,21 +155,16 @@ def verify(options: Options) -> int:
     console = make_console()
     paths = options.paths or (Path(RESULTS),)
     if options.changed_against:
-        if options.rerun or options.grant or options.split or len(paths) > 1:
-            options_named = "--split, --rerun or --grant"
+        if options.grant or options.split or len(paths) > 1:
             raise UsageError(
-                f"--changed-against is for one directory of entries, without {options_named}"
+                "--changed-against is for one directory of entries, without --split or --grant"
             )
         return verify_pull_request(console, paths[0], options)
-    fresh = ResultsDirectory(options.rerun).records() if options.rerun else []
-    if options.rerun and not fresh:
-        raise UsageError(f"--rerun: {str(options.rerun)!r} has no records")
-    if (options.rerun or options.grant) and len(paths) > 1:
-        raise UsageError("--rerun and --grant are for one entry: name a single PATH")
-    drawn = read_order(options.rerun) if options.rerun else None
+    if options.grant and len(paths) > 1:
+        raise UsageError("--grant is for one entry: name a single PATH")
     verdicts = []
     for path in paths:
-        for verdict in check(path, split=options.split, rerun=fresh, order=drawn):
+        for verdict in check(path, split=options.split):
             verdicts.append(verdict)
             report(console, verdict, options.verbosity)
     if not verdicts:
@@ -179,10 +172,7 @@ def verify(options: Options) -> int:
     if options.grant:
         if len(verdicts) > 1:
             raise UsageError("--grant is for one entry: name it, not the directory of entries")
-        granted = grant(paths[0], verdicts[0], options.grant)
-        grants = paths[0].absolute().parents[1] / GRANTS
-        console.print(f"{verdicts[0].name}: trust {granted.trust} is written to {grants}")
-        return 0
+        return write_grant(console, paths[0], verdicts[0], options.grant)
     refused = sum(not verdict.ok for verdict in verdicts)
     if len(verdicts) > 1:
         console.print(f"{len(verdicts) - refused} valid, {refused} refused")
@@ -211,9 +201,17 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
         )
     if refused:
         return say(f"{refused} of {len(entries)} entries are refused", 1)
-    with tempfile.TemporaryDirectory() as fresh:
-        build_board(read_entries(results), Path(fresh), suite_sections(results.parent))
+    with temporary_directory() as fresh:
+        build_board(read_entries(results), fresh, suite_sections(results.parent))
     console.print(f"{', '.join(entries)}: may be merged, the board builds with it")
+    return 0
+
+
+def write_grant(console: Console, path: Path, verdict: EntryVerdict, by: str) -> int:
+    """Grant an entry the level of trust that was established, and say where it is written."""
+    granted = grant(path, verdict, by)
+    grants = path.absolute().parents[1] / GRANTS
+    console.print(f"{verdict.name}: trust {granted.trust} is written to {grants}")
     return 0
 
 
@@ -231,7 +229,8 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     lines = [f"{verdict.name}: {problem.text}" for problem in problems]
     if findings.count > len(problems):
         lines.append(f"and {findings.count - len(problems)} more")
-    lines += [f"re-run: {line}" for line in (verdict.rerun.lines if verdict.rerun else ())]
+    if verdict.rerun is not None:
+        lines.append(f"re-run: {verdict.rerun.how}")
     lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]
     for line in lines:
         console.print(f"  {line}")

@@ -24,10 +24,11 @@ import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar, get_args
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AfterValidator, TypeAdapter, ValidationError
 
+from oodd_eval.data.bounded import MANIFEST_BYTES, read_bytes
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.errors import ResultsError
@@ -90,6 +91,15 @@ class EntryInfo:
         return json.dumps(asdict(self), indent=1, sort_keys=True, ensure_ascii=False) + "\n"
 
 
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError(f"{text!a:.60} is no line of printable text")
+    return text
+
+
+Printable = Annotated[str, AfterValidator(_printable)]
+
+
 @dataclass(frozen=True, slots=True)
 class Grant:
     """A level of trust above ``"reported"``, of the entry whose ``entry.json`` has a digest.
@@ -100,9 +110,9 @@ class Grant:
 
     entry: str
     trust: Literal["re-scored", "re-run"]
-    by: str
-    day: str
-    how: str
+    by: Printable
+    day: Printable
+    how: Printable
     means: Means = field(default_factory=dict)
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
@@ -205,9 +215,7 @@ def _has_its_files(directory: Path, meta: EntryInfo) -> bool:
 def read_json(kind: type[_T], file: Path, problem: str) -> _T:
     """Read a dataclass from a JSON file; `ResultsError` says a `problem` and why."""
     try:
-        return TypeAdapter(kind).validate_json(file.read_bytes())
-    except OSError as error:
-        why = f"cannot be read: {error.strerror}"
+        return TypeAdapter(kind).validate_json(read_bytes(file, MANIFEST_BYTES, ResultsError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         why = f"{problem}: {'.'.join(map(str, first['loc']))}: {first['msg']}"

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
-from oodd_eval.data.files import remove_abandoned, replacing
+from oodd_eval.data.files import only_writer, remove_abandoned, replacing
 from oodd_eval.data.layout import Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
@@ -69,8 +69,14 @@ class Chunk:
     episode_cap: int | None
     noise: float
     conditions: tuple[tuple[Condition, float | None], ...]
+    bits: int | None
     policy_digest: str
     policy: str
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of its episodes, which are their seeds unless these are drawn."""
+        return range(self.first_seed, self.first_seed + self.count)
 
     @property
     def file_name(self) -> str:
@@ -80,10 +86,24 @@ class Chunk:
         return f"{self.environment}-{self.part}-{self.first_seed}-{key}.npz"
 
 
+def digest_of_bits(bits: int) -> str:
+    """Return the SHA-256 of 128 bits, by which a split's definition names them."""
+    return hashlib.sha256(bits.to_bytes(16, "big")).hexdigest()
+
+
+def seed_of(number: int, bits: int | None) -> int:
+    """Return the seed of an episode: its number, or 128 bits of its own made from drawn ones."""
+    if bits is None:
+        return number
+    words = np.random.SeedSequence(bits, spawn_key=(number,)).generate_state(4).astype("<u4")
+    return int.from_bytes(words.tobytes(), "little")
+
+
 def build_split(
     definition: SplitDefinition,
     directory: Path,
     *,
+    bits: int | None = None,
     environments: Iterable[str] | None = None,
     policies: Mapping[str, Path] | None = None,
     jobs: int | None = None,
@@ -92,37 +112,44 @@ def build_split(
     """Build a split into a directory and return the directory; resume an earlier build.
 
     Complete environments there are kept. By default there are all seven, the frozen policies act,
-    one worker process per core. `UsageError` for a wrong size, or another split in the directory.
+    one worker process per core. `bits` are those of a definition whose seeds are drawn.
+    `UsageError` for a wrong size, or another split in the directory.
     """
     names = in_order(ENVIRONMENTS if environments is None else environments, ENVIRONMENTS)
     _check_sizes(definition)
+    if definition.drawn != ("" if bits is None else digest_of_bits(bits)):
+        raise UsageError(
+            f"seeds of split {definition.name!r} come from bits with SHA-256 "
+            f"{definition.drawn or '(none)'}: expected these bits"
+        )
     for name in names:
         _check_strengths(definition, name)
     paths = {e: str((policies or {}).get(e, "")) for e in names}
     digests = {e: _acting(definition, e, paths[e]) for e in names}
-    entries = _kept(definition, directory, digests)
-    work = directory / WORK
-    work.mkdir(parents=True, exist_ok=True)
-    remove_abandoned(work)
-    for name in ("*.h5", layout.MANIFEST):  # users may keep other files there
-        remove_abandoned(directory, name)
-    todo = {e: _chunks(definition, e, paths[e], digests[e]) for e in names if e not in entries}
-    further: dict[str, list[Chunk]] = todo
-    while any(further.values()):
-        chunks = [c for planned in todo.values() for c in planned]
-        missing = [c for c in chunks if not (work / c.file_name).exists()]
-        done = len(chunks) - len(missing)
-        for chunk in _run(missing, work, jobs):
-            done += 1
-            progress(done, len(chunks), f"{chunk.environment} {chunk.part}")
-        further = {e: _further(definition, planned, work) for e, planned in todo.items()}
-        todo = {e: planned + further[e] for e, planned in todo.items()}
-    for environment, chunks in todo.items():
-        entries[environment] = _write(definition, chunks, work, directory)
-    ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
-    versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
-    layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
-    shutil.rmtree(work)
+    with only_writer(directory):
+        entries = _kept(definition, directory, digests)
+        work = directory / WORK
+        work.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(work)
+        todo = {
+            e: _chunks(definition, e, paths[e], digests[e], bits) for e in names if e not in entries
+        }
+        further: dict[str, list[Chunk]] = todo
+        while any(further.values()):
+            chunks = [c for planned in todo.values() for c in planned]
+            missing = [c for c in chunks if not (work / c.file_name).exists()]
+            done = len(chunks) - len(missing)
+            for chunk in _run(missing, work, jobs):
+                done += 1
+                progress(done, len(chunks), f"{chunk.environment} {chunk.part}")
+            further = {e: _further(definition, planned, work) for e, planned in todo.items()}
+            todo = {e: planned + further[e] for e, planned in todo.items()}
+        for environment, chunks in todo.items():
+            entries[environment] = _write(definition, chunks, work, directory)
+        ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
+        versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
+        layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
+        shutil.rmtree(work)
     return directory
 
 
@@ -252,12 +279,14 @@ def _base(
     return contextlib.closing(split.environment(environment))
 
 
-def _chunks(definition: SplitDefinition, environment: str, path: str, digest: str) -> list[Chunk]:
+def _chunks(
+    definition: SplitDefinition, environment: str, path: str, digest: str, bits: int | None
+) -> list[Chunk]:
     conditions = tuple(_conditions(definition, environment).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
         recipe = definition.episode_cap, definition.noise, conditions if part == "test" else ()
-        return Chunk(environment, part, first, count, *recipe, digest, path)
+        return Chunk(environment, part, first, count, *recipe, bits, digest, path)
 
     if definition.base:  # its test seeds have twins that are long enough
         with _base(definition.base, environment, digest) as base:
@@ -339,13 +368,14 @@ def record_chunk(chunk: Chunk, work: Path) -> None:
     conditions = dict(chunk.conditions)
     environment, cap = chunk.environment, chunk.episode_cap
     recorded: list[dict[Condition | None, RecordedEpisode]] = []
-    for seed in range(chunk.first_seed, chunk.first_seed + chunk.count):
+    for number in chunk.numbers:
+        seed = seed_of(number, chunk.bits)
         # A test seed whose twin is too short gives way to a later one, see `_further`.
         with contextlib.suppress(TwinTooShortError):
             episodes = record_seed(
                 environment, seed, conditions, policy=policy, episode_cap=cap, noise=chunk.noise
             )
-            recorded.append(episodes)
+            recorded.append({c: dataclasses.replace(e, seed=number) for c, e in episodes.items()})
     arrays: dict[str, NDArray[Any]] = {}
     for condition in [None, *conditions] if recorded else []:
         nominal = TWINS if chunk.part == "test" else chunk.part

@@ -115,14 +115,20 @@ def record_split(
     options: Options,
     environments: Sequence[str] = tuple(ENVIRONMENTS),
     output: Path | None = None,
+    *,
+    bits: int | None = None,
 ) -> None:
-    """Record a split, by default of all environments and where splits are found."""
+    """Record a split, by default of all environments and where splits are found.
+
+    See `build_split` for the `bits`.
+    """
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
     build_split(
         definition,
         directory,
         environments=environments,
+        bits=bits,
         jobs=options.jobs,
         progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"),
     )

@@ -5,7 +5,7 @@ Entries are data; this is the only action that runs a detector for one.
 
 import json
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,187 +19,263 @@ from oodd_eval.cli import (
     Names,
     Options,
     command,
-    expression_option,
     jobs_option,
     limit_options,
-    say,
 )
+from oodd_eval.cli.leaderboard import report, write_grant
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
-from oodd_eval.data.facts import CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
-from oodd_eval.data.files import write_text
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition, in_order
+from oodd_eval.data.files import find_file, write_text
 from oodd_eval.data.split import Split, load_split, split_places
-from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import ENTRY, SubmittedEntry, digest_of, read_entry
-from oodd_eval.leaderboard.verify import verify
-from oodd_eval.leaderboard.verify.rerun import LEAST, ORDER, SPLIT_DIRECTORY, RerunOrder, read_order
-from oodd_eval.names import expression, select
+from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.leaderboard.verify import EntryVerdict, verify
+from oodd_eval.leaderboard.verify.rerun import (
+    ORDER,
+    SPLIT_DIRECTORY,
+    Rerun,
+    RerunDifference,
+    RerunOrder,
+    cell_of,
+    compare_rerun,
+    read_order,
+)
+from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
+from oodd_eval.names import select
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.identity import Setting
+from oodd_eval.results.board import grouped, ranked_by
+from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
+from oodd_eval.results.render.text import print_table
+from oodd_eval.results.tables import Table
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan, source_digest
 from oodd_eval.scoring.runner import run
+from oodd_recording.build import digest_of_bits
 from oodd_recording.commands import record_split
 
 
-@command("leaderboard rerun leaderboard/results/paper-mini --output again", plugins=True)
+@command(
+    "leaderboard rerun leaderboard/results/paper-mini --detector rf --env cartpole,acrobot,hopper",
+    "leaderboard rerun leaderboard/results/mine-standard --grant Hopper",
+    plugins=True,
+)
 @click.argument("path", type=DIRECTORY, metavar="ENTRY", help="directory of the entry")
+@click.option("--detector", default="all", type=Names("detectors"), help=NAMES)
+@click.option("--env", default="all", type=Names("envs"), help=NAMES)
+@click.option("--seed", type=SEEDS, help="seeds of the detectors (default: those of the entry)")
 @click.option(
     "--output",
-    required=True,
     type=DIRECTORY,
-    help="directory of the re-run; the same command goes on where it was interrupted",
+    help="directory of the re-run (default: rerun-ENTRY); the same command goes on where it was "
+    "interrupted, and other detectors are added",
 )
-@click.option(
-    "--env", default="all", type=Names("envs"), help=f"{NAMES}, at least {LEAST} for a grant"
-)
-@click.option("--seed", type=SEEDS, help="seeds of the detectors (default: those of the entry)")
-@expression_option
-@click.option(
-    "--no-sandbox",
-    is_flag=True,
-    help="use plain workers also where bubblewrap is installed; the grant says so",
-)
+@click.option("--grant", help="once all rows agree, grant the entry the level re-run in this name")
 @jobs_option
 @limit_options("a fit with its scores", "3h")
 def rerun(options: Options) -> int:
-    """Run an entry's detectors again on seeds drawn now.
+    """Run an entry's detectors again on seeds drawn now, in a sandbox and row by row, and compare.
 
-    The exit code is 1 when a fit failed, and 2 when the re-run was interrupted.
+    The exit code is 1 when the entry is better than chance explains or a fit failed, and 2 when the
+    re-run was interrupted.
     """
-    path, directory = options.path, options.output
+    verdict, console = sound(options.path), make_console()
+    records = chosen(verdict, options)
+    environments = in_order((record.environment for record in records), ENVIRONMENTS)
+    results = ResultsDirectory(options.output or Path(f"rerun-{verdict.name}"))
+    if missing := unfinished(records, results):
+        require_sandbox()
+        limits = Limits(options.timeout, options.memory, (str(results.path.absolute()),))
+        plugins = discovered(options, limits)
+        check_installed(missing, plugins)
+    order = draw(verdict, results.path, environments)
+    if missing and not _run(verdict, missing, order, plugins, results, options):
+        return 2
+    again = compare_rerun(verdict.records, earlier(results), order, verdict.findings)
+    verdict = replace(verdict, rerun=again)
+    for table in figures(again, ranked_by(records)):
+        print_table(table, console)
+    report(console, verdict, options.verbosity)
+    if options.grant:
+        return write_grant(console, options.path, verdict, options.grant)
+    return int(not verdict.ok)
+
+
+def sound(path: Path) -> EntryVerdict:
+    """Return the verdict on an entry that can be run again; `UsageError` for any other."""
     verdicts = [*verify(path)]
     if len(verdicts) != 1 or not verdicts[0].ok:
         raise UsageError(f"{str(path)!r}: expected one valid entry, see leaderboard verify")
-    entry, plugins = read_entry(path), discovered(options)
-    if not all(record.paired for record in entry.records):
+    verdict = verdicts[0]
+    if not all(record.paired for record in verdict.records.values()):
         raise UsageError(
-            f"{entry.meta.id} is of logs, which cannot be recorded again: without a re-run its "
+            f"{verdict.name} is of logs, which cannot be recorded again: without a re-run its "
             "trust is at most re-scored, by leaderboard verify from its scores"
         )
-    names = select("environment", options.env, environments_of(entry))
-    check_installed(entry, plugins)
-    boxed = not options.no_sandbox and _sandboxed()
-    drawn = draw(entry, directory, names, sandbox=boxed)
-    record_split(definition_of(entry, drawn), options, names, directory / SPLIT_DIRECTORY)
-    split = load_split(directory / SPLIT_DIRECTORY)
-    plan = plan_of(entry, split, plugins, options.seed).matching(expression(options.expression))
-    hidden = (*split_places(split), str(directory)) if boxed else None
-    settings = RunSettings(
-        jobs=options.jobs,
-        limits=Limits(options.timeout, options.memory, hidden),
-        command=options.invocation,
-    )
-    results, console = ResultsDirectory(directory), make_console()
-    reporter = TerminalReporter(console, verbosity=options.verbosity, log=results.log_path)
-    done = run(plan, split, plugins, settings, results, observers=[reporter])
-    if done.interrupted:
-        return 2
-    console.print(f"next: oodd-eval leaderboard verify {path} --rerun {directory}")
-    return int(not all(record.ok for record in done.records))
+    definition_of(verdict)
+    return verdict
 
 
-def _sandboxed() -> bool:
-    """Tell whether workers can have a sandbox, and if not, say why."""
-    try:
-        require_sandbox()
-    except UsageError as error:
-        say(f"workers are plain ones, and a grant is going to say so: {error}")
-        return False
-    return True
-
-
-def check_installed(entry: SubmittedEntry, plugins: Plugins) -> None:
-    """Raise `UsageError` unless each detector is installed in the version and source it had."""
-    for record in {record.detector: record for record in entry.records}.values():
-        offer = plugins.offer(record.detector)
-        name = f"{offer.distribution}:{offer.plugin}"
-        here = name, offer.version, source_digest(offer.module)
-        there = record.plugin, record.detector_version, record.plugin_source
-        if here != there:
-            installed, submitted = (
-                f"{p} {version}, source {s[:12]}" for p, version, s in (here, there)
-            )
-            raise UsageError(
-                f"{record.detector} is installed as {installed}, but {entry.meta.id} has "
-                f"{submitted}: install that"
-            )
-
-
-def plan_of(
-    entry: SubmittedEntry, split: Split, plugins: Plugins, seeds: Sequence[int] | None = None
-) -> Plan:
-    """Return the plan of all rows of an entry in a split, with its seeds or with some of them."""
-    # One record stands for all of an environment, row and seed.
-    fits: dict[tuple[str, Setting, int], Record] = {}
-    for record in entry.records:
-        fits.setdefault((record.environment, record.setting, record.seed), record)
-    plans = [
-        make_plan(
-            plugins,
-            split=split,
-            detectors=[record.detector],
-            environments=[environment],
-            horizons=[record.horizon],
-            seeds=[seed],
-            parameters=record.parameters,
+def definition_of(verdict: EntryVerdict, bits: int = 0) -> SplitDefinition:
+    """Return the entry's split with seeds from other bits; `UsageError` where it has none."""
+    split = verdict.entry.split if verdict.entry else ""
+    definition = SPLITS.get(split)
+    if definition is None or definition.base:
+        known = ", ".join(name for name, one in SPLITS.items() if not one.base)
+        raise UsageError(
+            f"{verdict.name} is on split {split!r}: expected one that can be recorded with other "
+            f"seeds ({known})"
         )
-        for environment in split.environments
-        for (submitted, _, seed), record in fits.items()
-        if submitted == environment and (seeds is None or seed in seeds)
+    drawn = digest_of_bits(bits)
+    return replace(definition, name=f"rerun-{drawn[:12]}", seed_base=0, drawn=drawn)
+
+
+def chosen(verdict: EntryVerdict, options: Options) -> list[Record]:
+    """Return the records of an entry that the options choose."""
+    records = [*verdict.records.values()]
+    environments = in_order((record.environment for record in records), ENVIRONMENTS)
+    environments = select("environment", options.env, environments)
+    detectors = select("detector", options.detector, {record.detector for record in records})
+    known = sorted({record.seed for record in records})
+    if not set(options.seed or known) <= set(known):
+        raise UsageError(f"--seed: {verdict.name} has seeds {', '.join(map(str, known))}")
+    return [
+        record
+        for record in records
+        if record.environment in environments
+        and record.detector in detectors
+        and record.seed in (options.seed or known)
     ]
-    units = tuple(unit for plan in plans for unit in plan.units)
-    if not units:
-        raise UsageError(f"{entry.meta.id} has none of seeds {', '.join(map(str, seeds or ()))}")
-    return Plan(split.name, split.digest, units, split.groups)
 
 
-def draw(
-    entry: SubmittedEntry, directory: Path, environments: Sequence[str], *, sandbox: bool
-) -> RerunOrder:
-    """Draw seeds for an entry and write the order, or go on with the one that is there.
+def earlier(results: ResultsDirectory) -> list[Record]:
+    """Return the records of a re-run's directory so far."""
+    return results.records() if find_file(results.path / RECORDS) else []
+
+
+def unfinished(records: Sequence[Record], results: ResultsDirectory) -> list[Record]:
+    """Return those of an entry's records that were not run again with the same outcome."""
+    again = {cell_of(record): record.status for record in earlier(results)}
+    return [record for record in records if again.get(cell_of(record)) != record.status]
+
+
+def check_installed(records: Sequence[Record], plugins: Plugins) -> None:
+    """Raise `UsageError` unless each detector is installed in the version and source it had."""
+    for record in {record.detector: record for record in records}.values():
+        there = record.plugin, record.detector_version, record.plugin_source
+        try:
+            offer = plugins.offer(record.detector)
+        except UnknownNameError as error:
+            installed = f"cannot be had ({error})"
+        else:
+            offer.require()
+            name = f"{offer.distribution}:{offer.plugin}"
+            here = name, offer.version, source_digest(offer.module)
+            if here == there:
+                continue
+            installed = _version(*here)
+        raise UsageError(
+            f"{record.detector} is installed as {installed}, but the entry has {_version(*there)}: "
+            "install that"
+        )
+
+
+def _version(plugin: str, version: str, source: str) -> str:
+    return f"{plugin} {version}, source {source[:12]}"
+
+
+def draw(verdict: EntryVerdict, directory: Path, environments: Sequence[str]) -> RerunOrder:
+    """Draw bits for an entry and write the order, or go on with the one that is there.
 
     `UsageError`: the order there is for another entry, another version of it, or environments.
     """
-    digest = digest_of((entry.path / ENTRY).read_bytes())
     order = read_order(directory)
     if order is None:
-        taken = {definition.seed_base for definition in SPLITS.values()}
-        base = secrets.choice([n for n in CUSTOM_SEED_BASES if n not in taken])
         day = datetime.now(UTC).date().isoformat()
-        order = RerunOrder(digest, base, day, list(environments), sandbox)
-    if order.entry != digest:
+        order = RerunOrder(verdict.digest, secrets.token_hex(16), day, list(environments))
+        directory.mkdir(parents=True, exist_ok=True)
+        write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
+    if order.entry != verdict.digest:
         raise UsageError(
-            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {entry.meta.id} "
-            f"has {digest[:12]}: seeds are drawn for one version of an entry; name another --output"
+            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {verdict.name} "
+            f"has {verdict.digest[:12]}: seeds are drawn for one version of an entry; name another "
+            "--output"
         )
     if order.environments != list(environments):
         raise UsageError(
             f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
             f"{', '.join(environments)}: name another --output"
         )
-    order = replace(order, sandbox=order.sandbox and sandbox)
-    directory.mkdir(parents=True, exist_ok=True)
-    write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
     return order
 
 
-def definition_of(entry: SubmittedEntry, order: RerunOrder) -> SplitDefinition:
-    """Return the entry's split, recorded anew from the order's seeds; `UsageError` for others."""
-    definition = SPLITS.get(entry.meta.split)
-    if definition is None or definition.base:
-        known = ", ".join(name for name, one in SPLITS.items() if not one.base)
-        raise UsageError(
-            f"{entry.meta.id} is on split {entry.meta.split!r}: expected one that can be recorded "
-            f"with other seeds ({known})"
+def _run(
+    verdict: EntryVerdict,
+    records: Sequence[Record],
+    order: RerunOrder,
+    plugins: Plugins,
+    results: ResultsDirectory,
+    options: Options,
+) -> bool:
+    """Record the split as far as it is not there, and run what is missing; False if interrupted."""
+    bits, directory = int(order.bits, 16), results.path / SPLIT_DIRECTORY
+    record_split(definition_of(verdict, bits), options, order.environments, directory, bits=bits)
+    split = load_split(directory)
+    hidden = (*split_places(split), str(results.path.absolute()))
+    settings = RunSettings(
+        jobs=options.jobs,
+        limits=Limits(options.timeout, options.memory, hidden),
+        command=options.invocation,
+        streamed=True,
+    )
+    reporter = TerminalReporter(make_console(), verbosity=options.verbosity, log=results.log_path)
+    plan = plan_of(records, split, plugins)
+    return not run(plan, split, plugins, settings, results, observers=[reporter]).interrupted
+
+
+def plan_of(records: Sequence[Record], split: Split, plugins: Plugins) -> Plan:
+    """Return the plan of all fits that records of an entry are of, in another split."""
+    # One record stands for all of an environment, row and seed.
+    fits = {(r.environment, r.setting, r.seed): r for r in records}
+    plans = [
+        make_plan(
+            plugins,
+            split=split,
+            detectors=[record.detector],
+            environments=[record.environment],
+            horizons=[record.horizon],
+            seeds=[record.seed],
+            parameters=record.parameters,
         )
-    return replace(definition, name=f"rerun-{order.seed_base}", seed_base=order.seed_base)
+        for record in fits.values()
+    ]
+    units = tuple(unit for plan in plans for unit in plan.units)
+    return Plan(split.name, split.digest, units, split.groups)
 
 
-def environments_of(entry: SubmittedEntry) -> list[str]:
-    """Return the environments that an entry has, in the order of the paper."""
-    present = {record.environment for record in entry.records}
-    return [name for name in ENVIRONMENTS if name in present]
+def figures(again: Rerun, ranking: Sequence[str]) -> Iterator[Table]:
+    """Yield a table a row: by environment what ranks, and what is better by most errors."""
+    for row, compared in again.differences.items():
+        lines = []
+        for name, parts in grouped(compared, lambda d: d.environment or "mean").items():
+            by_metric = {d.metric: d for d in parts}
+            most = max(parts, key=lambda d: d.z)
+            values = [_values(by_metric.get(metric)) for metric in ranking]
+            lines.append([name, *values, metric_info(most.metric).title, f"{most.z:.1f}"])
+        # The mean over environments comes last.
+        lines.sort(key=lambda line: line[0] == "mean")
+        titles = [metric_info(name).title for name in ranking]
+        header = ["Environment", *titles, "Most better in", "z"]
+        note = (
+            "a / b: of the entry and of its re-run. z: by how many standard errors the entry is "
+            "better in the metric in which it is most so."
+        )
+        yield Table(f"{row}, entry / re-run", header, lines, labels=1, note=note, wrap=True)
+
+
+def _values(difference: RerunDifference | None) -> str:
+    if difference is None:
+        return UNDEFINED
+    text = metric_info(difference.metric).text
+    return f"{text(difference.entry)} / {text(difference.rerun)}"

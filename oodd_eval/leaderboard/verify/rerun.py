@@ -5,26 +5,27 @@ and the order, ``rerun.json``. The order is written before anything is recorded,
 digest of ``entry.json``: seeds that were drawn for one entry do not count for another.
 
 A re-run uses the same code, by its digest, on a split of seeds that the submitter could not know,
-so its numbers differ by chance. How much chance explains is estimated from environments: each has a
-fit, a calibration and episodes of its own. An entry that is better by more than that is refused.
+so its numbers differ by chance: by the choice of test, calibration and training episodes. An entry
+that is better than that, in any environment or on their mean, is refused.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
-from oodd_eval.data.facts import TABLE1
-from oodd_eval.data.split import published_digests
 from oodd_eval.leaderboard.entry import Means, read_json
 from oodd_eval.leaderboard.verify.files import Findings
-from oodd_eval.leaderboard.verify.recompute import Records
-from oodd_eval.metrics.auc import Floats
-from oodd_eval.metrics.binomial import t_quantile
-from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval, nan_mean
+from oodd_eval.metrics.bootstrap import (
+    calibration_samples,
+    drawn_cell,
+    mean_over_cells,
+    sample_cells,
+)
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.identity import Setting
@@ -41,16 +42,16 @@ COMPARED: Final = (
     "delay_censored",
     "false_episodes_at_5pct",
     "delay_censored_at_5pct",
+    "found_within_20_at_5pct",
 )
-"""Metrics whose means over a row's cells have to agree with those of a re-run."""
+"""Metrics that have to agree with those of a re-run."""
 
-LEVEL: Final = 0.05
-"""Chance that an honest row is refused: of all `COMPARED` together (Bonferroni)."""
+MOST_IN_ONE: Final = 4.0
+MOST_ON_MEAN: Final = 3.0
+"""Standard errors by which an entry may be better in one environment, and on the mean over them."""
 
-_NORMAL: Final = 1.96  # half widths of a 95 % interval in standard errors
-
-LEAST: Final = 3
-"""Environments in which a row has to be run again, so that a difference has an interval."""
+MOST_CLAIMED: Final = 2.0
+"""Largest ratio of an entry's standard error, which is the submitter's, to that of its re-run."""
 
 _FIELDS: Final = (
     "detector_version",
@@ -60,30 +61,25 @@ _FIELDS: Final = (
     "deterministic",
     "alarm",
     "inputs",
+    "training",
 )
 """Fields of a record that are the same in a re-run."""
 
 
 @dataclass(frozen=True, slots=True)
 class RerunOrder:
-    """Seeds drawn on a `day` (ISO 8601) for an entry, given by the digest of its ``entry.json``.
+    """128 random bits drawn on a `day` (ISO 8601) for an entry, by the digest of ``entry.json``.
 
-    `sandbox` is False as soon as one worker was a plain one.
+    `bits` are 32 hexadecimal digits.
     """
 
     entry: str
-    seed_base: int
+    bits: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     day: str
     environments: list[str]
-    sandbox: bool
-    schema: Literal[1] = 1  # version of the layout; others are refused
+    schema: Literal[2] = 2  # version of the layout; others are refused
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
-
-    def __str__(self) -> str:
-        """Return what a grant says of it."""
-        where = "in a sandbox" if self.sandbox else "without a sandbox"
-        return f"seed base {self.seed_base} drawn on {self.day} for this entry, {where}"
 
 
 def read_order(directory: Path) -> RerunOrder | None:
@@ -94,142 +90,186 @@ def read_order(directory: Path) -> RerunOrder | None:
     return read_json(RerunOrder, file, "is no order of a re-run, use another directory")
 
 
+class RerunDifference(NamedTuple):
+    """A metric of an entry and of its re-run in an environment, or with "" on the mean over them.
+
+    `error` is the standard error of the difference, and `z` by how many of them the entry is
+    better.
+    """
+
+    metric: str
+    environment: str
+    entry: float
+    rerun: float
+    error: float
+
+    @property
+    def z(self) -> float:
+        """By how many standard errors the entry is better; negative where it is worse."""
+        sign = -1 if metric_info(self.metric).better == "lower" else 1
+        return sign * (self.entry - self.rerun) / self.error
+
+    @property
+    def refused(self) -> bool:
+        """True where chance does not explain by how much the entry is better."""
+        return self.z > (MOST_IN_ONE if self.environment else MOST_ON_MEAN)
+
+
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """The result of a comparison with a re-run, in one line and in a line for every row.
+    """The result of a comparison with a re-run: what a grant says of it, and differences by row.
 
-    It is confirmed when every row was run again in `LEAST` environments, and all agrees. `means`
-    are those of a `Grant`.
+    It is `complete` when every row of the entry was run again in the order's environments.
     """
 
     how: str
-    lines: list[str]
-    confirmed: bool
-    means: Means
+    differences: dict[str, list[RerunDifference]]
+    complete: bool
+
+    @property
+    def means(self) -> Means:
+        """Means of the entry and of the re-run by row and metric, as a `Grant` has them."""
+        return {
+            row: {
+                d.metric: (float(f"{d.entry:.6g}"), float(f"{d.rerun:.6g}"))
+                for d in compared
+                if not d.environment
+            }
+            for row, compared in self.differences.items()
+        }
 
 
-_CellKey = tuple[Setting, str, str]  # row, environment, condition
+def cell_of(record: Record) -> tuple[Setting, str, str, int]:
+    """Return row, environment, condition and detector seed of a record."""
+    return record.setting, *record.position, record.seed
+
+
+_PARTS: Final[Mapping[str, Callable[[Record], object]]] = {
+    "environments": lambda record: record.environment,
+    "kinds of anomalies": lambda record: record.condition,
+    "rows": lambda record: record.setting,
+    "detector seeds": lambda record: record.seed,
+    "cells": cell_of,
+}
 
 
 def compare_rerun(
-    records: Records, fresh: Sequence[Record], findings: Findings, order: RerunOrder | None = None
+    records: Mapping[str, Record], fresh: Sequence[Record], order: RerunOrder, findings: Findings
 ) -> Rerun:
-    """Compare an entry's records with those of the verifier's own run on a split of fresh seeds.
+    """Compare an entry's records, by where they stand, with those of its re-run.
 
-    The run may be of fewer environments and detector seeds, and have more than the entry's rows.
+    The re-run may be of fewer rows, environments and detector seeds; what it lacks is not compared,
+    and said in words.
     """
-    before = findings.count
-    again, source = _usable(records, fresh, findings)
-    ours = grouped(records.values(), _cell_of)
-    pairs = {key: (cells, again[key]) for key, cells in ours.items() if key in again}
-    lines, means = [], Means()
-    for row in dict.fromkeys(row for row, _, _ in ours):
-        of_row = {(env, a): pair for (r, env, a), pair in pairs.items() if r == row}
-        whole = {env for env, _ in of_row if all((env, a) in of_row for a in TABLE1)}
-        if len(whole) < LEAST:
-            why = f"was run again with all anomalies in {len(whole)} environments, expected {LEAST}"
-            findings.refuse("re-run", str(row), why)
-            continue
-        cells = sum(key[0] == row for key in ours)
-        compared = list(_differences(str(row), of_row, findings))
-        means[str(row)] = {metric: pair for metric, pair, _ in compared}
-        differences = [text for *_, text in compared if text]
-        lines.append("; ".join([f"{row}: {len(of_row)} of {cells} cells run again", *differences]))
+    again = {cell_of(record): record for record in fresh}
+    run = [record for record in records.values() if cell_of(record) in again]
     for where, record in records.items():
-        for other in again.get(_cell_of(record), ())[:1]:
-            for field in _FIELDS:
-                new, old = getattr(other, field), getattr(record, field)
-                findings.expect(where, field, new, old, "as in the re-run")
-    drawn = str(order or "by the verifier's word")
-    how = f"{source}, {drawn}, {len(pairs)} of {len(ours)} cells"
-    return Rerun(how, lines, findings.count == before, means)
-
-
-def _cell_of(record: Record) -> _CellKey:
-    return record.setting, *record.position
-
-
-def _usable(
-    records: Records, fresh: Sequence[Record], findings: Findings
-) -> tuple[Mapping[_CellKey, list[Record]], str]:
-    """Return the records of a re-run by row and cell, and its split in words; none if unusable."""
-    first = next(iter(records.values()))
-    known = {first.split_digest, *published_digests().values()}
-    usable = [r for r in fresh if r.protocol == first.protocol and r.limit is None]
-    splits = {r.split_digest: r.split for r in usable}
-    if len(splits) != 1 or known & splits.keys():
-        names = ", ".join(sorted(splits.values())) or "none without --limit"
-        expected = "results on one whole split of seeds that nobody could know before"
-        findings.refuse("re-run", "split", f"is {names}, expected {expected} (data build)")
-        return {}, "nothing"
-    ((digest, name),) = splits.items()
-    again = grouped(usable, _cell_of)
-    for record in records.values():
-        for other in again.get(_cell_of(record), ()):
-            for part in ("train", "calibration"):
-                if other.counts.get(part) != record.counts.get(part):
-                    message = f"are {other.counts} in {other.cell}, expected {record.counts}"
-                    findings.refuse("re-run", "counts", f"{message} but for test seeds")
-                    return {}, "nothing"
-    return again, f"fresh seeds (split {name}, digest {digest[:12]})"
-
-
-def _differences(
-    label: str,
-    cells: Mapping[tuple[str, str], tuple[list[Record], list[Record]]],
-    findings: Findings,
-) -> Iterator[tuple[str, tuple[float, float], str]]:
-    """Compare means over paired cells of a row; refuse what chance does not explain.
-
-    Yields metric, the entry's mean and the re-run's, and the difference as text where there is one.
-    """
-    for metric in COMPARED:
-        drawn: tuple[list[DrawnCells], list[DrawnCells]] = ([], [])
-        pairs: dict[str, list[list[float]]] = {}
-        for (environment, _), sides in cells.items():
-            by_side = [
-                [
-                    drawn_cell(environment, r.seed, contribution(r, metric), str(r.condition))
-                    for r in side
-                    if r.ok and metric in r.per_trajectory
-                ]
-                for side in sides
-            ]
-            both = [nan_mean(value for cell in side for value in cell.values) for side in by_side]
-            if not any(map(math.isnan, both)):
-                pairs.setdefault(environment, []).append(both)
-                for all_of_side, of_cell in zip(drawn, by_side, strict=True):
-                    all_of_side.extend(of_cell)
-        means = np.array([np.mean(both, axis=0) for both in pairs.values()]).reshape(-1, 2)
-        change = means[:, 0] - means[:, 1]
-        if len(change) < 2:
+        if (other := again.get(cell_of(record))) is None:
             continue
-        info, (mine, other) = metric_info(metric), means.mean(axis=0)
-        pair = float(f"{mine:.6g}"), float(f"{other:.6g}")
-        if not change.any():
-            yield metric, pair, ""
-            continue
-        ends = [mean_interval(side, kind=info.interval) for side in drawn]
-        episodes = math.hypot(
-            *(float(np.nan_to_num(high - low)) / 2 / _NORMAL for low, high in ends)
+        for name in _FIELDS:
+            findings.expect(
+                where, name, getattr(other, name), getattr(record, name), "as in the re-run"
+            )
+        for name in record.metrics.keys() & COMPARED if record.ok and other.ok else ():
+            if math.isnan(record.value(name)) and not math.isnan(other.value(name)):
+                findings.refuse(where, name, "is undefined, and defined in the re-run")
+    compared = {}
+    for row in dict.fromkeys(record.setting for record in run):
+        # All detector seeds of the entry count, whether they were run again or not.
+        ours = grouped((r for r in records.values() if r.setting == row), lambda r: r.environment)
+        theirs = grouped(
+            (again[cell_of(r)] for r in run if r.setting == row), lambda r: r.environment
         )
-        wide = by_chance(change, episodes)
-        environment = list(pairs)[int(np.argmax(np.abs(change)))]
-        most = f"most in {environment}, by {np.max(np.abs(change)):.2g}"
-        yield metric, pair, f"{metric} {other:.4g} for {mine:.4g} ({most})"
-        if (mine - other) * (-1 if info.better == "lower" else 1) > wide:
-            message = f"is {other:.4g}, but {mine:.4g} in the entry: chance explains {wide:.2g}"
-            findings.refuse("re-run", f"{label} {metric}", f"{message}, not the whole difference")
+        compared[str(row)] = differences({name: (ours[name], theirs[name]) for name in theirs})
+        for d in compared[str(row)]:
+            if d.refused:
+                findings.refuse(
+                    "re-run",
+                    f"{row} {d.metric} {d.environment or 'mean'}",
+                    f"is {d.entry:.4g}, but {d.rerun:.4g} in the re-run: better by {d.z:.2g} "
+                    "standard errors, which chance does not explain",
+                )
+    counts = [
+        f"{len(set(map(part, run)))} of {len(set(map(part, records.values())))} {name}"
+        for name, part in _PARTS.items()
+    ]
+    seeds = f"seeds of 128 random bits, {order.bits}, drawn on {order.day} for this entry"
+    digests = ", ".join(sorted({record.split_digest[:12] for record in fresh})) or "none"
+    how = f"{seeds} (split digest {digests}), row by row in a sandbox: {', '.join(counts)}"
+    drawn = {cell_of(r)[:3] for r in records.values() if r.environment in order.environments}
+    return Rerun(how, compared, drawn == {cell_of(r)[:3] for r in run})
 
 
-def by_chance(change: Floats, episodes: float = 0.0) -> float:
-    """Return by how much the mean of an honest row may be better than that of its re-run.
+def differences(
+    sides: Mapping[str, tuple[Sequence[Record], Sequence[Record]]],
+    metrics: Sequence[str] = COMPARED,
+) -> list[RerunDifference]:
+    """Return how a row's metrics differ from those of its re-run, by environment and on the mean.
 
-    Half of Student's interval of the mean of paired differences `change`, one an environment, on
-    one side, at the level that keeps all of `COMPARED` together to `LEVEL`. Few environments may by
-    chance differ by nearly the same: the standard error is at least that which the choice of
-    `episodes` alone gives.
+    Parameters
+    ----------
+    sides
+        By environment the row's records and those of its re-run. Conditions that only one of them
+        has, or in which one leaves a metric undefined, are left out.
+    metrics
+        Names of those to compare.
     """
-    n = len(change)
-    error = max(float(change.std(ddof=1)) / math.sqrt(n), episodes)
-    return t_quantile(1 - LEVEL / len(COMPARED), n - 1) * error
+    compared = []
+    for metric in metrics:
+        parts = [
+            difference
+            for environment, (ours, theirs) in sides.items()
+            for difference in _difference(environment, ours, theirs, metric)
+        ]
+        if parts:
+            entry = math.fsum(p.entry for p in parts) / len(parts)
+            rerun = math.fsum(p.rerun for p in parts) / len(parts)
+            error = math.hypot(*(p.error for p in parts)) / len(parts)
+            compared += [*parts, RerunDifference(metric, "", entry, rerun, error)]
+    return compared
+
+
+def _difference(
+    environment: str, ours: Sequence[Record], theirs: Sequence[Record], metric: str
+) -> Iterator[RerunDifference]:
+    """Yield the difference in an environment, if there is a condition that both sides have."""
+    defined = [
+        [r for r in side if metric in r.per_trajectory and not math.isnan(r.value(metric))]
+        for side in (ours, theirs)
+    ]
+    common = set.intersection(*({r.condition for r in side} for side in defined))
+    if not common:
+        return
+    ours, theirs = ([r for r in side if r.condition in common] for side in defined)
+    chance = max(
+        _standard_error(theirs, metric), *(_one_episode(s, metric) for s in (ours, theirs))
+    )
+    claimed = min(max(_standard_error(ours, metric), chance), MOST_CLAIMED * chance)
+    entry, rerun = (mean_over_cells((r.seed, r.value(metric)) for r in s) for s in (ours, theirs))
+    yield RerunDifference(metric, environment, entry, rerun, math.hypot(claimed, chance))
+
+
+def _one_episode(records: Sequence[Record], metric: str) -> float:
+    """Return by how much one more episode that went as badly as any would change a mean.
+
+    A share or an AUC changes by 1 over the number of episodes. No side is known better than that,
+    also where all of its episodes are alike.
+    """
+    terms = [record.per_trajectory[metric] for record in records]
+    worst = max(1.0, *(float(both[0].max(initial=0.0)) for both in terms))
+    return worst / sum(float(both[1].sum()) for both in terms)
+
+
+def _standard_error(records: Sequence[Record], metric: str) -> float:
+    """Return the standard error of a row's mean in an environment.
+
+    It is of test episodes, of detector seeds, and of calibration episodes where records say how
+    these change the metric.
+    """
+    cells = [
+        drawn_cell(r.environment, r.seed, contribution(r, metric), str(r.condition))
+        for r in records
+    ]
+    n = max(len(record.per_trajectory[metric][0]) for record in records)
+    of_test = float(np.nanstd(sample_cells(cells))) * math.sqrt(n / max(n - 1, 1))
+    return math.hypot(of_test, float(calibration_samples(cells).std()))
