@@ -9,17 +9,19 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.alarms import GuaranteedAlarm
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, guaranteed_contributions
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import IntervalKind
+from oodd_eval.metrics.catalogue import IntervalKind, metric_info
+from oodd_eval.metrics.recalibration import PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores, separability
+from oodd_eval.results.draws import CodedDraws
 
 SEEDS: Final = (10, 20, 50)
 """Test seeds per environment: those of mini, reduced and standard."""
@@ -147,11 +149,65 @@ class TwoSamples:
         return list(episodes)
 
 
+@dataclass(frozen=True)
+class Calibrated:
+    """A metric of guaranteed alarms at 5 %, whose threshold is from 40 calibration episodes.
+
+    Scores of a row are normal, and each episode has a level of its own; anomalous ones rise after
+    a quarter of their rows. True is the mean over calibrations. Without `noise` intervals have the
+    test seeds alone, as those of protocol 2.
+    """
+
+    title: str
+    metric: str
+    alarm: AlarmKind
+    noise: bool = True
+    environments: int = 1
+    rows: int = 60
+
+    def coverage(self, n: int, problems: int = PROBLEMS) -> float:
+        """Return the share of problems whose interval contains the true value."""
+        rng = np.random.default_rng(0)
+        kind, inside = metric_info(self.metric).interval, []
+        values = [self._terms(rng, n, f"t{i}").value for i in range(TRUE_CALIBRATIONS)]
+        truth = np.mean(values)
+        for i in range(problems):
+            names = [f"{i}/{k}" for k in range(self.environments)]
+            cells = [drawn_cell(name, 0, self._terms(rng, n, name, draw=True)) for name in names]
+            low, high = mean_interval(cells, kind=kind)
+            inside.append(low <= truth <= high)
+        return float(np.mean(inside))
+
+    def _terms(
+        self, rng: np.random.Generator, n: int, environment: str, *, draw: bool = False
+    ) -> Contribution:
+        calibration, twins = self._episodes(rng, 40), self._episodes(rng, n)
+        effects = np.full(n, self.rows // 4)
+        anomalous = [twin.copy() for twin in twins]
+        for scores in anomalous:
+            scores[effects[0] :] += rng.normal(1.0, 0.5) + rng.normal(size=len(scores) - effects[0])
+        name = self.metric.partition("_at_")[0]
+        rule = GuaranteedAlarm.fit(calibration, 0.05, self.alarm)
+        terms = guaranteed_contributions(anomalous, twins, effects.tolist(), rule)[name]
+        if not draw or not self.noise:
+            return terms
+        again = Recalibration.fit(calibration, self.alarm, environment)
+        (draws,) = again.paired(twins, [PairedScores(anomalous, effects, effects)])
+        kept = CodedDraws.of({self.metric: draws[self.metric]})
+        return replace(terms, deviations=kept[self.metric])
+
+    def _episodes(self, rng: np.random.Generator, n: int) -> list[NDArray[np.float64]]:
+        return list(rng.normal(0, 0.3, size=(n, 1)) + rng.normal(size=(n, self.rows)))
+
+
+TRUE_CALIBRATIONS: Final = 2000
+"""Calibrations that the true values of `Calibrated` are means over."""
+
 FALLS_SHORT: Final = "delays with 5 % misses"
 """The scenario whose intervals contain the true value too seldom: a resample holds no miss that the
 sample lacks."""
 
-SCENARIOS: Final[tuple[Scenario | TwoSamples, ...]] = (
+SCENARIOS: Final[tuple[Scenario | TwoSamples | Calibrated, ...]] = (
     Scenario("AUCs, skewed towards 1", _aucs, "share"),
     Scenario("AUCs, mean over 7 environments", _aucs, "share", 7),
     Scenario("delays, skewed", _delays, "mean"),
@@ -171,6 +227,14 @@ SCENARIOS: Final[tuple[Scenario | TwoSamples, ...]] = (
     TwoSamples("pooled AUC, no twins, 4 times as many nominal episodes", ratio=4),
     TwoSamples("pooled AUC of 96 %, no twins, as many nominal episodes", shift=3.5),
     TwoSamples("pooled AUC, no twins, mean over 3 conditions", conditions=3),
+    *(
+        Calibrated(f"{title}, {text}", f"{metric}_at_5pct", alarm, noise)
+        for title, metric, alarm in (
+            ("found within 20, score", "found_within_20", "score"),
+            ("censored delay, CUSUM", "delay_censored", "cusum"),
+        )
+        for noise, text in ((False, "test seeds alone"), (True, "with calibration noise"))
+    ),
 )
 
 

@@ -447,24 +447,41 @@ def from_starts(
     dict
         Contributions by name, without the suffix of a level.
     """
-    nothing = math.nan
-    early, delays, missed, censored = [], [], [], []
-    within: dict[int, list[float]] = {k: [] for k in FOUND_WITHIN}
-    for first, length, end, effect in zip(firsts, lengths, ends, map(int, effects), strict=True):
-        before = first is not None and first < effect
-        delay = nothing if first is None else float(first - effect)
-        remainder = length - effect
-        defined = not before and remainder > 0
-        early.append(float(before))
-        delays.append(delay if defined else nothing)
-        missed.append(float(first is None) if defined else nothing)
-        censored.append((remainder if first is None else delay) if defined else nothing)
-        for k, shares in within.items():
-            seen = first is not None and first < end and delay < k
-            shares.append(float(seen) if defined and effect < end else nothing)
-    values = {"early": early, "delay": delays, "missed": missed, "delay_censored": censored}
-    values |= {f"found_within_{k}": shares for k, shares in within.items()}
-    return {name: mean_of(terms) for name, terms in values.items()}
+    rows = np.array([math.nan if first is None else first for first in firsts], np.float64)
+    ints = (np.asarray(values, np.int64) for values in (lengths, ends, effects))
+    return {name: mean_of(terms) for name, terms in start_terms(rows, *ints).items()}
+
+
+def start_terms(
+    firsts: Floats, lengths: NDArray[np.int64], ends: NDArray[np.int64], effects: NDArray[np.int64]
+) -> dict[str, Floats]:
+    """Return the values of each episode, NaN where undefined, for `from_starts`.
+
+    Parameters
+    ----------
+    firsts
+        Rows of first alarms, NaN without: shape (..., n).
+    lengths, ends, effects
+        As those of `from_starts`: shape (n,).
+
+    Returns
+    -------
+    dict
+        Arrays of the shape of `firsts` by name, without the suffix of a level.
+    """
+    early, delays, missed = firsts < effects, firsts - effects, np.isnan(firsts)
+    remainders = lengths - effects
+    values = {
+        "delay": delays,
+        "missed": missed.astype(np.float64),
+        "delay_censored": np.where(missed, remainders, delays),
+    }
+    for k in FOUND_WITHIN:
+        seen = (firsts < ends) & (delays < k)
+        values[f"found_within_{k}"] = np.where(effects < ends, seen, np.nan)
+    defined = ~early & (remainders > 0)
+    terms = {name: np.where(defined, value, np.nan) for name, value in values.items()}
+    return {"early": early.astype(np.float64), **terms}
 
 
 def attribution_contributions(

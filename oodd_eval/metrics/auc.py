@@ -9,7 +9,7 @@ Time runs over observation rows. The ``onset`` is the row from which on an anoma
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -38,6 +38,9 @@ class Contribution:
     nominal
         Of test data without twins, how many of the first terms are of nominal test episodes; the
         others are of anomalous ones. None where terms are of anomalous episodes and their twins.
+    deviations
+        Of the value in each resample of the calibration episodes from its mean over these: shape
+        (draws,). Empty where none changes it, or it is not known.
 
     Examples
     --------
@@ -50,6 +53,7 @@ class Contribution:
     denominator: Floats
     median: bool = False
     nominal: int | None = None
+    deviations: Floats = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def value(self) -> float:

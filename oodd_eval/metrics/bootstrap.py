@@ -38,6 +38,8 @@ Samples = NDArray[np.float64]  # A number in every resample: shape (R,), NaN whe
 
 _NORMAL: Final = NormalDist()
 
+_DIGITS: Final = 4  # of an end to which draws of the calibration have added
+
 _NOISE: Final = 1e-12  # relative difference that is taken for rounding
 
 
@@ -145,6 +147,8 @@ class DrawnCells:
         Number of nominal test episodes that terms begin with; None where episodes have twins.
     condition
         That of all of these cells, where episodes have no twins.
+    deviations
+        Of each cell's value in the resamples of calibration episodes, see `Contribution`.
     """
 
     environment: str
@@ -154,6 +158,7 @@ class DrawnCells:
     median: bool = False
     nominal: int | None = None
     condition: str = ""
+    deviations: Sequence[Floats] = ()
 
     @functools.cached_property
     def values(self) -> list[float]:
@@ -186,7 +191,7 @@ class DrawnCells:
 
     @property
     def compared(self) -> bool:
-        """Whether the metric is of nominal and of anomalous episodes."""
+        """True where the metric compares nominal with anomalous episodes."""
         return len(self._samples) > 1 and all(s.any() for s in self._samples)
 
     @property
@@ -202,7 +207,10 @@ class DrawnCells:
         """Return the cells at some indices."""
         seeds = [self.seeds[i] for i in cells]
         terms = self.numerators[list(cells)], self.denominators[list(cells)]
-        return replace(self, seeds=seeds, numerators=terms[0], denominators=terms[1])
+        deviations = [self.deviations[i] for i in cells] if self.deviations else ()
+        return replace(
+            self, seeds=seeds, numerators=terms[0], denominators=terms[1], deviations=deviations
+        )
 
     @functools.cached_property
     def sums(self) -> list[CellSum]:
@@ -232,7 +240,8 @@ def drawn_cell(
     """Return one cell of a detector seed; the condition matters where episodes have no twins."""
     terms = contribution.numerator[None], contribution.denominator[None]
     median, nominal = contribution.median, contribution.nominal
-    return DrawnCells(environment, [seed], *terms, median, nominal, condition)
+    deviations = [contribution.deviations]
+    return DrawnCells(environment, [seed], *terms, median, nominal, condition, deviations)
 
 
 def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[float, float]:
@@ -249,6 +258,9 @@ def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[f
 
     Where nominal and anomalous episodes are two samples the smaller one counts, and the terms of an
     AUC may leave its range in a resample, so that the ends of a share are clipped to [0, 1].
+
+    Where the calibration episodes decide the metric, too, their noise is added: the distances of
+    the ends from the value, which are independent, as squares (Zou & Donner, Stat. Med. 27, 2008).
     """
     sizes: dict[tuple[str, str], int] = {}
     for c in cells:
@@ -257,6 +269,29 @@ def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[f
     if not sizes:
         return math.nan, math.nan
     value = mean_over_cells(pair for c in cells for pair in zip(c.seeds, c.values, strict=True))
+    low, high = _of_test_seeds(cells, kind, value, sizes)
+    below, above = _of_calibration(cells)
+    if below or above:
+        low, high = (
+            float(f"{end:.{_DIGITS}g}")
+            for end in (
+                value - math.hypot(value - low, below),
+                value + math.hypot(high - value, above),
+            )
+        )
+        # A rounded end may have come past the value.
+        low, high = max(min(low, value), 0.0), max(high, value)
+        return low, high if kind in ("mean", "count") else min(high, 1.0)
+    return low, high
+
+
+def _of_test_seeds(
+    cells: Sequence[DrawnCells],
+    kind: IntervalKind,
+    value: float,
+    sizes: Mapping[tuple[str, str], int],
+) -> tuple[float, float]:
+    """Return the interval that the choice of test trajectories and detector seeds gives."""
     if kind == "exact":
         low, high = _exact(cells)
         # The mean over cells and the share of all twins differ where environments do in size.
@@ -270,6 +305,53 @@ def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[f
     if kind == "share" and any(c.nominal is not None for c in cells):
         return max(low, 0.0), min(high, 1.0)
     return low, high
+
+
+def _of_calibration(cells: Sequence[DrawnCells]) -> tuple[float, float]:
+    """Return how far calibration noise goes below a mean over cells (negative) and above it."""
+    if not any(changes.size for c in cells for changes in c.deviations):
+        return 0.0, 0.0
+    changes = np.sort(calibration_samples(cells))
+    low, high = (_percentile(changes, (1 + side * LEVEL) / 2) for side in (-1, 1))
+    return min(low, 0.0), max(high, 0.0)
+
+
+def calibration_samples(cells: Sequence[DrawnCells], resamples: int = RESAMPLES) -> Samples:
+    """Return by how much calibration changes a mean over cells in every resample.
+
+    Cells of one environment share the draws; environments are drawn apart. Those of one alone are
+    its draws as they are.
+    """
+    defined: dict[int, int] = {}
+    for c in cells:
+        for seed, value in zip(c.seeds, c.values, strict=True):
+            defined[seed] = defined.get(seed, 0) + (not math.isnan(value))
+    seeds = sum(n > 0 for n in defined.values())
+    totals: dict[tuple[str, int], Floats] = {}
+    for c in cells:
+        for seed, value, change in zip(c.seeds, c.values, c.deviations, strict=False):
+            if change.size and not math.isnan(value):
+                key = c.environment, len(change)
+                part = change / (seeds * defined[seed])
+                totals[key] = totals.get(key, np.zeros(len(part))) + part
+    if len(totals) < 2:
+        return next(iter(totals.values()), np.zeros(1))
+    samples = np.zeros(resamples)
+    for (environment, draws), total in totals.items():
+        samples += total[calibration_draws(environment, draws, resamples)]
+    return samples
+
+
+@functools.lru_cache(maxsize=128)
+def calibration_draws(environment: str, draws: int, resamples: int) -> NDArray[np.intp]:
+    """Return which resample of an environment's calibration episodes each resample takes.
+
+    Each is taken as often as any other: shape (resamples,).
+    """
+    rng = np.random.default_rng([zlib.crc32(f"draws of {environment}".encode()), draws])
+    order = rng.permutation(resamples) % draws
+    order.setflags(write=False)
+    return order
 
 
 def _trials(cells: Sequence[DrawnCells], sizes: Mapping[tuple[str, str], int]) -> int:

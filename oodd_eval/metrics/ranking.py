@@ -12,7 +12,7 @@ resamples takes what is equal up to rounding as equal.
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.binomial import incomplete_beta
-from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds
+from oodd_eval.metrics.bootstrap import bootstrap_weights, bounds, calibration_draws
 
 ALPHA: Final = 0.05
 """Highest chance that a table calls any row better that is not (family-wise error rate)."""
@@ -141,8 +141,9 @@ def rank(
     if it were the one further primary row, so that its rank is the one that it would have.
 
     Test seeds are drawn jointly for all rows and anomalies of an environment, so that differences
-    are paired. Several detector seeds of a row are drawn, too, independently of other rows; the two
-    sources of noise are added.
+    are paired. Several detector seeds of a row are drawn, too, independently of other rows, and
+    where terms say what the calibration episodes change, so are these, jointly as test seeds are.
+    The sources of noise are added.
     """
     names = sorted(rows)
     _check_shape(rows)
@@ -185,12 +186,14 @@ class _Influences(NamedTuple):
     """Shifts of a row's mean by each test seed and each detector seed, centred on 0.
 
     `of_tests` is by sample, see `_samples`; `of_detectors` is empty where there is one detector
-    seed, and `key` names the draws of these.
+    seed, and `key` names the draws of these. `of_calibrations` is by environment, empty for
+    metrics that calibration does not change.
     """
 
     of_tests: Mapping[str, Floats]
     of_detectors: Floats
     key: str
+    of_calibrations: Mapping[str, Floats]
 
 
 class _Tested(NamedTuple):
@@ -226,6 +229,8 @@ class _PairBootstrap:
         # Sums are taken in a fixed order, so that an interval depends on its two rows alone.
         self._shifts = np.zeros((len(rows), resamples))
         self._variances = np.zeros((len(rows), resamples))
+        calibrated = any(row.of_calibrations for row in self._rows)
+        self._calibrations = np.zeros((len(rows), resamples if calibrated else 0))
         for i, row in enumerate(self._rows):
             self._shifts[i] = np.einsum("n,nr->r", self._influences[i] / self._n, self._drawn)
             if n := row.of_detectors.size:
@@ -234,6 +239,11 @@ class _PairBootstrap:
                 square = np.einsum("n,nr->r", row.of_detectors**2, drawn) / n
                 self._shifts[i] += mean
                 self._variances[i] = np.maximum(square - mean * mean, 0.0) / (n - 1)
+            for environment, changes in row.of_calibrations.items():
+                taken = calibration_draws(environment, len(changes), resamples)
+                self._calibrations[i] += changes[taken]
+            if calibrated:
+                self._shifts[i] += self._calibrations[i]
 
     def test(self, name: str, others: Sequence[str], differences: Floats) -> list[_Tested]:
         """Test a row against others, given the differences of its mean to theirs."""
@@ -276,7 +286,14 @@ class _PairBootstrap:
         for i, column in enumerate(columns):
             for z in (self._rows[row].of_detectors, self._rows[column].of_detectors):
                 variances[i] += float(z.var()) / (z.size - 1) if z.size else 0.0
-        return variances
+        return variances + self._of_calibrations(row, columns)
+
+    def _of_calibrations(self, row: int, columns: NDArray[np.intp]) -> Floats:
+        """Return the variances that the calibration episodes give to differences of a row."""
+        if not self._calibrations.size:
+            return np.zeros(len(columns))
+        changes = self._calibrations
+        return np.array([(changes[row] - changes[column]).var() for column in columns])
 
     def _studentized(self, row: int, columns: NDArray[np.intp], effects: Floats) -> Floats:
         """Return shifts over their standard errors in every resample: shape (columns, R)."""
@@ -284,6 +301,7 @@ class _PairBootstrap:
         squares = effects**2 / (self._n * freedom)
         means = effects / (self._n * np.sqrt(freedom))
         studentized = np.empty((len(columns), self.resamples))
+        of_calibrations = self._of_calibrations(row, columns)[:, None]
         for start in range(0, self.resamples, _BLOCK):
             block = slice(start, start + _BLOCK)
             variances = squares @ self._drawn[:, block]
@@ -293,6 +311,7 @@ class _PairBootstrap:
                 variances -= mean
             variances = np.maximum(variances, 0.0)
             variances += self._variances[row, block] + self._variances[columns, block]
+            variances += of_calibrations
             shifts = self._shifts[row, block] - self._shifts[columns, block]
             with np.errstate(divide="ignore", invalid="ignore"):
                 # Where all seeds agree to the last digit, no shift over no spread is no shift.
@@ -308,7 +327,7 @@ class _PairBootstrap:
         """
         last = len(studentized) - 1
         places = [last - ENOUGH, last - 10 * ENOUGH]
-        near, far = (self._tail(t) for t in np.partition(studentized, places)[places])
+        near, far = (self._tail(t) for t in np.sort(studentized)[places])
         slope = min(math.log(10) / math.log(far / near), 1.0) if far > near else 1.0
         share: float = (self._tail(observed) / near) ** slope
         return share * (1 + ENOUGH) / (self.resamples + 1)
@@ -357,14 +376,31 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
     >>> tie_groups(["a", "b", "c"], [("a", "c")])
     [('a', 'b'), ('b', 'c')]
     """
-    groups = [frozenset(names)] if names else []
-    for pair in sorted(better):
-        split = [g for g in groups if not g.issuperset(pair)]
-        split += [g - {one} for g in groups if g.issuperset(pair) for one in pair]
-        groups = [g for g in set(split) if not any(g < other for other in split)]
+    alike = {name: {*names} - {name} for name in names}
+    for one, other in better:
+        alike[one].discard(other)
+        alike[other].discard(one)
+    groups = _cliques(alike, [], {*names}, set()) if names else ()
     # By position, since names have an order of their own.
     positions = sorted(sorted(map(names.index, group)) for group in groups)
     return [tuple(names[i] for i in group) for group in positions]
+
+
+def _cliques(
+    alike: Mapping[str, set[str]], group: list[str], more: set[str], done: set[str]
+) -> Iterator[list[str]]:
+    """Yield the largest groups of rows that are all alike (Bron & Kerbosch, 1973, with pivots).
+
+    They are those with `group`, some of `more`, and none of `done`, in which groups were yielded.
+    """
+    if not more and not done:
+        yield group
+        return
+    pivot = max(more | done, key=lambda name: len(alike[name] & more))
+    for name in more - alike[pivot]:
+        yield from _cliques(alike, [*group, name], more & alike[name], done & alike[name])
+        more.remove(name)
+        done.add(name)
 
 
 def win_rates(values: Mapping[str, Mapping[Position, float]]) -> dict[tuple[str, str], float]:
@@ -377,13 +413,57 @@ def win_rates(values: Mapping[str, Mapping[Position, float]]) -> dict[tuple[str,
     ...            "b": {("ant", "iid"): 0.8, ("ant", "drift"): 0.5}})["a", "b"]
     0.75
     """
+    cells = sorted({cell for row in values.values() for cell in row})
+    every = np.array([[row.get(c, math.nan) for c in cells] for row in values.values()])
     rates = {}
-    for row, other in itertools.permutations(values, 2):
-        common = [(values[row][c], values[other][c]) for c in values[row] if c in values[other]]
-        defined = [x - y for x, y in common if not math.isnan(x) and not math.isnan(y)]
-        wins = [0.5 if abs(d) <= NOISE else float(d > 0) for d in defined]
-        rates[row, other] = sum(wins) / len(wins) if wins else math.nan
+    for (i, row), (j, other) in itertools.combinations(enumerate(values), 2):
+        differences = every[i] - every[j]
+        defined = differences[~np.isnan(differences)]
+        equal = int(np.count_nonzero(np.abs(defined) <= NOISE))
+        wins = int(np.count_nonzero(defined > NOISE)) + 0.5 * equal
+        n = defined.size
+        rates[row, other] = wins / n if n else math.nan
+        rates[other, row] = (n - wins) / n if n else math.nan
     return rates
+
+
+class Lead(NamedTuple):
+    """Number of environments that can be left out with a row's mean staying above the next."""
+
+    held: int
+    environments: int
+
+    def __str__(self) -> str:
+        """Return both numbers, such as ``6/7``."""
+        return f"{self.held}/{self.environments}"
+
+
+def leads(rows: Mapping[str, Row]) -> dict[str, Lead]:
+    """Return the leads of rows, in their order, over the next one; the last row has none.
+
+    There are none over a single environment.
+    """
+    totals = {}
+    for name, row in rows.items():
+        by_environment: dict[str, list[float]] = {}
+        for cells in row.values():
+            for cell in sorted(cells):
+                by_environment.setdefault(cell[0], []).append(cells[cell].value)
+        totals[name] = {e: (math.fsum(v), len(v)) for e, v in by_environment.items()}
+    results = {}
+    for name, other in itertools.pairwise(rows):
+        environments = totals[name].keys()
+        held = 0
+        for left_out in environments if len(environments) > 1 else ():
+            means = [
+                math.fsum(total for e, (total, _) in totals[r].items() if e != left_out)
+                / sum(n for e, (_, n) in totals[r].items() if e != left_out)
+                for r in (name, other)
+            ]
+            held += means[0] > means[1] + NOISE
+        if len(environments) > 1:
+            results[name] = Lead(held, len(environments))
+    return results
 
 
 def _check_shape(rows: Mapping[str, Row]) -> None:
@@ -449,7 +529,12 @@ def _influences(name: str, row: Row, used: Collection[str]) -> _Influences:
         means = np.array([np.mean([row[seed][cell].value for cell in cells]) for seed in seeds])
         of_detectors = means - means.mean()
         of_detectors = np.where(np.abs(of_detectors) > NOISE, of_detectors, 0.0)
-    return _Influences(of_tests, of_detectors, f"{DETECTOR_SEEDS} of {name}")
+    of_calibrations: dict[str, Floats] = {}
+    for cell, seed in itertools.product(cells, seeds):
+        if (changes := row[seed][cell].deviations).size:
+            part = changes / (len(seeds) * len(cells))
+            of_calibrations[cell[0]] = of_calibrations.get(cell[0], np.zeros(len(part))) + part
+    return _Influences(of_tests, of_detectors, f"{DETECTOR_SEEDS} of {name}", of_calibrations)
 
 
 def _used(rows: Mapping[str, Row]) -> set[str]:

@@ -6,7 +6,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar
+from statistics import NormalDist
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, SPLITS, in_order
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells
+from oodd_eval.metrics.bootstrap import LEVEL, DrawnCells, mean_interval, mean_over_cells
 from oodd_eval.metrics.catalogue import ALARM_RANKING, HEADLINE, LEVELS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
@@ -93,21 +94,25 @@ class Board:
         self.paired = self.conditions.paired
         self.level = level_of(self.records)
         self.ranking, self.alarm_ranking = ranked_by(self.records)
-        self._cells = grouped(self.records, lambda r: (r.setting, r.environment, r.anomaly))
+        self._rows = grouped(self.records, lambda r: r.setting)
+        self._cells: dict[Setting, dict[Position, list[int]]] = {}  # indices of a row's records
+        for row, of_row in self._rows.items():
+            cells_of_row = self._cells.setdefault(row, {})
+            for i, r in enumerate(of_row):
+                cells_of_row.setdefault((r.environment, r.anomaly), []).append(i)
         cells = expected or expected_cells(self.records)
         self._expected = {(e, Condition.parse(condition).anomaly) for e, condition in cells}
-        self._plugins: dict[Setting, str] = {}
-        for r in self.records:
-            self._plugins.setdefault(r.setting, r.plugin)
-        self.entries = list(self._plugins)
-        self.environments = in_order((e for _, e, _ in self._cells), ENVIRONMENTS)
-        self.anomalies = in_order((a for _, _, a in self._cells), ANOMALIES)
+        self.entries = list(self._rows)
+        self.environments = in_order((r.environment for r in self.records), ENVIRONMENTS)
+        self.anomalies = in_order((r.anomaly for r in self.records), ANOMALIES)
         self._groups = {r.anomaly: r.group for r in self.records}
         self.horizons = sorted({entry.horizon for entry in self.entries})
         brief = {(r.environment, r.anomaly) for r in self.records if r.brief}
         everywhere = itertools.product(self.environments, self.anomalies)
         self.brief = [cell for cell in everywhere if cell in brief]
-        self._mean = functools.cache(self._computed)  # several tables show the same means
+        # Several tables show the same means, and many means are over the same values.
+        self._mean = functools.cache(self._computed)
+        self._values = functools.cache(self._values_of)
 
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
@@ -128,7 +133,7 @@ class Board:
 
     def is_trivial(self, entry: Setting) -> bool:
         """Return whether an entry is one of the harness's own trivial rows."""
-        return self._plugins[entry].endswith(":trivial")
+        return self._rows[entry][0].plugin.endswith(":trivial")
 
     def present(self, names: Iterable[str]) -> list[str]:
         """Return the metrics that any record has."""
@@ -162,8 +167,10 @@ class Board:
     ) -> Value:
         everywhere = list(itertools.product(environments, anomalies))
         chosen = [cell for cell in everywhere if cell in self._expected] or everywhere
-        cells = [self._cells[entry, *cell] for cell in chosen if (entry, *cell) in self._cells]
-        records = [record for cell in cells for record in cell]
+        of_row, cells_of_row = self._rows[entry], self._cells[entry]
+        cells = [cells_of_row[cell] for cell in chosen if cell in cells_of_row]
+        indices = [i for cell in cells for i in cell]
+        records = [of_row[i] for i in indices]
         blank = Value(
             state=next((r.status for r in records if not r.ok), ""),
             cells=sum(not r.ok or metric in r.metrics for r in records),
@@ -172,8 +179,16 @@ class Board:
         )
         if blank.state:
             return blank
-        value, low, high = _mean_of(records, metric, intervals=intervals)
-        return blank._replace(value=value, low=low, high=high)
+        ends = (NAN, NAN)
+        if intervals and (drawn := _drawn_cells(records, metric)):
+            ends = mean_interval([*drawn.values()], kind=metric_info(metric).interval)
+        values = self._values(entry, metric)
+        value = mean_over_cells((of_row[i].seed, values[i]) for i in indices)
+        return blank._replace(value=value, low=ends[0], high=ends[1])
+
+    def _values_of(self, entry: Setting, metric: str) -> list[float]:
+        """Return a metric of all records of a row."""
+        return _values_of(self._rows[entry], metric)
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
@@ -182,8 +197,14 @@ class Board:
             for e, a in itertools.product(self.environments, self.anomalies)
             if not any(math.isnan(self.mean(s, [e], [a], metric).value) for s in (first, second))
         ]
-        cells = ([self._cells[s, *cell] for cell in common] for s in (first, second))
-        one, two = (_mean_of(itertools.chain(*groups), metric)[0] for groups in cells)
+        one, two = (
+            mean_over_cells(
+                (self._rows[s][i].seed, self._values(s, metric)[i])
+                for cell in common
+                for i in self._cells[s][cell]
+            )
+            for s in (first, second)
+        )
         return one, two, len(common)
 
     def failures(self) -> list[Record]:
@@ -241,12 +262,17 @@ def expected_cells(records: Sequence[Record]) -> set[Position]:
         return set()
     conditions = Conditions.of(records[0])
     name = conditions.split
-    if name in SPLITS and published_digests().get(name) == conditions.split_digest:
-        suite, cap = SPLITS[name].suite, SPLITS[name].episode_cap
-        return {(e, str(c)) for e in ENVIRONMENTS for c in conditions_of(suite, e, cap)}
+    if published_digests().get(name) == conditions.split_digest:
+        return defined_cells(name)
     rows = grouped(records, lambda r: r.setting).values()
     counts = Counter(cell for row in rows for cell in {r.position for r in row})
     return {cell for cell, n in counts.items() if 2 * n >= len(rows)}
+
+
+def defined_cells(split: str) -> set[Position]:
+    """Return the environments and conditions of a published split, or of one that will be."""
+    suite, cap = SPLITS[split].suite, SPLITS[split].episode_cap
+    return {(e, str(c)) for e in ENVIRONMENTS for c in conditions_of(suite, e, cap)}
 
 
 def cells_with(metric: str, records: Iterable[Record]) -> set[Position]:
@@ -269,9 +295,13 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def contribution(record: Record, metric: str) -> Contribution:
-    """Return a record's numerators and denominators of a metric."""
+    """Return a record's terms of a metric, and what its calibration episodes do to it."""
     terms, nominal = record.per_trajectory[metric], _nominal(record)
-    return Contribution(terms[0], terms[1], _is_median(metric), nominal=nominal)
+    deviations = record.calibration_draws.get(metric, _NONE)
+    return Contribution(terms[0], terms[1], _is_median(metric), nominal, deviations)
+
+
+_NONE: Final = np.zeros(0)
 
 
 def _nominal(record: Record) -> int | None:
@@ -283,32 +313,66 @@ def _is_median(metric: str) -> bool:
     return metric in NAMES and metric_info(metric).median
 
 
-def _mean_of(
-    records: Iterable[Record], metric: str, *, intervals: bool = False
-) -> tuple[float, float, float]:
-    """Return the mean of a metric over records, and its interval, NaN without terms of the metric.
+def _drawn_cells(records: Sequence[Record], metric: str) -> dict[tuple[int, ...], DrawnCells]:
+    """Return the cells of a row that have terms of a metric, by the indices of their records.
 
     Thresholds are no ratios of sums, and have no terms.
     """
-    by_shape: dict[tuple[str, str, int | None, int], list[Record]] = {}
-    values = []
-    for r in records:
+    by_shape: dict[tuple[str, str, int | None, int], list[int]] = {}
+    for i, r in enumerate(records):
         if metric in r.per_trajectory:
             # Each condition without twins has a sample of its own.
             condition = "" if r.paired else str(r.condition)
             size = len(r.per_trajectory[metric][0])
-            by_shape.setdefault((r.environment, condition, _nominal(r), size), []).append(r)
-        else:
-            values.append((r.seed, r.value(metric)))
-    cells = []
-    for (environment, condition, nominal, _), group in by_shape.items():
+            by_shape.setdefault((r.environment, condition, _nominal(r), size), []).append(i)
+    cells = {}
+    for (environment, condition, nominal, _), indices in by_shape.items():
+        group = [records[i] for i in indices]
         terms = np.array([r.per_trajectory[metric] for r in group])
-        seeds = [r.seed for r in group]
         both = terms[:, 0], terms[:, 1]
-        drawn = DrawnCells(environment, seeds, *both, _is_median(metric), nominal, condition)
-        cells.append(drawn)
-        values += zip(seeds, drawn.values, strict=True)
-    ends = NAN, NAN
-    if intervals and cells:
-        ends = mean_interval(cells, kind=metric_info(metric).interval)
-    return mean_over_cells(values), *ends
+        deviations = [r.calibration_draws.get(metric, _NONE) for r in group]
+        seeds = [r.seed for r in group]
+        cells[tuple(indices)] = DrawnCells(
+            environment, seeds, *both, _is_median(metric), nominal, condition, deviations
+        )
+    return cells
+
+
+def _values_of(records: Sequence[Record], metric: str) -> list[float]:
+    """Return a metric of records of a row, from its terms where there are any."""
+    values = [NAN] * len(records)
+    with_terms: set[int] = set()
+    for indices, drawn in _drawn_cells(records, metric).items():
+        with_terms.update(indices)
+        for i, value in zip(indices, drawn.values, strict=True):
+            values[i] = value
+    for i in set(range(len(records))) - with_terms:
+        values[i] = records[i].value(metric)
+    return values
+
+
+def standard_error(records: Iterable[Record], metric: str) -> float:
+    """Return the standard error of a row's mean of a metric over the cells of one environment.
+
+    It is a quarter of the width of the mean's 95 % interval, more exactly the width in units of
+    that of a normal distribution: test episodes, detector seeds and, for metrics of alarms,
+    calibration episodes are in it, and a share that is 0 or 1 everywhere is not taken to be exact.
+
+    Parameters
+    ----------
+    records
+        Of the row, with all its seeds.
+    metric
+        One that is a ratio of sums over trajectories.
+
+    Returns
+    -------
+    float
+        In the unit of records; NaN where no record has the metric.
+    """
+    cells = [*_drawn_cells(list(records), metric).values()]
+    low, high = mean_interval(cells, kind=metric_info(metric).interval) if cells else (NAN, NAN)
+    return (high - low) / (2 * _NORMAL)
+
+
+_NORMAL: Final = NormalDist().inv_cdf((1 + LEVEL) / 2)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -18,16 +19,19 @@ from oodd_eval.data.facts import LogFacts
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, Interval, lengths_of, parts_of
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.metrics import alarms, unpaired
+from oodd_eval.errors import ContractError, ResultsError, UsageError
+from oodd_eval.metrics import alarms, recalibration, unpaired
 from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.recalibration import Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import Scores
+from oodd_eval.results.causality import check_before_effect, early_difference
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, Metric, Record
 
@@ -95,8 +99,12 @@ def cell_metrics(
     environment: str,
     explained: Sequence[NDArray[np.int32]] = (),
     corrupted: Sequence[Collection[int]] = (),
+    draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
-    """Compute all metrics of one cell with their intervals; attribution where it is explained."""
+    """Compute all metrics of one cell with their intervals; attribution where it is explained.
+
+    `draws` are the deviations of metrics in resamples of the calibration episodes.
+    """
     contributions = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
     for suffix, rule in rules.guaranteed.items():
         of_level = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
@@ -104,6 +112,7 @@ def cell_metrics(
     if explained and (headline := rules.guaranteed.get(HEADLINE)):
         named = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
         contributions |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
+    contributions = _with_deviations(contributions, draws)
     metrics = {name: metric_of(name, c, environment) for name, c in contributions.items()}
     return metrics | rules.thresholds(), contributions
 
@@ -116,9 +125,11 @@ def unpaired_metrics(
     condition: Condition,
     rate: float | None = None,
     rows: bool = False,
+    draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
     """Compute all metrics of one cell without twins, those of rows if asked for.
 
+    `draws` are the deviations of metrics in resamples of the calibration episodes.
     Under the condition `NOMINAL` there are nominal episodes alone, and metrics of false alarms.
     """
     contributions = {} if condition == NOMINAL else unpaired.separability(cell, rules.statistic)
@@ -129,10 +140,20 @@ def unpaired_metrics(
     for suffix, rule in rules.guaranteed.items():
         of_level = unpaired.unpaired_alarms(cell, rule, rate, rules.earlier.get(suffix, ()))
         contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
+    contributions = _with_deviations(contributions, draws)
     metrics = {
         name: metric_of(name, c, environment, str(condition)) for name, c in contributions.items()
     }
     return metrics | rules.thresholds(), contributions
+
+
+def _with_deviations(
+    contributions: Mapping[str, Contribution], draws: Mapping[str, NDArray[np.float64]]
+) -> dict[str, Contribution]:
+    return {
+        name: replace(c, deviations=draws[name]) if name in draws else c
+        for name, c in contributions.items()
+    }
 
 
 def metric_of(
@@ -150,22 +171,96 @@ def evaluated(
     data: EnvironmentData,
     *,
     row_metrics: bool = False,
+    streamed: bool = False,
 ) -> list[Record]:
-    """Return the records of a unit with metrics; ``invalid`` if scores cannot be standardized."""
+    """Return the records of a unit with metrics.
+
+    They are ``invalid`` where scores cannot be standardized, or tell an episode from its twin
+    before they differ (`oodd_eval.results.causality`).
+    """
     try:
         joining = scores.parts[TWINS] if records[0].rolling else None
         rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm, joining)
     except OverflowError:
-        reason = "scores are too large: their sum over the calibration trajectories overflows"
-        return [replace(record, status="invalid", reason=reason) for record in records]
+        return _invalid(
+            records, "scores are too large: their sum over the calibration trajectories overflows"
+        )
     if records[0].alarm == "score" and math.isnan(rules.paper.standardization.mean):
         # Any score would be an alarm.
-        reason = "no score of the calibration trajectories is defined, so there is no threshold"
-        return [replace(record, status="invalid", reason=reason) for record in records]
+        return _invalid(
+            records, "no score of the calibration trajectories is defined, so there is no threshold"
+        )
+    draws = _calibration_draws(records, scores, data)
     measure = _with_metrics if data.paired else partial(_without_twins, rows=row_metrics)
-    measured = (measure(record, data, scores, rules) for record in records)
+    measured = [
+        measure(replace(record, calibration_draws=CodedDraws.of(of_cell)), data, scores, rules)
+        for record, of_cell in zip(records, draws, strict=True)
+    ]
+    if data.logs is None and (reason := _foresight(measured, data, scores, streamed=streamed)):
+        return _invalid(records, reason)
     few = _too_few_to_roll(len(scores.parts[CALIBRATION]), records[0], rules)
     return [replace(r, note=few) if r.rolling else r for r in measured]
+
+
+def _invalid(records: Sequence[Record], reason: str) -> list[Record]:
+    return [
+        replace(
+            r,
+            status="invalid",
+            reason=reason,
+            metrics={},
+            per_trajectory={},
+            calibration_draws=CodedDraws(),
+        )
+        for r in records
+    ]
+
+
+def _foresight(
+    measured: Sequence[Record], data: EnvironmentData, scores: ScoreFile, *, streamed: bool
+) -> str:
+    """Return how the scores of a unit tell an episode from its twin too early; empty if not."""
+    effects = {
+        record.condition.part: data.anomalous(record.condition)
+        .effects[: len(scores.parts[TWINS])]
+        .tolist()
+        for record in measured
+    }
+    first = measured[0]
+    try:
+        check_before_effect(
+            scores.parts,
+            effects,
+            environment=first.environment,
+            detector=first.detector,
+            horizon=first.horizon,
+            streamed=streamed,
+        )
+    except ContractError as error:
+        return str(error)
+    return next(filter(None, map(early_difference, measured)), "")
+
+
+def _calibration_draws(
+    records: Sequence[Record], scores: ScoreFile, data: EnvironmentData
+) -> list[recalibration.Draws]:
+    """Return what calibration does to the alarms of each cell of a unit.
+
+    A rolling calibration is not resampled: its episodes have an order.
+    """
+    first, twins = records[0], scores.parts[TWINS]
+    if first.rolling:
+        return [{} for _ in records]
+    again = Recalibration.fit(scores.parts[CALIBRATION], first.alarm, first.environment)
+    if data.paired:
+        cells = []
+        for record in records:
+            anomalous, known = scores.parts[record.condition.part], data.anomalous(record.condition)
+            starts, effects = (r[: len(anomalous)] for r in (known.onsets, known.effects))
+            cells.append(recalibration.PairedScores(anomalous, starts, effects))
+        return again.paired(twins, cells)
+    rate = data.logs.rate if data.logs else None
+    return [again.unpaired(unpaired_scores(r, scores.parts, data), rate) for r in records]
 
 
 def _too_few_to_roll(episodes: int, record: Record, rules: Rules) -> str:
@@ -203,6 +298,7 @@ def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rule
         environment=record.environment,
         explained=explained,
         corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
+        draws=record.calibration_draws,
     )
     note = ""
     if data.logs is not None:
@@ -272,6 +368,7 @@ def _without_twins(
         condition=record.condition,
         rate=data.logs.rate if data.logs else None,
         rows=rows,
+        draws=record.calibration_draws,
     )
     return replace(record, metrics=metrics, per_trajectory=_terms(contributions))
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
@@ -32,6 +32,8 @@ from oodd_eval._version import __version__
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.plugins.contract import Training
+from oodd_eval.results.draws import CodedDraws, Draws
 from oodd_eval.results.identity import Cell, Setting
 
 SCHEMA: Final = 3
@@ -97,6 +99,8 @@ class Record:
         accumulates by itself.
     deterministic
         Whether its seed changes nothing.
+    training
+        What the detector learns from, as it declares (`DetectorSpec`).
     environment, anomaly, strength, group, horizon, seed, split, split_digest, limit
         The evaluation. `strength` is a name, empty where an anomaly has only one; `limit` is the
         number of trajectories of each part that were used, None for all.
@@ -116,6 +120,9 @@ class Record:
     per_trajectory
         For each metric that is a ratio of sums, its numerators and denominators in test order:
         shape (2, n). Without twins, nominal test episodes come first, then the anomalous ones.
+    calibration_draws
+        For each metric of alarms by how much resamples of the calibration episodes change it;
+        empty in records that were written before they were kept, and with a rolling calibration.
     scores
         Key of the file with the scores.
     seconds_fit, seconds_score, steps_scored, peak_rss_mb
@@ -151,6 +158,7 @@ class Record:
     inputs: str = ""
     alarm: Literal["cusum", "score"] = "cusum"
     deterministic: bool = False
+    training: Training = "nominal"
     strength: str = ""
     magnitude: float | None = None
     limit: int | None = None
@@ -159,6 +167,7 @@ class Record:
     brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
     per_trajectory: Mapping[str, Terms] = field(default_factory=dict)
+    calibration_draws: Draws = field(default_factory=CodedDraws)
     scores: str = ""
     seconds_fit: Number = NAN
     seconds_score: Number = NAN
@@ -226,9 +235,17 @@ class Record:
         """Return one line of JSON, keys in a fixed order, NaN as null.
 
         Without a number of its strength the record has no ``magnitude``, as before there was one;
-        ``paired``, ``rolling`` and ``note`` are left out where they say nothing.
+        ``training``, ``paired``, ``rolling``, ``note`` and ``calibration_draws`` are left out where
+        they say nothing.
         """
-        silent = {"magnitude": None, "paired": True, "rolling": False, "note": ""}
+        silent = {
+            "training": "nominal",
+            "magnitude": None,
+            "paired": True,
+            "rolling": False,
+            "note": "",
+            "calibration_draws": CodedDraws(),
+        }
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         plain = {n: v for n, v in values.items() if n not in silent or v != silent[n]}
         plain["metrics"] = {
@@ -237,6 +254,8 @@ class Record:
         }
         plain = without_nan(plain | {"per_trajectory": {}})  # terms are finite, and many
         plain["per_trajectory"] = {n: terms.tolist() for n, terms in self.per_trajectory.items()}
+        if self.calibration_draws:
+            plain["calibration_draws"] = self.calibration_draws.coded
         return json.dumps(plain, allow_nan=False)
 
     @classmethod
@@ -374,8 +393,8 @@ def packages() -> dict[str, str]:
     """Return the installed versions of `PACKAGES`."""
     versions = {}
     for name in PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[name] = version(name)
+        with suppress(Exception):  # of a package that is not there, or whose metadata is broken
+            versions[name] = str(version(name))
     return versions
 
 
