@@ -1,46 +1,25 @@
-"""Prefixes that are scored again in a run: which, and what is made of their scores."""
+"""Scores that know the future: beside those of a prefix, and of the twin."""
 
 import math
 
 import numpy as np
 import pytest
+from helpers_records import make_record
+from helpers_split import make_split
 from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval import evaluate
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import MIN_ROWS, PROBES, TOLERANCE, check_prefix, difference, probes
-
-LENGTHS = st.dictionaries(
-    st.sampled_from(["calibration", "test/nominal", "test/iid"]),
-    st.lists(st.integers(1, 500), max_size=20),
-)
-
-
-@given(LENGTHS, st.integers(0, 2**53 - 1))
-def test_probes_are_of_different_episodes_and_the_first_reaches_the_last_quarter(lengths, seed):
-    found = probes(lengths, seed)
-    seeds = {
-        (part == "calibration", i)
-        for part, own in lengths.items()
-        for i, n in enumerate(own)
-        if n >= MIN_ROWS
-    }
-    drawn = {(p.part == "calibration", p.index) for p in found}
-    assert drawn <= seeds
-    assert len(drawn) == len(found) == min(len(seeds), PROBES)
-    for k, probe in enumerate(found):
-        n = lengths[probe.part][probe.index]
-        assert (n // 4 if k else 3 * n // 4) <= probe.rows < n
-    assert found == probes(lengths, seed)
-
+from oodd_eval.plugins.contract import TOLERANCE, difference
+from oodd_eval.results.causality import check_before_effect, early_difference
 
 WHOLE = np.array([math.nan, 1.0, 2.0, 3.0, 2.0])
 
 
 @pytest.mark.parametrize("found", [WHOLE[:3], WHOLE[:2] + 3e-4, WHOLE, WHOLE[:0]])
 def test_the_same_up_to_single_precision_is_the_same(found):
-    check_prefix(found, WHOLE, detector="mine", where="hopper/test/iid[7]")
+    assert not difference(found, WHOLE, TOLERANCE)
 
 
 @pytest.mark.parametrize("constant", [0.0, 5e3, -1e7, 1e12, 1e15])
@@ -51,30 +30,19 @@ def test_neither_a_constant_nor_a_spike_nor_a_step_hides_a_difference(constant, 
     whole = constant + rng.normal(size=100) + np.where(np.arange(100) < 30, 0.0, step)
     whole[3] += spike
     found = whole[:50].copy()
-    check_prefix(found, whole, detector="mine", where="hopper/test/iid[7]")
+    assert not difference(found, whole, TOLERANCE)
     found[40] += 0.2
-    with pytest.raises(ContractError, match="at t = 40 it is"):
-        check_prefix(found, whole, detector="mine", where="hopper/test/iid[7]")
+    assert difference(found, whole, TOLERANCE).startswith("at t = 40 it is")
     if abs(constant) <= 1e7:
-        check_prefix(whole[:50] + 1e-5, whole, detector="mine", where="hopper/test/iid[7]")
-
-
-def test_rollouts_may_leave_more_rounding_and_no_more_than_that():
-    whole = np.arange(100.0)  # the tenth nearest other score is five away
-    for horizon, allowed in ((1, 5e-3), (2, 25e-3)):
-        given = {"detector": "mine", "where": "hopper/test/iid[7]", "horizon": horizon}
-        check_prefix(whole[:90] + 0.9 * allowed, whole, **given)
-        with pytest.raises(ContractError, match="is not causal"):
-            check_prefix(whole[:90] + 1.1 * allowed, whole, **given)
+        assert not difference(whole[:50] + 1e-5, whole, TOLERANCE)
 
 
 @pytest.mark.parametrize("scores", [np.full(20, 7.0), np.where(np.arange(20) == 9, 1.0, 2.0)])
 def test_scores_that_are_mostly_equal_stay_the_same_bit_for_bit(scores):
-    check_prefix(scores[:15], scores, detector="mine", where="x")
+    assert not difference(scores[:15], scores, TOLERANCE)
     found = scores[:15].copy()
     found[4] = np.nextafter(found[4], 9.0)
-    with pytest.raises(ContractError, match=r"at t = 4 it is [27]\.00000000000000"):
-        check_prefix(found, scores, detector="mine", where="x")
+    assert "at t = 4 it is " in difference(found, scores, TOLERANCE)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -122,9 +90,67 @@ class InCompany(Magnitude):
         return [scores / np.concatenate(found).std() for scores in found]
 
 
-def test_a_detector_in_this_process_is_probed_too(tiny_split):
+# Before the effect
+
+LONG = np.concatenate([[math.nan], np.random.default_rng(3).normal(size=60)])
+PARTS = {"test/nominal": [LONG, LONG + 1.0], "test/iid": [LONG.copy(), LONG + 1.0]}
+
+
+def checked(parts, **options):
+    effects = {"test/iid": [3, 4]}
+    check_before_effect(parts, effects, environment="hopper", detector="mine", **options)
+
+
+@pytest.mark.parametrize(
+    ("row", "change", "streamed", "refused"),
+    [
+        (2, 0.5, False, True), (2, 1e-12, True, True), (2, 1e-12, False, False),
+        (4, 0.5, True, False), (0, 7.0, True, True),
+    ],
+)  # fmt: skip
+def test_scores_before_the_effect_are_those_of_the_twin(row, change, streamed, refused):
+    later = {**PARTS, "test/iid": [PARTS["test/iid"][0], PARTS["test/iid"][1].copy()]}
+    checked(later, streamed=streamed)
+    scores = later["test/iid"][1]
+    scores[row] = change if np.isnan(scores[row]) else scores[row] + change
+    if not refused:
+        checked(later, streamed=streamed)
+        return
+    with pytest.raises(ContractError, match=rf"hopper/test/iid\[1\] .* at t = {row} it is"):
+        checked(later, streamed=streamed)
+
+
+@pytest.mark.parametrize("level", ["at_10pct", "at_5pct", "at_1pct"])
+def test_an_alarm_before_the_effect_is_one_of_the_twin(level):
+    terms = np.array([[0.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
+    record = make_record()
+    record.per_trajectory.update({f"early_{level}": terms, f"early_null_{level}": terms})
+    assert early_difference(record) == ""
+    record.per_trajectory[f"early_{level}"] = terms[:, ::-1] + [[0.0, 0, 1], [0, 0, 0]]
+    assert f"early_{level} of hopper/test/iid[2] is 1, and early_null_" in early_difference(record)
+
+
+class KnowsTheEnd(Magnitude):
+    def score(self, trajectory):
+        scores = super().score(trajectory)
+        return scores * (1.0 + scores.sum())
+
+
+def test_an_honest_detector_passes(tiny_split):
     records = evaluate(Magnitude, tiny_split, environments="hopper")
     assert {r.status for r in records} == {"ok"}
-    for wrong in (Centred, InCompany):
-        with pytest.raises(ContractError, match=r"is not causal: .* at t = 0 it is"):
-            evaluate(wrong, tiny_split, environments="hopper")
+
+
+@pytest.mark.parametrize("wrong", [Centred, InCompany, KnowsTheEnd])
+def test_look_ahead_is_found_by_the_twin(tiny_split, wrong):
+    records = evaluate(wrong, tiny_split, environments="hopper")
+    assert {r.status for r in records} == {"invalid"}
+    assert all("not those of its twin" in r.reason and not r.metrics for r in records)
+
+
+def test_alarms_alone_give_a_look_ahead_away(tmp_path, monkeypatch):
+    monkeypatch.setattr("oodd_eval.results.evaluate.check_before_effect", lambda *_, **__: None)
+    split = make_split(tmp_path / "split", ("cartpole",), calibration=20)
+    records = evaluate(KnowsTheEnd, split)
+    assert {r.status for r in records} == {"invalid"}
+    assert "early_null" in records[0].reason

@@ -205,7 +205,7 @@ def test_rows_that_were_not_run_again_stand_below_those_that_were():
     assert (str(last.entry), last.below, last.primary, last.rank) == ("claimed", True, True, 1)
     assert above == alone.standings
     rows = tables.ranking(found.ranks, found.trust).rows
-    assert [rows[-1][i] for i in (0, 1, 3, 6)] == ["(1)", UNDEFINED, "claimed", "reported"]
+    assert [rows[-1][i] for i in (0, 1, 3, 6)] == ["(1)", UNDEFINED, "claimed (= riqn)", "reported"]
     assert any("run again on seeds of their own" in n for n in tables.ranking_notes(found.ranks))
     # Re-scored is not run again; and where nothing was, all rows are ranked.
     claims = [entry("official", official, trust="re-scored"), entry("stranger", best)]
@@ -694,3 +694,70 @@ def test_a_mean_is_within_its_interval_where_a_cell_is_undefined_for_one_seed():
     # Of the means 5 and 27.5 of the two seeds.
     assert (mean.low, mean.value, mean.high) == (5.0, 16.25, 27.5)
     assert found.compare(first, second, "delay") == (16.25, 16.25, 2)
+
+
+# Rows with another's scores, and with other training data
+
+
+def renamed(name, *, of="riqn", **fields):
+    return [dataclasses.replace(r, detector=name, **fields)
+            for r in board() if r.detector == of and r.horizon == 1]  # fmt: skip
+
+
+def test_a_row_with_the_scores_of_another_is_folded_into_it():
+    """It takes its rank, stands behind it, and changes nothing of the others."""
+    before = ranked(board())
+    after = ranked([*board(), *renamed("riqn-ms")])
+    (clone,) = (s for s in after.standings if s.clone_of)
+    original = next(s for s in after.standings if s.entry == clone.clone_of)
+    assert (str(clone.entry), str(clone.clone_of)) == ("riqn-ms", "riqn")
+    assert clone.marks == " (= riqn)"
+    for field in ("rank", "alarm_rank", "ties", "wins"):
+        assert getattr(clone, field) == getattr(original, field)
+    assert [s for s in after.standings if s is not clone] == before.standings
+    assert after.ranking.comparisons == before.ranking.comparisons
+    assert list(after.ranking.ranks)[1:3] == ["riqn", "riqn-ms"]
+    assert any("has that row's scores" in note for note in tables.ranking_notes(after))
+
+
+def test_the_original_was_run_again_is_of_the_package_and_comes_first_by_name():
+    def folded(records, **options):
+        standings = ranked(records, **options).standings
+        return {str(s.entry): str(s.clone_of) for s in standings if s.clone_of}
+
+    early, foreign = renamed("aaa"), renamed("aaa", plugin="thief:x")
+    assert folded([*board(), *early]) == {"riqn": "aaa"}
+    assert folded([*board(), *foreign]) == {"aaa": "riqn"}
+    settings = {r.setting for r in board()}
+    assert folded([*board(), *early], rerun=settings) == {"aaa": "riqn"}
+    simple = renamed("zzz")
+    loaded = [dataclasses.replace(r, overrides={"trees": 1}) for r in renamed("aaa")]
+    assert folded([*(r for r in board() if r.detector != "riqn"), *simple, *loaded]) == {
+        "aaa[trees=1]": "zzz"
+    }
+
+
+@pytest.mark.parametrize("metric", ["auc_matched", "delay_censored_at_5pct"])
+def test_one_other_number_makes_another_row(metric):
+    other = renamed("other")
+    other[-1].per_trajectory[metric][0, 0] += 1e-3
+    assert not any(s.clone_of for s in ranked([*board(), *other]).standings)
+
+
+def test_rows_that_tell_nothing_apart_are_not_those_of_one_another():
+    """Clock and comb have matched AUC one half everywhere, and are two detectors."""
+    ranks = ranked([*board(), *renamed("comb", of="clock")])
+    assert not any(s.clone_of for s in ranks.standings)
+
+
+@pytest.mark.parametrize("training", ["simulation", "anomalies", "external"])
+def test_a_row_trained_on_more_is_shown_and_not_ranked(training):
+    cheat = [dataclasses.replace(r, detector="wise", training=training)
+             for r in board() if r.detector == "riqn" and r.horizon == 10]  # fmt: skip
+    before, after = ranked(board()), ranked([*board(), *cheat])
+    (row,) = (s for s in after.standings if s.training != "nominal")
+    assert row.rank is row.alarm_rank is None
+    assert row.state == row.alarm_state == f"trained on {training}"
+    assert row.marks == f" (trained on {training})"
+    assert after.ranking == before.ranking
+    assert f"Not ranked: wise[h=10], trained on {training}." in tables.ranking_notes(after)

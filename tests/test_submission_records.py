@@ -60,15 +60,6 @@ def every(name, value):
     return lambda d: [r.update({name: value}) for r in d.records]
 
 
-def overrides(of_first):
-    def change(d):
-        for r in d.records:
-            r["parameters"] = r["overrides"] = {"width": 3}
-        d.records[FIRST]["overrides"] = {"width": of_first}
-
-    return change
-
-
 def failed(**fields):
     return lambda d: d.records[FIRST].update(status="timeout", **fields)
 
@@ -105,21 +96,26 @@ CASES = {
     ),
     "endless-delay": (metric("delay", value=1e308), "metrics.delay.value"),
     "edited-numerator": (term("auc_matched", 0.25), "metrics.auc_matched.value"),
-    "auc-above-one": (term("auc_matched", 1.5, consistent=True), "per_trajectory.auc_matched"),
-    "more-alarms-than-steps": (term("far_twin", 1e6, consistent=True), "per_trajectory.far_twin"),
-    "negative-delay": (term("delay_censored", -1.0), "per_trajectory.delay_censored"),
     "something-of-nothing": (term("auc", 0.0, side=1), "per_trajectory.auc"),
     "one-term-too-few": (one_term_too_few, "per_trajectory.auc"),
     "uneven-terms": (
         lambda d: d.records[FIRST]["per_trajectory"]["auc"][0].pop(), "per_trajectory.auc",
     ),
     "no-terms": (field("per_trajectory.auc", [0.5]), "per_trajectory.auc"),
+    "draws-of-nothing": (
+        field("calibration_draws", {"nothing": [0.1, "UV"]}), "calibration_draws.nothing"
+    ),
+    "draws-beyond-the-range": (
+        field("calibration_draws", {"missed_at_5pct": [1.0, "Uz"]}),
+        "calibration_draws.missed_at_5pct",
+    ),
+    "draws-of-marks": (field("calibration_draws", {"far": [0.1, "<"]}), "calibration_draws.far[1]"),
     "terms-alone": (drop("metrics.auc_placebo"), "per_trajectory.auc_placebo"),
     "no-ranking-metric": (
         drop("metrics.auc_matched", "per_trajectory.auc_matched"), "metrics.auc_matched",
     ),
     "unknown-metric": (field("metrics.auc_best", UNKNOWN), "metrics.auc_best"),
-    "a-level-too-many": (field("metrics.missed_at_5pct", UNKNOWN), "metrics.missed_at_5pct"),
+    "a-level-too-many": (field("metrics.missed_at_5pct", UNKNOWN), "per_trajectory.missed_at_5pct"),
     "threshold-with-interval": (
         metric("threshold_at_10pct", low=0.1), "metrics.threshold_at_10pct.low",
     ),
@@ -132,7 +128,7 @@ CASES = {
     "unknown-metric-field": (metric("auc", code="import os"), "metrics.auc.code"),
     "negative-cost": (field("seconds_fit", -1.0), "seconds_fit"),
     "formula-as-inputs": (field("inputs", "=HYPERLINK(1)"), "inputs"),
-    "more-tests-than-can-be-drawn": (field("counts.test", 10**6), "counts.test"),
+    "more-tests-than-can-be-drawn": (field("counts.test", 10**6), "counts"),
     "other-schema": (field("schema", 2), "schema"),
     "old-protocol": (field("protocol", 0), "protocol"),
     "html-in-detector": (every("detector", "<b>best</b>"), "detector"),
@@ -143,18 +139,14 @@ CASES = {
     "unknown-environment": (field("environment", "../ant"), "environment"),
     "path-as-score-key": (field("scores", "../../secret"), "scores"),
     "wrong-group": (field("group", "dynamics"), "group"),
-    "missing-cells": (lambda d: d.records.pop(2), "anomaly"),
     "duplicate-cells": (lambda d: d.records.append(d.records[3]), "cell"),
     "one-cell-on-two-devices": (on_two_devices, "cell"),
     "another-split-in-one-record": (field("split_digest", "0" * 64), "split_digest"),
     "two-versions-of-a-detector": (field("detector_version", "9.9"), "plugins"),
     "limited-run": (field("limit", 5), "limit"),
-    "override-unlike-parameter": (overrides(True), "overrides.width"),
-    "reason-of-success": (field("reason", "because"), "reason"),
-    "failure-without-reason": (failed(**NO_METRICS), "reason"),
     "failure-with-metrics": (failed(reason="too slow"), "metrics"),
     "rows-without-end": (rows_without_end, "rows"),
-    "count-missing": (drop("counts.calibration"), "counts.calibration"),
+    "count-missing": (drop("counts.calibration"), "counts"),
 }  # fmt: skip
 
 
@@ -183,7 +175,7 @@ def test_with_the_split_at_hand_cells_that_it_lacks_are_refused(submissions, tmp
 
 @pytest.mark.parametrize(
     ("changes", "refused"),
-    [({}, []), ({"strength": "x"}, ["strength"]), ({"anomaly": "delay"}, ["anomaly"])],
+    [({}, []), ({"strength": "x"}, ["anomaly"]), ({"anomaly": "delay"}, ["anomaly"])],
 )
 def test_records_of_a_published_split_are_of_its_conditions(submissions, changes, refused):
     """One more condition in one record, and no row of a board would be complete."""
@@ -202,25 +194,57 @@ def test_an_entry_of_before_a_metric_was_added_stays_valid(submissions, tmp_path
     for source, split in ((submissions.plain, None), (submissions.full, submissions.split)):
         draft = Draft(source, tmp_path)
         for record in draft.records:
-            for part in ("metrics", "per_trajectory"):
+            for part in ("metrics", "per_trajectory", "calibration_draws"):
                 record[part] = {n: v for n, v in record[part].items() if n not in lacking}
         verdict = draft.verdict(split)
         assert verdict.ok, [p.text for p in verdict.findings.problems]
         assert verdict.rescored == (split is not None)
 
 
+def test_draws_that_scores_do_not_give_are_refused(submissions, tmp_path):
+    draft = Draft(submissions.full, tmp_path)
+    one = next(r for r in draft.records if any(text for _, text in r["calibration_draws"].values()))
+    name = next(name for name, (_, text) in one["calibration_draws"].items() if text)
+    one["calibration_draws"][name][1] = one["calibration_draws"][name][1][::-1]
+    # The interval of the cell is the same: these draws change what is compared with it.
+    fields = {p.field for p in draft.verdict(submissions.split).findings.problems}
+    assert fields == {"calibration_draws"}
+
+
 def test_a_metric_is_judged_by_the_range_that_its_table_has(submissions, tmp_path, monkeypatch):
     """The facts of a metric decide, not its name."""
     facts = replace(catalogue.METRICS["auc"], name="gain", range=(-1.0, 1.0), interval="mean")
-    metrics = {**catalogue.METRICS, "gain": facts}
+    monkeypatch.setattr(catalogue, "METRICS", {**catalogue.METRICS, "gain": facts})
     for module in (catalogue, recompute):
-        monkeypatch.setattr(module, "METRICS", metrics)
         monkeypatch.setattr(module, "NAMES", (*catalogue.NAMES, "gain"))
-    for value, sound in ((-0.5, True), (-1.5, False)):
+    for value, sound in ((-0.5, True), (-9.0, False)):
         draft = Draft(submissions.plain, tmp_path / str(value))
         draft.records[FIRST]["per_trajectory"]["gain"] = [[value, 0.5, 0.5], [1.0, 1.0, 1.0]]
         draft.consistent(FIRST, "gain")
         assert draft.verdict().ok == sound
+
+
+def test_a_row_without_some_cells_is_noted(submissions, tmp_path):
+    """It is listed, and not ranked."""
+    draft = Draft(submissions.plain, tmp_path)
+    del draft.records[2]
+    verdict = draft.verdict(submissions.split)
+    assert verdict.ok
+    notes = " ".join(verdict.findings.notes)
+    assert "persistence[h=1,seed=0] is partial: it lacks 1 of 8 cells" in notes
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("level", ["at_10pct"])
+def test_alarms_before_the_effect_that_the_twins_lack_are_refused(
+    submissions, tmp_path, level, side
+):
+    draft = Draft(submissions.plain, tmp_path)
+    name = (f"early_{level}", f"early_null_{level}")[side]
+    terms = draft.records[FIRST]["per_trajectory"][name][0]
+    terms[1] = 1.0 - terms[1]
+    draft.consistent(FIRST, name)
+    assert_refused(draft.verdict(), "per_trajectory", "cartpole/test/iid[1]")
 
 
 def test_a_consistent_lie_passes_as_reported_only(submissions, tmp_path):

@@ -195,6 +195,7 @@ def slim(record: Record, metrics: Iterable[str], **provenance: object) -> Record
         provenance=provenance,
         reason="",
         per_trajectory=terms,
+        calibration_draws=record.calibration_draws.only(terms),
         metrics={name: Metric(NAN) for name in terms},
         seconds_fit=NAN,
         seconds_score=NAN,
@@ -316,7 +317,8 @@ def rankings(
         lines = []
         for row in standings:
             label = str(row.entry)
-            rank = f"{row.printed(ranking.ranks.get(label))} {ranking.letters(label)}".rstrip()
+            letters = ranking.letters(str(row.clone_of or row.entry))
+            rank = f"{row.printed(ranking.ranks.get(label))} {letters}".rstrip()
             name = f"{MARK * (row.entry in marked)}{label}{row.marks}"
             lines.append((row.entry, [rank, name, *texts(ranks.board, row.entry, columns)]))
         return lines
@@ -367,6 +369,8 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
     """
     lines = []
     near = {str(s.entry) for s in ranks.standings if s.primary and not s.below}
+    originals = {s.entry: s.clone_of for s in ranks.standings}
+    label = str(originals.get(row) or row)
     by_scores, by_alarms = (
         metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
     )
@@ -374,11 +378,11 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
         (by_scores.title, ranks.ranking, by_scores.name),
         ("delay" if by_alarms.unit == "steps" else "found", ranks.alarms, by_alarms.name),
     ):
-        pairs = (c for c in ranking.comparisons if c.first == str(row) and c.second in near)
+        pairs = (c for c in ranking.comparisons if c.first == label and c.second in near)
         tests = {c.second: c for c in pairs}
-        worse = {c.first for c in ranking.comparisons if c.second == str(row) and c.better}
+        worse = {c.first for c in ranking.comparisons if c.second == label and c.better}
         order = list(ranking.ranks)
-        here = order.index(str(row)) if str(row) in order else len(order)
+        here = order.index(label) if label in order else len(order)
         above = [name for name in order[:here] if name in tests][-1:]
         below = [name for name in order[here:] if name in tests][:1]
         for neighbour in (*above, *below):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
-from oodd_eval.data.files import compress_large, digests
+from oodd_eval.data.files import compress_large, digests, remove_abandoned, temporary_directory
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
@@ -98,8 +98,7 @@ def submit(
         (directory / ENTRY).write_text(entry.to_json(), encoding="utf-8")
         verdict = verify_entry(directory, name=entry.id, split=split)
         if root.is_dir():
-            others = Neighbours(stored.read_entries(root))
-            others.check_rows(verdict.name, verdict.records, verdict.findings)
+            Neighbours(stored.read_entries(root)).check(verdict)
         if verdict.ok:
             directory.rename(path)
     return Submission(path, verdict, left_out)
@@ -152,7 +151,7 @@ def _publishable(record: Record) -> Record:
     reason = "".join(c if c.isprintable() else " " for c in record.reason)
     reason = reason.replace("<", "(").replace(">", ")").replace("](", "] (")[:1000]
     origin = dict(record.provenance)
-    if formats.complaint(formats.FreeValue, origin.get("command", "")):
+    if any(formats.unsafe(origin.get("command", ""))):
         del origin["command"]
     return replace(record, reason=reason, provenance=origin)
 
@@ -182,7 +181,7 @@ def _check_publishable(records: Sequence[Record]) -> None:
                 f"{record.cell} used --limit {record.limit}: an entry uses all trajectories, so "
                 "run without it, into another results directory"
             )
-        if formats.complaint(formats.PluginName, record.plugin):
+        if formats.complaint(formats.PLUGIN_NAME, record.plugin):
             raise UsageError(
                 f"detector {record.detector!r} is of no installed plug-in (plugin is "
                 f"{record.plugin!r}): others could not run it again; see oodd-eval new"
@@ -196,7 +195,7 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     # Detectors made of classes have capitals and a colon in their names.
     split = first.split.replace("@", "-")
     name = statement.id or f"{'-'.join(detectors)}-{split}".lower().replace(":", "-")
-    complaint = formats.complaint(formats.EntryId, name)
+    complaint = formats.complaint(formats.ENTRY_ID, name)
     if not statement.id and (len(detectors) > 3 or complaint):
         raise UsageError("the names of these detectors make no short id: choose one with --id")
     if complaint:
@@ -231,7 +230,7 @@ def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: s
     """Return the score files of records, each once; refuse when one is not there."""
     files = {r.scores: source.path / SCORES / f"{r.scores}.h5" for r in records}
     for key, file in files.items():
-        if formats.complaint(formats.ScoreKey, key) or not file.is_file():
+        if formats.complaint(formats.SCORE_KEY, key) or not file.is_file():
             advice = f"{instead} run again into this directory"
             raise UsageError(f"scores are not there in {str(file)!r}: {advice}")
     return list(files.values())
@@ -240,11 +239,11 @@ def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: s
 @contextmanager
 def _written(path: Path) -> Iterator[Path]:
     """Yield a directory beside the path, which is removed afterwards unless it was moved."""
-    directory = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        directory.mkdir(parents=True)
-        yield directory
+        remove_abandoned(path.parent)
+        with temporary_directory(path.parent, path.name) as directory:
+            yield directory
+    except OutputError:
+        raise
     except OSError as error:
         raise OutputError(f"{str(path)!r} cannot be written: {error}") from error
-    finally:
-        shutil.rmtree(directory, ignore_errors=True)

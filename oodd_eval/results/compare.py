@@ -368,6 +368,7 @@ def write_reference(
             r,
             metrics=metrics,
             per_trajectory=terms,
+            calibration_draws=r.calibration_draws.only(terms),
             scores="",
             seconds_fit=NAN,
             seconds_score=NAN,

@@ -77,9 +77,10 @@ def write_curves(curves: Mapping[str, Any], path: Path) -> None:
 def read_curves(path: Path | str) -> dict[str, Any]:
     """Read ``curves.json``; ResultsError names the field that is not as the layout has it."""
     path = Path(path)
+    text = files.read_text(path)
     try:
-        plain = json.loads(files.read_text(path))
-    except (OSError, ValueError, RecursionError) as error:
+        plain = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
     return check_curves(plain, path.name)
 

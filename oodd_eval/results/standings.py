@@ -2,15 +2,18 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
-from oodd_eval.metrics.ranking import ALPHA, Position, Ranking, Row, rank, win_rates
+from oodd_eval.metrics.ranking import ALPHA, Lead, Position, Ranking, Row, leads, rank, win_rates
+from oodd_eval.plugins.contract import Training
 from oodd_eval.results.board import (
     Board,
     Conditions,
@@ -42,9 +45,11 @@ class Standing:
     `rank` is None, and `state` says why, for a row that is not ranked; `alarm_rank` is its rank by
     alarms, None where `alarm_state` says why. `primary` rows are one a detector; the others are
     variants, whose rank is the one that they would have. So is that of a row `below` the ranking,
-    which was not run again where others were. `ties` are the letters of its tie groups,
-    `wins` is the mean of its win rates against the other ranked rows, and `inputs` is empty where
-    no record names the detector's inputs.
+    which was not run again where others were. A row whose scores are another's is a clone: it has
+    the rank of the row that `clone_of` names, and pushes nobody down. `ties` are the letters of its
+    tie groups, `wins` is the mean of its win rates against the other ranked rows, `lead` says how
+    often its mean stays above the next row's without one of the environments, empty for the last
+    row, and `inputs` is empty where no record names the detector's inputs.
     """
 
     entry: Setting
@@ -58,8 +63,10 @@ class Standing:
     state: str
     alarm_state: str
     wins: float
+    lead: str
     inputs: str
     cost: Cost
+    clone_of: Setting | None = None
 
     @property
     def seeds(self) -> int:
@@ -71,9 +78,16 @@ class Standing:
         return UNDEFINED if rank is None else f"({rank})" if self.below else str(rank)
 
     @property
+    def training(self) -> Training:
+        """The training data that its detector declares, see `DetectorSpec`."""
+        return next((r.training for r in self.records if r.training != "nominal"), "nominal")
+
+    @property
     def marks(self) -> str:
-        """The marks printed behind a row's name: trivial, variant, or both."""
-        return " (trivial)" * self.trivial + " (variant)" * (not self.primary)
+        """The marks printed behind a row's name: trivial, variant, clone, other training data."""
+        marks = " (trivial)" * self.trivial + " (variant)" * (not self.primary)
+        marks += f" (= {self.clone_of})" if self.clone_of else ""
+        return marks + (f" (trained on {self.training})" if self.training != "nominal" else "")
 
 
 class RankedBoard(NamedTuple):
@@ -81,7 +95,8 @@ class RankedBoard(NamedTuple):
 
     All have the order of the standings: ranked rows by rank and mean, then the others by name, and
     last what stands below the ranking, likewise.
-    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric.
+    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric. A clone has
+    the rank of its original, and is in no comparison.
     """
 
     board: Board
@@ -156,17 +171,31 @@ def ranked(
     cells = set(expected or expected_cells(records))
     below = set(by_row).difference(rerun) if rerun else set()
 
-    def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row], dict[Setting, str]]:
+    counted: dict[str, dict[Setting, list[Record]]] = {}
+    states: dict[str, dict[Setting, str]] = {}
+    by_scores, by_alarms = ranked_by(records)
+    for metric in (by_scores, by_alarms):
         # Without twins a metric is one of some cells, such as those whose anomalous rows are known.
         compared = cells if records[0].paired else cells & cells_with(metric, records)
-        counted = {e: [r for r in rows if r.position in compared] for e, rows in by_row.items()}
-        states = {e: _state(rows, compared, metric, e in first) for e, rows in counted.items()}
-        rows = {str(e): terms_of(counted[e], metric) for e, state in states.items() if not state}
-        return rank(rows, set(map(str, first - below))), rows, states
+        counted[metric] = {
+            e: [r for r in rows if r.position in compared] for e, rows in by_row.items()
+        }
+        states[metric] = {
+            e: _state(rows, compared, metric, e in first) for e, rows in counted[metric].items()
+        }
+    complete = {e: rows for e, rows in counted[by_scores].items() if not states[by_scores][e]}
+    clones = _clones(complete, (by_scores, by_alarms), below, first)
 
-    by_scores, by_alarms = ranked_by(records)
-    ranking, rows, states = ranking_by(by_scores)
-    alarms, _, alarm_states = ranking_by(by_alarms)
+    def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row]]:
+        rows = {
+            str(e): terms_of(counted[metric][e], metric)
+            for e, state in states[metric].items()
+            if not state and e not in clones
+        }
+        return rank(rows, set(map(str, first - below))), rows
+
+    ranking, rows = ranking_by(by_scores)
+    alarms, _ = ranking_by(by_alarms)
     seeds = {label: rows[label].values() for label in ranking.ranks}
     rates = win_rates(
         {
@@ -177,6 +206,16 @@ def ranked(
         }
     )
     unranked = set(map(str, below))
+    wins: dict[str, list[float]] = {}
+    for (row, against), rate in rates.items():
+        if against not in unranked:
+            wins.setdefault(row, []).append(rate)
+    lead: dict[str, Lead] = {}
+    for part in (False, True):
+        lead |= leads(
+            {label: rows[label] for label in ranking.ranks if (label in unranked) == part}
+        )
+    ranking, alarms = (_with_clones(one, clones) for one in (ranking, alarms))
     positions = {label: i for i, label in enumerate(ranking.ranks)}
     order = sorted(
         by_row, key=lambda e: (e in below, positions.get(str(e), len(positions)), _name(e))
@@ -191,20 +230,69 @@ def ranked(
             below=entry in below,
             rank=ranking.ranks.get(str(entry)),
             alarm_rank=alarms.ranks.get(str(entry)),
-            ties=ranking.letters(str(entry)),
-            state=states[entry],
-            alarm_state=alarm_states[entry],
-            wins=nan_mean(
-                rate
-                for (row, against), rate in rates.items()
-                if row == str(entry) and against not in unranked
-            ),
+            ties=ranking.letters(str(clones.get(entry, entry))),
+            state=states[by_scores][entry],
+            alarm_state=states[by_alarms][entry],
+            wins=nan_mean(wins.get(str(clones.get(entry, entry)), ())),
+            lead=str(lead.get(str(clones.get(entry, entry)), "")),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
+            clone_of=clones.get(entry),
         )
         for entry in order
     ]
     return RankedBoard(board, standings, ranking, alarms, rates)
+
+
+def _clones(
+    rows: Mapping[Setting, Sequence[Record]],
+    metrics: tuple[str, str],
+    below: Collection[Setting],
+    first: Collection[Setting],
+) -> dict[Setting, Setting]:
+    """Return the rows whose scores are another's, and whose they are.
+
+    Rows are whole. Two of them are equal where their terms of both rankings are, in every cell with
+    every detector seed that both have. A row whose episodes have all one number in every cell, such
+    as `clock`, is equal to none by that. The original is a row that was run again before one that
+    was not, one of this distribution, a primary one, one with fewer parameters, and last the first
+    by name.
+    """
+    terms: dict[Setting, dict[tuple[int, Position], int]] = {}
+    for row, records in rows.items():
+        by_scores = [r.per_trajectory[metrics[0]][0] for r in records]
+        if any(len(values) and np.ptp(values) for values in by_scores):
+            terms[row] = {
+                (r.seed, r.position): hash(
+                    tuple(r.per_trajectory[m].tobytes() for m in metrics if m in r.per_trajectory)
+                )
+                for r in records
+            }
+
+    def order(row: Setting) -> tuple[Any, ...]:
+        foreign = not rows[row][0].plugin.startswith("oodd-eval:")
+        return row in below, foreign, row not in first, len(row.parameters), *_name(row)
+
+    originals: list[Setting] = []
+    clones: dict[Setting, Setting] = {}
+    for row in sorted(terms, key=order):
+        for other in originals:
+            common = terms[row].keys() & terms[other].keys()
+            if common and all(terms[row][key] == terms[other][key] for key in common):
+                clones[row] = other
+                break
+        else:
+            originals.append(row)
+    return clones
+
+
+def _with_clones(ranking: Ranking, clones: Mapping[Setting, Setting]) -> Ranking:
+    """Return a ranking in which clones stand behind their originals, with the same rank."""
+    labels = grouped(clones, lambda clone: str(clones[clone]))
+    ranks: dict[str, int] = {}
+    for label, number in ranking.ranks.items():
+        ranks |= dict.fromkeys([label, *map(str, labels.get(label, ()))], number)
+    return replace(ranking, ranks=ranks)
 
 
 def terms_of(records: Iterable[Record], metric: str) -> Row:
@@ -219,7 +307,10 @@ def terms_of(records: Iterable[Record], metric: str) -> Row:
         if r.ok and metric in r.per_trajectory:
             terms = contribution(r, metric)
             cells[r.position] = Contribution(
-                sign * terms.numerator, terms.denominator, nominal=terms.nominal
+                sign * terms.numerator,
+                terms.denominator,
+                nominal=terms.nominal,
+                deviations=sign * terms.deviations,
             )
     return row
 
@@ -253,6 +344,7 @@ def _state(
     defined = sum(not math.isnan(value) for value in values)
     if undefined := sum(r.ok for r in records) - defined:
         reasons.append(f"undefined in {undefined} of {expected} cells")
+    reasons += sorted({f"trained on {r.training}" for r in records if r.training != "nominal"})
     if primary and has_few_seeds(records):
         reasons.append(f"{seeds} of {SEEDS} detector seeds")
     return ", ".join(reasons)

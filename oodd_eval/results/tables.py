@@ -15,6 +15,7 @@ from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.metrics.promise import enough_episodes
 from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, Standing
 
 BRIEF: Final = "\N{DAGGER}"
@@ -94,7 +95,16 @@ def texts(board: Board, entry: Setting, columns: Iterable[Mean]) -> list[str]:
 
 BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
-_SIMPLE: Final = ("random", "persistence", *BLIND, "range", "mahalanobis", "rf", "rf-ewma")
+_SIMPLE: Final = (
+    "random",
+    "persistence",
+    *BLIND,
+    "range",
+    "mahalanobis",
+    "manifold",
+    "rf",
+    "rf-ewma",
+)
 """Rows that a detector with a learned model of the dynamics should beat."""
 
 _FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
@@ -289,9 +299,10 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
         inputs = row.inputs.replace("observations+actions", "+actions") or UNDEFINED
         labels = [rank, row.ties or UNDEFINED, row.printed(row.alarm_rank), detector, settings]
         labels += [inputs, trust.get(row.entry, UNDEFINED)]
-        rows.append([*labels, *texts(ranks.board, row.entry, columns), _percent(row.wins)])
+        means = texts(ranks.board, row.entry, columns)
+        rows.append([*labels, *means, _percent(row.wins), row.lead or UNDEFINED])
     labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust"]
-    header = [*labels, *(c.title for c in columns), "win rate"]
+    header = [*labels, *(c.title for c in columns), "win rate", "lead"]
     return Table(f"Ranking by {title} (%)", header, rows, labels=7)
 
 
@@ -404,6 +415,7 @@ def notes(board: Board) -> list[str]:
             f"Brief cells, marked {BRIEF}: {names}. Half of their episodes end within 20 rows of "
             "the onset."
         )
+    lines += uncalibrated(board)
     if changed := sum(bool(r.provenance.get("git_dirty")) for r in board.records):
         lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {changed} cells.")
     lines.append(
@@ -411,6 +423,24 @@ def notes(board: Board) -> list[str]:
         "* marks a mean over fewer cells than the split has there. A failure is shown as its state."
     )
     return lines
+
+
+def uncalibrated(board: Board) -> list[str]:
+    """Return which rows' alarms have intervals without the noise of the calibration episodes."""
+    lacking = dict.fromkeys(str(r.setting) for r in board.records if _lacks_draws(r))
+    if not lacking:
+        return []
+    have = [str(entry) for entry in board.entries if str(entry) not in lacking]
+    named = ", ".join(lacking)
+    if len(have) < len(lacking):
+        named = f"all rows but {', '.join(have)}" if have else "all rows"
+    sentence = "Intervals of alarms, and ranks by them, leave out the noise of the calibration"
+    return [f"{sentence} episodes where records of earlier versions do not say it: {named}."]
+
+
+def _lacks_draws(record: Record) -> bool:
+    alarms = "far" in record.metrics or any("false_episodes" in name for name in record.metrics)
+    return alarms and not record.calibration_draws
 
 
 def _episodes(board: Board) -> list[str]:
@@ -429,8 +459,8 @@ def _episodes(board: Board) -> list[str]:
 _PARTS: Final = {"train": "training", "calibration": "calibration", "nominal": "nominal test"}
 
 
-def ranking_notes(ranks: RankedBoard) -> list[str]:
-    """Return what has to stand below a ranking."""
+def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
+    """Return what has to stand below a ranking; not `whole` without columns of lead and alarms."""
     rows = ranks.standings
     lines = [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
     if not all(row.primary for row in rows):
@@ -438,17 +468,31 @@ def ranking_notes(ranks: RankedBoard) -> list[str]:
             "A variant is a further row of a detector. It has the rank that it would have, and "
             "pushes no other row down."
         )
+    if any(row.clone_of for row in rows):
+        lines.append(
+            "A row with = and another's name has that row's scores. It has the same rank, and "
+            "pushes no other row down."
+        )
+    if any(row.training != "nominal" for row in rows):
+        lines.append("Rows trained on more than nominal trajectories of the split are not ranked.")
     if any(row.below for row in rows):
         lines.append(
             "Ranked are rows that maintainers have run again on seeds of their own. The others "
             "stand below, in brackets the rank that they would have, and push no row down."
         )
+    if whole and any(row.lead for row in rows):
+        lines.append(
+            "Lead: in how many of the cases in which one environment is left out the row's mean "
+            "stays above that of the next rank."
+        )
     if ranks.alarms.ranks:
         info = metric_info(ranks.board.alarm_ranking)
         title = info.title[0].lower() + info.title[1:]
-        lines.append(f"Alarm rank: the same by {title}, {info.better} is better.")
+        if whole:
+            lines.append(f"Alarm rank: the rank by {title}, {info.better} is better.")
         without = (row for row in rows if row.alarm_state and not row.state)
         lines += [f"Without an alarm rank: {row.entry}, {row.alarm_state}." for row in without]
+        lines += uncalibrated(ranks.board)
     seeds = ranks.board.test_seeds()
     if seeds and seeds[0] < _FEW and len(ranks.ranking.ranks) > 1:
         episodes = "test seeds per environment" if ranks.board.paired else "anomalous episodes"

@@ -257,7 +257,10 @@ def _row(
         **_fields(
             standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank", "ties", "state"
         ),
+        "clone_of": str(standing.clone_of or ""),
+        "training": standing.training,
         "wins": _short(standing.wins),
+        "lead": standing.lead,
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
         "trust": section.trust[row],
         **_fields(source.meta, "submitter", "caption"),

@@ -3,25 +3,23 @@
 An entry is checked in an order in which every step only meets what the steps before have found
 sound: files, ``entry.json``, digests, the fields of each record, the metrics of each record, the
 records among each other, curves and scores, and last the scores against the split, where it is at
-hand. That the scores are those of the detector is not checked here: re-runs do that (`rerun`).
+hand. Whether numbers that agree are those of the detector is not asked here: re-runs do (`rerun`).
 """
 
 import os
 import stat
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from oodd_eval.data.facts import SPLITS
-from oodd_eval.data.files import forms
+from oodd_eval.data.files import UNFINISHED, forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.leaderboard.entry import (
+    CURVES,
     ENTRY,
     GRANTS,
     TRUST,
@@ -38,21 +36,28 @@ from oodd_eval.leaderboard.entry import (
     row_of,
     write_grants,
 )
-from oodd_eval.leaderboard.verify.files import Findings, check_digests, plain, read_files, short
-from oodd_eval.leaderboard.verify.formats import GrantedBy, complaint, read_info, read_records
+from oodd_eval.leaderboard.verify.files import (
+    Findings,
+    check_digests,
+    find_text,
+    parse_json,
+    plain,
+    read_files,
+    short,
+)
+from oodd_eval.leaderboard.verify.formats import GRANTED_BY, complaint, read_info, read_records
 from oodd_eval.leaderboard.verify.recompute import (
     Records,
     check_against_split,
-    check_curves,
     check_record,
     check_rescored,
     check_scores,
     check_together,
 )
-from oodd_eval.leaderboard.verify.rerun import Rerun, RerunOrder, compare_rerun
-from oodd_eval.results.board import ranked_by
+from oodd_eval.leaderboard.verify.rerun import Rerun
+from oodd_eval.results.board import defined_cells
+from oodd_eval.results.curve_file import check_curves
 from oodd_eval.results.directory import RECORDS
-from oodd_eval.results.record import Record
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
 
@@ -63,7 +68,8 @@ class EntryVerdict:
 
     `entry` is None when ``entry.json`` is not sound, `digest` is that of its bytes; `records` are
     the sound ones, by where they stand; `rescored` says that every metric was recomputed from the
-    scores and agrees; `grant` is what maintainers have granted to just this entry.
+    scores and agrees; `grant` is what maintainers have granted to just this entry, `rerun` how it
+    compares with a run of its rows on fresh seeds.
     """
 
     name: str
@@ -71,9 +77,9 @@ class EntryVerdict:
     records: Records
     entry: EntryInfo | None = None
     rescored: bool = False
-    rerun: Rerun | None = None
     digest: str = ""
     grant: Grant | None = None
+    rerun: Rerun | None = None
 
     @property
     def ok(self) -> bool:
@@ -90,23 +96,17 @@ class EntryVerdict:
         """The level of trust that was established here; None for an entry that is refused."""
         if not self.ok:
             return None
-        if self.rerun is not None and self.rerun.confirmed:
+        if self.rerun is not None and self.rerun.complete:
             return "re-run"
         return "re-scored" if self.rescored else "reported"
 
 
 def verify_entry(
-    directory: Path,
-    *,
-    name: str = "",
-    split: str | Path | None = None,
-    rerun: Sequence[Record] = (),
-    order: RerunOrder | None = None,
+    directory: Path, *, name: str = "", split: str | Path | None = None
 ) -> EntryVerdict:
     """Check one entry, which is going to have another name if one is given.
 
-    `split` names its split where that is not at its usual place, `rerun` are a verifier's records,
-    on seeds of an `order`, if they were drawn by one.
+    `split` names its split where that is not at its usual place.
     """
     name = name or Path(os.path.abspath(directory)).name  # noqa: PTH100  a link is not followed
     findings = Findings()
@@ -124,11 +124,17 @@ def verify_entry(
     if entry is None or not records:
         return EntryVerdict(name, findings, records, entry)
     _check_statements(entry, records, findings)
-    check_together(entry, records, findings)
-    check_curves(contents, records, findings)
+    opened, note = find_split(entry.split, entry.split_digest, split)
+    cells = (
+        {(e, str(c)) for e in opened.environments for c in opened.conditions(e)} if opened else ()
+    )
+    cells = defined_cells(entry.split) if entry.split in SPLITS else cells
+    check_together(entry, records, cells, findings)
+    name_of_curves, text = find_text(contents, CURVES, findings)
+    with findings.reading(name_of_curves):
+        _ = text and check_curves(parse_json(text), name_of_curves)
     scored = check_scores(directory, contents, records, findings)
     rescored = False
-    opened, note = find_split(entry.split, entry.split_digest, split)
     if opened is None:
         findings.notes.append(f"{note}: compared with no trajectory, nothing recomputed")
     else:
@@ -138,14 +144,10 @@ def verify_entry(
         if scored := {w: r for w, r in scored.items() if w in of_split}:
             rescored = check_rescored(scored, directory, opened, findings) and complete
     digest = digest_of(contents[ENTRY])
-    if order is not None and order.entry != digest:
-        why = "seeds were drawn for another version of the entry"
-        findings.expect("re-run", "entry", order.entry, digest, why)
-    again = compare_rerun(records, rerun, findings, order) if rerun else None
     grant = read_grants(directory.absolute().parent).get(name)
     held = grant if grant and grant.entry == digest else None
     rescored = rescored and not findings.count
-    verdict = EntryVerdict(name, findings, records, entry, rescored, again, digest, held)
+    verdict = EntryVerdict(name, findings, records, entry, rescored, digest, held)
     findings.notes.extend(_notes_on_trust(verdict))
     return verdict
 
@@ -224,28 +226,22 @@ def _notes_on_trust(verdict: EntryVerdict) -> Iterator[str]:
         yield f"qualifies for {verdict.reached!r} (--grant)"
 
 
-def verify(
-    path: Path | str,
-    *,
-    split: str | Path | None = None,
-    rerun: Sequence[Record] = (),
-    order: RerunOrder | None = None,
-) -> Iterator[EntryVerdict]:
+def verify(path: Path | str, *, split: str | Path | None = None) -> Iterator[EntryVerdict]:
     """Check an entry, or all entries of a directory and that no two of them clash.
 
     Yields one verdict an entry, in the order of their names, and one more for the directory itself
-    when something else lies in it; for the other arguments see `verify_entry`.
+    when something else lies in it; for the split see `verify_entry`.
     """
     path = Path(path)
     if not path.is_dir():
         raise ResultsError(f"{str(path)!r} is no directory: expected an entry, or one of entries")
     if any(os.path.lexists(path / name) for name in (ENTRY, *forms(RECORDS))):
-        yield verify_entry(path, split=split, rerun=rerun, order=order)
+        yield verify_entry(path, split=split)
         return
-    if rerun:
-        raise UsageError(f"--rerun is for one entry, but {str(path)!r} is a directory of entries")
     stray, neighbours, digests = Findings(), Neighbours(), {}
     for child in sorted(path.iterdir()):
+        if UNFINISHED.fullmatch(child.name):  # by a submission that goes on, or was killed
+            continue
         if child.is_symlink() or child.is_dir():
             verdict = _guarded(child, split)
             neighbours.check(verdict)
@@ -276,7 +272,7 @@ def verify_changed(root: Path, names: Collection[str]) -> Iterator[EntryVerdict]
 
 
 class Neighbours:
-    """The rows, detectors and numbers of entries, which no further entry may have too.
+    """The rows and detectors of entries, which no further entry may have too.
 
     Parameters
     ----------
@@ -287,52 +283,25 @@ class Neighbours:
     def __init__(self, entries: Iterable[SubmittedEntry] = ()) -> None:
         self._rows: dict[object, str] = {}  # the entry of a row
         self._origins: dict[str, tuple[str, str]] = {}  # a detector's entry and distribution
-        self._numbers: dict[object, tuple[str, str]] = {}  # entry and row of a cell's numbers
         for entry in entries:
             records = {str(i): record for i, record in enumerate(entry.records)}
             self.check(EntryVerdict(entry.meta.id, Findings(), records))
 
     def check(self, verdict: EntryVerdict) -> None:
-        """Refuse what an earlier entry has, and keep what this one has."""
-        self.check_rows(verdict.name, verdict.records, verdict.findings)
-        self._check_copies(verdict.name, verdict.records, verdict.findings)
-
-    def check_rows(self, name: str, records: Records, findings: Findings) -> None:
         """Refuse rows of other entries, and detectors' names from other distributions."""
-        for where, record in records.items():
-            if (other := self._rows.setdefault(row_of(record), name)) != name:
+        for where, record in verdict.records.items():
+            if (other := self._rows.setdefault(row_of(record), verdict.name)) != verdict.name:
                 message = f"is of a row of entry {other} too: replace that one, or leave it out"
-                findings.refuse(where, "cell", message)
+                verdict.findings.refuse(where, "cell", message)
             origin = record.plugin.partition(":")[0]
-            owner, first = self._origins.setdefault(record.detector, (name, origin))
+            owner, first = self._origins.setdefault(record.detector, (verdict.name, origin))
             why = f"as in entry {owner}: a name stands for one detector"
-            findings.expect(where, "detector", f"from {first}", f"from {origin}", why)
-
-    def _check_copies(self, name: str, records: Records, findings: Findings) -> None:
-        """Refuse rows that have another entry's numbers in more than half of their cells.
-
-        Cells in which all trajectories have one number say nothing, as whatever finds all has them.
-        Numbers are compared by three digits, so that changing all of them a little does not help.
-        """
-        cells, copied = Counter[str](), Counter[tuple[str, str, str]]()
-        for record in records.values():
-            metric, row = ranked_by([record])[0], str(record.setting)
-            terms = record.per_trajectory.get(metric, np.zeros((2, 0)))
-            numbers = tuple(round(term, 3) for term in terms[0].tolist())
-            if len(set(numbers)) > 1:
-                cells[row] += 1
-                key = record.split_digest, record.environment, record.condition, numbers
-                entry, other = self._numbers.setdefault(key, (name, row))
-                copied[row, entry, other] += entry != name
-        for (row, entry, other), count in copied.items():
-            if 2 * count > cells[row]:
-                message = f"has in {count} of {cells[row]} cells the numbers of {other} in {entry}"
-                findings.refuse(RECORDS, row, f"{message}: expected a detector's own")
+            verdict.findings.expect(where, "detector", f"from {first}", f"from {origin}", why)
 
 
 def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
     """Grant an entry the level of trust that its verification by somebody established."""
-    if message := complaint(GrantedBy, by):
+    if message := complaint(GRANTED_BY, by):
         raise UsageError(f"--grant {message}")
     level = verdict.reached
     if level is None:
@@ -340,7 +309,7 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
     if level == "reported" or TRUST.index(level) <= TRUST.index(verdict.trust):
         raise UsageError(
             f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
-            f"is {level!r}: more needs its scores (re-scored) or a run of yours (--rerun)"
+            f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows"
         )
     how, means = "every metric recomputed from its scores", Means()
     if verdict.rerun:

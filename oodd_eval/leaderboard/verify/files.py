@@ -111,7 +111,10 @@ def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
     listed = _scan(entry, "", findings)
     if SCORES in listed and stat.S_ISDIR(listed[SCORES].st_mode):
         del listed[SCORES]
-        listed |= _scan(entry / SCORES, f"{SCORES}/", findings)
+        inside = _scan(entry / SCORES, f"{SCORES}/", findings)
+        if not inside:
+            findings.refuse(SCORES, "", "is empty: remove it")
+        listed |= inside
     sizes = {}
     for name, status in sorted(listed.items()):
         if complaint := _complaint(name, status):

@@ -72,6 +72,13 @@ const winsColumn = (board) =>
   plainColumn("wins", "Wins", "%", `Mean share of cells with a higher ${rankingName(board)} than another row's`,
     (row) => row.wins === null ? null : 100 * row.wins, { better: "higher", marked: true, text: (share) => isNumber(share) ? share.toFixed(0) : UNDEFINED });
 
+/** A column of how many environments a row's lead over the next one does not rest on. */
+const LEAD = plainColumn(
+  "lead", "Lead", "", "In how many of the cases in which one environment is left out the mean stays above that of the next rank",
+  (row) => row.lead ? Number(row.lead.split("/")[0]) : null,
+  { better: "higher", text: (held, row) => isNumber(held) ? row.lead : UNDEFINED },
+);
+
 /** Columns of those of some metrics that a board has. */
 const metricColumns = (board, metrics) => known(board, metrics).map((metric) => metricColumn(board, metric, {
   interval: board.intervals.includes(metric),
@@ -92,6 +99,7 @@ const LISTS = {
         metricColumn(board, "auc"),
         metricColumn(board, "auc_placebo"),
         winsColumn(board),
+        LEAD,
       ];
     },
   },
@@ -176,6 +184,7 @@ const LISTS_OF_LOGS = {
       ...groupColumns(board, selection),
       ...metricColumns(board, ["auc_pool", "auc_pool_null", "auc_rows", "auc_outcome"].filter((metric) => metric !== board.ranking)),
       winsColumn(board),
+      LEAD,
     ],
     empty: "This board has nominal episodes alone, so there is nothing to separate: see its alarms.",
   },

@@ -225,6 +225,8 @@ const TRUST = {
 function badges(row) {
   return [
     row.trivial && element("span", { class: "badge", title: "Knows nothing of the dynamics: what a detector has to beat" }, "trivial"),
+    row.clone_of && element("span", { class: "badge", title: "Has the scores of that row, and pushes no other row down" }, `= ${row.clone_of}`),
+    row.training !== "nominal" && element("span", { class: "badge", title: "Learns from more than nominal trajectories of the split: not ranked" }, `trained on ${row.training}`),
     " ", element("span", { class: `badge ${row.trust}`, title: TRUST[row.trust] ?? "" }, row.trust),
   ];
 }
@@ -276,10 +278,19 @@ function notesOf(board, rows) {
     lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
   }
   if (!isSummary(state)) {
-    lines.push("Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.");
+    lines.push(`Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.`);
   }
   if (rows.some((r) => r.below)) {
     lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
+  }
+  if (rows.some((r) => r.clone_of)) {
+    lines.push("A row with = and another’s name has that row’s scores. It has the same rank, and pushes no other row down.");
+  }
+  if (rows.some((r) => r.training !== "nominal")) {
+    lines.push("Rows trained on more than nominal trajectories of the split are not ranked.");
+  }
+  if (isSummary(state) && rows.some((r) => r.lead)) {
+    lines.push("Lead: in how many of the cases in which one environment is left out the row’s mean stays above that of the next rank.");
   }
   for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
   for (const [caption, own] of groupedBy(rows.filter((row) => row.caption), (row) => row.caption)) {
