@@ -2,12 +2,10 @@
 
 import contextlib
 import dataclasses
-import os
 import socket
 import subprocess
 import sys
 import threading
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,12 +74,11 @@ class Good:
         shares, onsets = self.explain(self.lived())
         return shares[-1], int(onsets[-1])
 
-    def save(self, directory):
-        np.savez(directory / "state.npz", std=self.std_)
+    def state(self):
+        return {"std": self.std_}
 
-    def load(self, directory):
-        with np.load(directory / "state.npz", allow_pickle=False) as state:
-            self.std_ = state["std"]
+    def restore(self, state):
+        self.std_ = state["std"]
         self.reset()
 
 
@@ -381,9 +378,9 @@ class HalfStreaming(Good):
         super().fit(nominal)
         del self.reset
 
-    def load(self, directory):
+    def restore(self, state):
         self.reset = lambda: None
-        super().load(directory)
+        super().restore(state)
         del self.reset
 
 
@@ -417,28 +414,52 @@ class Stacks(Good):
         np.stack([x.observations for x in nominal])
 
 
-# Files
+# State
 
 
-@breaks("save-and-load", "a detector that loaded a saved fit differs: at t =", also={"shared-fit"})
-class SavesHalf(Good):
-    def save(self, directory):
-        np.savez(directory / "state.npz", std=np.ones_like(self.std_))
+@breaks("state", "a detector that restored a state differs: at t =", also={"shared-fit"})
+class HandsOverHalf(Good):
+    def state(self):
+        return {"std": np.ones_like(self.std_)}
 
 
 @breaks(
-    "save-and-load",
-    "save wrote no file into the directory that it was given",
-    also={"shared-fit", "saved-files"},
+    "state",
+    "state raised ContractError: state() of detector: array 'std' is of |O",
+    also={"shared-fit"},
 )
-class SavesNothing(Good):
-    def save(self, directory): ...
+class HandsOverObjects(Good):
+    def state(self):
+        return {"std": self.std_.astype(object)}
 
 
-@breaks("save-and-load", "load raised FileNotFoundError", also={"shared-fit", "saved-files"})
-class LoadsElsewhere(Good):
-    def load(self, directory):
-        (directory / "elsewhere").read_bytes()
+@breaks("state", "state raised ContractError: state() of detector: TypeError", also={"shared-fit"})
+class HandsOverItself(Good):
+    def state(self):
+        return {"detector": self}
+
+
+@breaks("state", "array 'scored' of state() differs after scoring")
+class HandsOverScores(Good):
+    scored = 0
+
+    def score(self, x):
+        self.scored += 1
+        return super().score(x)
+
+    def state(self):
+        return {"std": self.std_, "scored": np.int64(self.scored)}
+
+
+@breaks("state", "restore raised KeyError", also={"shared-fit"})
+class RestoresAnother(Good):
+    def restore(self, state):
+        self.std_ = state["another"]
+
+
+@breaks("state", "has only one of state and restore", also={"shared-fit"})
+class HandsOverInVain(Good):
+    restore = None
 
 
 @breaks("baseline", "scores with baseline=21 are those without it")
@@ -447,56 +468,17 @@ class LearnsNothingFromIt(Good):
         super().__init__(seed=seed, horizon=horizon, power=power)
 
 
-@breaks("shared-fit", "a fit of horizon 1, loaded for horizon 3, differs from a")
+@breaks("shared-fit", "a fit of horizon 1, restored for horizon 3, differs from a")
 class FitsItsHorizon(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ = self.std_ / self.horizon
 
 
-@breaks("saved-files", "load unpickled numpy")
-class SavesObjects(Good):
-    def save(self, directory):
-        np.savez(directory / "state.npz", std=self.std_.astype(object))
-
-    def load(self, directory):
-        with np.load(directory / "state.npz", allow_pickle=True) as state:
-            self.std_ = state["std"].astype(np.float64)
-        self.reset()
-
-
 # Manners
 
 ENDS, STARTED = [], []
 """Events that end threads, and processes, for those who clean up."""
-
-
-@breaks("random-state", "fit or score changed the state of the global generator of")
-class Seeds(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        np.random.seed(self.seed)  # noqa: NPY002
-
-
-@breaks("global-settings", "fit or score changed OMP_NUM_THREADS: 3 -> 1")
-class SetsThreads(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        os.environ["OMP_NUM_THREADS"] = "1"
-
-
-@breaks("global-settings", "fit or score changed recursion limit")
-class SetsTheLimit(Good):
-    def score(self, x):
-        sys.setrecursionlimit(4321)
-        return super().score(x)
-
-
-@breaks("global-settings", "fit or score changed working directory")
-class Wanders(Good):
-    def score(self, x):
-        os.chdir("/")
-        return super().score(x)
 
 
 @breaks("leftovers", "left running: thread pump: end what was started")
@@ -509,7 +491,7 @@ class LeavesAThread(Good):
 
 @breaks("leftovers", "left running: daemon thread pump: end what was started")
 class LeavesADaemonThread(Good):
-    save = load = None
+    state = restore = None
 
     def fit(self, nominal):
         super().fit(nominal)
@@ -522,27 +504,6 @@ class LeavesAProcess(Good):
     def fit(self, nominal):
         super().fit(nominal)
         STARTED.append(subprocess.Popen(["sleep", "60"]))
-
-
-@breaks("quiet", "fit or score printed 8 characters, first 'fitting':")
-class Prints(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        print("fitting")  # noqa: T201
-
-
-@breaks("quiet", "fit or score printed 4 characters, first 'deep': expected")
-class PrintsBelow(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        os.write(2, b"deep")
-
-
-@breaks("warnings", "fit or score warned: UserWarning: it is late: mend or")
-class Warns(Good):
-    def fit(self, nominal):
-        super().fit(nominal)
-        warnings.warn("it is late", stacklevel=1)
 
 
 @breaks("network", "the factory, fit or score asked the network for")

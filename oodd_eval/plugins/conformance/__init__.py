@@ -98,7 +98,7 @@ class CheckReport:
         Returns
         -------
         str
-            Such as ``"32 checks: 29 passed, 3 skipped in 0.4 s"``.
+            Such as ``"28 checks: 25 passed, 3 skipped in 0.4 s"``.
         """
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[s]} {meaning}" for s, meaning in STATUSES.items() if counts[s]]

@@ -1,4 +1,4 @@
-"""Side effects of running code: files, network, output, settings, threads, processes, memory.
+"""Side effects of running code: files, network, threads, processes.
 
 An audit hook sees every file that Python opens and every address that it connects to, from whatever
 library. It cannot be removed again: one is installed at the first use and is idle in between.
@@ -6,30 +6,21 @@ library. It cannot be removed again: one is installed at the first use and is id
 
 import contextlib
 import functools
-import locale
 import os
 import random
-import signal
 import sys
 import tempfile
 import threading
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 from unittest.mock import patch
 
 import numpy as np
 import psutil
 
-from oodd_eval.data.files import redirected
-
-_THREAD_VARIABLES: Final = tuple(f"{x}_NUM_THREADS" for x in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"))
-
-# Set before code is watched, so that setting the usual value is seen as well.
-_UNUSUAL_THREADS: Final = 3
-_UNUSUAL_SEED: Final = 0x0DD
+from oodd_eval.data.files import temporary_directory
 
 _CALLS: Final = "connect getaddrinfo gethostbyaddr gethostbyname sendmsg sendto"
 _NETWORK: Final = frozenset(f"socket.{call}" for call in _CALLS.split())
@@ -38,11 +29,10 @@ _WRITING: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEN
 
 @dataclass(slots=True)
 class Events:
-    """Addresses that were asked for, paths that were written to, and names that were unpickled."""
+    """Addresses that were asked for, and paths that were written to."""
 
     network: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
-    unpickled: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -50,10 +40,6 @@ class Effects(Events):
     """The side effects of one piece of work, up to its error; paths are those of `outside`."""
 
     error: BaseException | None = None
-    printed: str = ""  # by Python and by libraries beneath it
-    warnings: list[str] = field(default_factory=list)  # "Category: message"
-    random: list[str] = field(default_factory=list)  # global generators whose state changed
-    settings: list[str] = field(default_factory=list)  # "setting: before -> after"
     running: list[str] = field(default_factory=list)  # threads and child processes left
 
 
@@ -80,8 +66,6 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if event in _NETWORK and (address := _address(event, arguments)):
         _recording[-1].network.append(address)
         raise ConnectionRefusedError(f"no network during a check: {event} {address}")
-    if event == "pickle.find_class":
-        _recording[-1].unpickled.append(".".join(map(str, arguments)))
     # Descriptors are of files that were opened before, and seen then.
     path = arguments[0] if event == "open" and (arguments[2] or 0) & _WRITING else None
     if isinstance(path, str | bytes | os.PathLike):
@@ -97,60 +81,22 @@ def _address(event: str, arguments: tuple[Any, ...]) -> str:
     return ":".join(str(part) for part in target[:2]) if isinstance(target, tuple) else ""
 
 
-def watch(work: Callable[[], None], settings_before: dict[str, str]) -> Effects:
+def watch(work: Callable[[], None]) -> Effects:
     """Return the side effects of work, done in an empty directory; then the process is as before.
 
-    `settings_before` are those before libraries were imported, which is not seen otherwise.
+    What is global in the process is not watched: a run scores every group in a process of its own.
     """
     seen, running_before = Effects(), _running()
-    with contextlib.ExitStack() as stack:
-        here = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="oodd-check-")))
-        stack.enter_context(_set_apart(here))
-        generators, before = _generators(), settings_before | _set_here()
-        printed = stack.enter_context(_captured())
-        caught = stack.enter_context(warnings.catch_warnings(record=True, action="always"))
+    with temporary_directory() as here, _set_apart(here):
         with auditing(seen):
             try:
                 work()
             except (Exception, SystemExit) as error:  # noqa: BLE001  the checks judge it
                 seen.error = error
-        seen.random = [name for name, state in _generators().items() if generators[name] != state]
-        after = settings() | _set_here()
-        pairs = [(n, before.get(n, "unset"), after[n]) for n in sorted(after)]
-        seen.settings = [f"{name}: {old} -> {new}" for name, old, new in pairs if old != new]
-        seen.warnings = [
-            f"{w.category.__name__}: {' '.join(str(w.message).split())}" for w in caught or []
-        ]
         left = sorted(str(path) for path in here.rglob("*") if path.is_file())
         seen.written = outside([*seen.written, *left], here / "work")
-        printed.flush()
-        printed.seek(0)
-        seen.printed = printed.read()
     seen.running = [name for _, name in sorted(_running() - running_before)]
     return seen
-
-
-def settings() -> dict[str, str]:
-    """Return settings of the process that are the user's; a missing library has its defaults."""
-    torch = sys.modules.get("torch")
-    values: dict[str, object] = {
-        "numpy error handling": np.geterr(),
-        "recursion limit": sys.getrecursionlimit(),
-        "locale": locale.setlocale(locale.LC_ALL),
-        "interrupts": signal.getsignal(signal.SIGINT),
-        "torch default dtype": torch.get_default_dtype() if torch else "torch.float32",
-        "torch gradients enabled": torch.is_grad_enabled() if torch else True,
-        "torch deterministic": bool(torch and torch.are_deterministic_algorithms_enabled()),
-    }
-    return {name: str(value) for name, value in values.items()}
-
-
-def _set_here() -> dict[str, str]:
-    """Return the settings that are set to unusual values before code is watched."""
-    values = {name: str(os.environ.get(name)) for name in _THREAD_VARIABLES}
-    if torch := sys.modules.get("torch"):
-        values["torch.get_num_threads()"] = str(torch.get_num_threads())
-    return {**values, "working directory": os.path.realpath(os.curdir)}
 
 
 def outside(written: Iterable[str], here: Path) -> list[str]:
@@ -185,42 +131,16 @@ def seeded_generators(seed: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _set_apart(here: Path) -> Iterator[None]:
-    """Work in empty directories, with unusual generators and thread settings; then put all back."""
+    """Work in empty directories, with generators of the global kind put back in the end."""
     for directory in (work := here / "work", temporary := here / "temporary"):
         directory.mkdir()
-    variables = dict.fromkeys(_THREAD_VARIABLES, str(_UNUSUAL_THREADS))
     with (
-        seeded_generators(_UNUSUAL_SEED),
-        patch.dict(os.environ, variables, TMPDIR=str(temporary)),
+        seeded_generators(0),
+        patch.dict(os.environ, TMPDIR=str(temporary)),
         patch.object(tempfile, "tempdir", str(temporary)),
         contextlib.chdir(work),
-        contextlib.ExitStack() as back,
     ):
-        if torch := sys.modules.get("torch"):
-            back.callback(torch.set_num_threads, torch.get_num_threads())
-            torch.set_num_threads(_UNUSUAL_THREADS)
         yield
-
-
-def _generators() -> dict[str, object]:
-    kind, words, *rest = np.random.get_state()  # noqa: NPY002
-    numpy_state = kind, np.asarray(words).tobytes(), rest
-    states: dict[str, object] = {"random": random.getstate(), "numpy.random": numpy_state}
-    if torch := sys.modules.get("torch"):
-        states["torch"] = torch.get_rng_state().numpy().tobytes()
-    return states
-
-
-@contextlib.contextmanager
-def _captured() -> Iterator[IO[str]]:
-    """Send what is printed, by Python and by libraries beneath it, into a file."""
-    with (
-        tempfile.TemporaryFile("w+", errors="replace") as file,
-        redirected(file),
-        contextlib.redirect_stdout(file),
-        contextlib.redirect_stderr(file),
-    ):
-        yield file
 
 
 def _running() -> set[tuple[int, str]]:

@@ -8,7 +8,7 @@ PYTEST_DONT_REWRITE: messages are whole sentences.
 import contextlib
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,16 @@ from oodd_eval.plugins.conformance.trial import (
 from oodd_eval.plugins.contract import (
     TOLERANCE,
     Detector,
+    Scores,
     StorableDetector,
+    StreamingDetector,
     check_scores,
     difference,
 )
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
+from oodd_eval.plugins.state import PackedState, pack, read_state, write_state
 
 __all__ = ["shared_trial", "trial"]  # fixtures
 
@@ -277,13 +280,15 @@ def test_streaming(trial: Trial) -> None:
     # The second episode is left in the middle, so that the next one has to begin anew.
     first, second, third = trial.nominal(3)
     for trajectory in (first, second[: len(second) // 2], third):
-        whole = trial.scores(trajectory)
-        with doing("reset and update"):
-            detector.reset()
-            rows = map(detector.update, trajectory.observations, [None, *trajectory.actions])
-            scores = np.array(list(rows), dtype=np.float64)
-        what = "update differs from score of the whole episode"
-        assert_equal(scores, whole, what, tolerance=trial.tolerance)
+        whole, what = trial.scores(trajectory), "update differs from score of the whole episode"
+        assert_equal(_streamed(detector, trajectory), whole, what, tolerance=trial.tolerance)
+
+
+def _streamed(detector: StreamingDetector, trajectory: Trajectory) -> Scores:
+    with doing("reset and update"):
+        detector.reset()
+        rows = map(detector.update, trajectory.observations, [None, *trajectory.actions])
+        return np.array(list(rows), dtype=np.float64)
 
 
 def test_explain(trial: Trial) -> None:
@@ -394,85 +399,65 @@ def _must_be_finite(trial: Trial, detector: Detector, trajectory: Trajectory, wh
     )
 
 
-def test_save_and_load(trial: Trial) -> None:
-    """A new detector that loads what was saved gives the same scores, bit for bit."""
-    with _saved(trial.fitted()) as directory:
-        trial.must_agree(_loaded(trial, directory), "a detector that loaded a saved fit differs")
+def test_state(trial: Trial) -> None:
+    """A new detector that restores a state, which scoring leaves alone, gives the same scores."""
+    packed, detector = _packed(trial), trial.fitted()
+    restored, what = _restored(trial, packed), "a detector that restored a state differs"
+    trial.must_agree(restored, what)
+    again = _packed(trial)
+    assert again.text == packed.text, "state() differs after scoring: expected what fit learned"
+    for name, array in packed.arrays.items():
+        assert array.tobytes() == again.arrays.get(name, np.empty(0)).tobytes(), (
+            f"array {name!r} of state() differs after scoring: expected what fit learned"
+        )
+    if isinstance(detector, StreamingDetector):
+        x = trial.nominal(1)[0]
+        try:
+            expected = _streamed(detector, x)
+        except RaisedError:
+            pytest.skip("needs update: see check 'streaming'")
+        # Sums of one row and of many can have another order, which may depend on how arrays lie.
+        assert_equal(_streamed(restored, x), expected, f"row by row, {what}")
 
 
 def test_shared_fit(trial: Trial) -> None:
-    """One saved fit serves all horizons where the spec says that they do not decide the fit."""
-    offered(trial.fitted(), "save", "load")
+    """One fit serves all horizons where the spec says that they do not decide the fit."""
+    packed = _packed(trial)
     if trial.spec.horizon_decides_fit:
         pytest.skip("does not say that fits ignore the horizon")
     other = trial.horizon + 2
-    what = f"a fit of horizon {trial.horizon}, loaded for horizon {other}, differs from a fit of "
+    what = f"a fit of horizon {trial.horizon}, restored for horizon {other}, differs from a fit of "
     advice = "expected horizon_decides_fit=True"
-    with _saved(trial.fitted()) as directory:
-        x, loaded = trial.nominal(1)[0], _loaded(trial, directory, horizon=other)
-        expected = trial.scores(x, trial.fit(horizon=other))
-        assert_equal(trial.scores(x, loaded), expected, f"{what}horizon {other}", advice)
+    x, restored = trial.nominal(1)[0], _restored(trial, packed, horizon=other)
+    expected = trial.scores(x, trial.fit(horizon=other))
+    assert_equal(trial.scores(x, restored), expected, f"{what}horizon {other}", advice)
 
 
-def test_saved_files(trial: Trial) -> None:
-    """Loading saved files unpickles nothing, which could run anything."""
-    with _saved(trial.fitted()) as directory:
-        trial.events.unpickled.clear()
-        _loaded(trial, directory)
-    expected = "save JSON, npz without objects, or safetensors"
-    fail_for(trial.events.unpickled, "load unpickled", expected)
+def _packed(trial: Trial) -> PackedState:
+    """Return the state of the shared fit as it comes back from a file."""
+    detector = trial.fitted()
+    if not isinstance(detector, StorableDetector) and hasattr(detector, "save"):
+        pytest.skip("has save and load, which nothing calls any more: offer state and restore")
+    with doing("state"):
+        packed = pack(offered(detector, "state", "restore").state())
+    with tempfile.TemporaryDirectory(prefix="oodd-check-") as directory:
+        write_state(Path(directory) / "fit.npz", packed)
+        return read_state(Path(directory) / "fit.npz")
 
 
-@contextlib.contextmanager
-def _saved(detector: Detector) -> Iterator[Path]:
-    """Give the directory that a detector saved itself in."""
-    storable = offered(detector, "save", "load")
-    with tempfile.TemporaryDirectory(prefix="oodd-check-") as name:
-        with doing("save"):
-            storable.save(Path(name))
-        assert any(Path(name).iterdir()), "save wrote no file into the directory that it was given"
-        yield Path(name)
-
-
-def _loaded(trial: Trial, directory: Path, **changes: Any) -> Detector:
-    detector: StorableDetector = offered(trial.make(**changes), "save", "load")
-    with doing("load"):
-        detector.load(directory)
+def _restored(trial: Trial, packed: PackedState, **changes: Any) -> Any:
+    detector = offered(trial.make(**changes), "state", "restore")
+    with doing("restore"):
+        detector.restore(packed.state())
     return detector
-
-
-def test_random_state(trial: Trial) -> None:
-    """Global random generators are left alone."""
-    effect = "fit or score changed the state of the global generator of"
-    advice = "use numpy.random.default_rng(seed), or a generator of one's own"
-    fail_for(trial.effects.random, effect, advice)
-
-
-def test_global_settings(trial: Trial) -> None:
-    """Settings of the process, such as working directory and threads, are left alone."""
-    fail_for(trial.effects.settings, "fit or score changed", "leave, or put back, what is global")
 
 
 def test_leftovers(trial: Trial) -> None:
     """No thread and no process is left running."""
-    # A run loads the saved fit anew where threads run on.
-    saved = isinstance(trial.fitted(), StorableDetector)
-    left = [x for x in trial.effects.running if not (saved and x.startswith(DAEMON))]
+    # Groups restore the state where threads run on.
+    kept = isinstance(trial.fitted(), StorableDetector)
+    left = [x for x in trial.effects.running if not (kept and x.startswith(DAEMON))]
     fail_for(left, "left running:", "end what was started")
-
-
-def test_quiet(trial: Trial) -> None:
-    """Nothing is printed."""
-    printed = trial.effects.printed
-    line = printed.strip().partition("\n")[0][:60]
-    assert not printed, (
-        f"fit or score printed {len(printed)} characters, first {line!r}: expected none"
-    )
-
-
-def test_warnings(trial: Trial) -> None:
-    """No warning is raised."""
-    fail_for(trial.effects.warnings, "fit or score warned:", "mend or silence what is expected")
 
 
 def test_network(trial: Trial) -> None:

@@ -20,7 +20,7 @@ import pytest
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.metrics.auc import Floats
-from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, settings, watch
+from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, watch
 from oodd_eval.plugins.contract import (
     ROLLOUT_TOLERANCE,
     TOLERANCE,
@@ -79,7 +79,6 @@ class Trial:
         self.rows = ROWS + horizon  # of an ordinary episode
         self.tolerance = TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE
         self.events = Events()  # of all checks so far
-        self._settings_before = settings()
 
     @contextlib.contextmanager
     def watched(self) -> Iterator[None]:
@@ -164,7 +163,7 @@ class Trial:
             for trajectory in nominal:
                 detector.score(trajectory)
 
-        return watch(work, self._settings_before)
+        return watch(work)
 
     def episode(self, key: int, rows: int | None = None, sensors: int = SENSORS) -> Trajectory:
         """Return the nominal episode of a key; another number of sensors is another system."""
