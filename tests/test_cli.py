@@ -15,8 +15,10 @@ from helpers_docs import parse
 from helpers_plugins import install
 from helpers_split import make_split
 
+from oodd_eval import cli as cli_package
 from oodd_eval.cli import listing
 from oodd_eval.cli import main as cli
+from oodd_eval.errors import MissingExtraError
 
 
 @pytest.fixture
@@ -356,6 +358,19 @@ def commands(rows, *names):
     """The words of every command of a table."""
     for name, (_, target) in rows.items():
         yield from [[*names, name]] if isinstance(target, str) else commands(target, *names, name)
+
+
+def test_help_of_a_group_needs_no_extra_of_its_commands(capsys, monkeypatch):
+    def import_all_but_recording(target, load=cli_package.load):
+        if target.startswith("oodd_recording"):
+            raise MissingExtraError("recording needs the simulators")
+        return load(target)
+
+    monkeypatch.setattr(cli_package, "load", import_all_but_recording)
+    assert cli.main(["leaderboard", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "  rerun " in text
+    assert "oodd-eval leaderboard verify" in text.partition("\nExamples:\n")[2]
 
 
 @pytest.mark.parametrize(

@@ -139,9 +139,9 @@ def test_a_file_that_is_no_recipe_is_refused(tmp_path):
     path = tmp_path / "arm.toml"
     for content in (b"split = ", b"\xff\xfe", b'split = "a\nb"'):
         path.write_bytes(content)
-        with pytest.raises(UsageError, match=r"arm\.toml cannot be read"):
+        with pytest.raises(UsageError, match=r"arm\.toml' cannot be read"):
             Recipe.load(path)
-    with pytest.raises(UsageError, match=r"none\.toml cannot be read"):
+    with pytest.raises(UsageError, match=r"none\.toml' cannot be read"):
         Recipe.load(tmp_path / "none.toml")
     path.write_text("spilt = 'a'")
     with pytest.raises(UnknownNameError, match=r"arm\.toml"):

@@ -708,7 +708,7 @@ def test_the_command_says_what_became_of_labelled_episodes(labelled, many, tmp_p
     assert main(["scan", str(tmp_path / "logs")]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert f"{labelled} episodes are anomalous by their labels, 0 of them odd" in out
-    assert ("--watchdog DIR" in out) == many
+    assert ("--watchdog FILE" in out) == many
 
 
 def test_command_with_recipe_and_watchdog(tmp_path, capsys):

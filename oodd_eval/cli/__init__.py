@@ -1,5 +1,7 @@
 """The command line: a module per command, and here the classes and options that they share."""
 
+import contextlib
+import stat
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -13,7 +15,7 @@ from typing import Any, Final, TypeAlias
 import click
 from click.shell_completion import CompletionItem
 
-from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
 from oodd_eval.names import memory_bytes, parameter, seconds, whole_numbers
 
 NAMES: Final = "names separated by commas, globs, or 'all'"
@@ -163,9 +165,12 @@ class Group(click.Group):
                 formatter.write_dl(rows)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write an example of each command."""
-        commands = (self.get_command(ctx, name) for name in self.entries)
-        examples = (c.examples[0] for c in commands if isinstance(c, Command))
+        """Write an example of each command whose extra is installed."""
+        examples: list[str] = []
+        for name in self.entries:
+            with contextlib.suppress(MissingExtraError):
+                loaded = self.get_command(ctx, name)
+                examples += loaded.examples[:1] if isinstance(loaded, Command) else []
         write_section(formatter, "Examples", [f"oodd-eval {line}" for line in examples])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> Items:
@@ -244,8 +249,27 @@ def _named(kind: click.ParamType[Any], metavar: str) -> click.ParamType[Any]:
     return kind
 
 
-DIRECTORY: Final = _named(click.Path(path_type=Path), "DIR")
-FILE: Final = _named(click.Path(path_type=Path), "FILE")
+def plain_path(text: str) -> Path:
+    """Return a path to read or write at; `UsageError` for a pipe, a device and the like."""
+    path = Path(text)
+    try:
+        kind = path.stat().st_mode
+    except (OSError, ValueError):  # the command says what is missing
+        return path
+    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+        raise UsageError(f"{text!r}, expected a file or directory, not a pipe or a device")
+    return path
+
+
+class _PathType(Converted):
+    """The type of a path, which shells complete as they do files."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+        return click.Path().shell_complete(ctx, param, incomplete)
+
+
+DIRECTORY: Final = _PathType(plain_path, "DIR")
+FILE: Final = _PathType(plain_path, "FILE")
 COUNT: Final = _named(click.IntRange(min=1), "N")
 HORIZONS: Final = Converted(partial(whole_numbers, least=1), "N,...")
 SEEDS: Final = Converted(partial(whole_numbers, least=0), "N,...")

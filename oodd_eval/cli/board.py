@@ -52,7 +52,7 @@ def show(options: Options) -> int:
     output = _Output(options)
     for board in chosen:
         ranks = board.ranks()
-        notes = [*tables.ranking_notes(ranks), *_of_entries(board)]
+        notes = [*tables.ranking_notes(ranks, whole=False), *_of_entries(board)]
         output.print(
             Section(
                 f"Leaderboard, {board}",
@@ -92,7 +92,7 @@ def place_run(options: Options) -> int:
             of_ranks = rankings(placed.ranks, trust, placed.rows)
             nearby = (neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str))
             of_ranks += [table for table in nearby if table]
-            notes = [*tables.ranking_notes(placed.ranks), *notes]
+            notes = [*tables.ranking_notes(placed.ranks, whole=False), *notes]
         output.print(
             Section(f"Your rows on the leaderboard, {board}", tables=of_ranks, notes=notes),
             ranking_csv(placed.ranks, trust) if output.csv and not output.quiet else "",

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 import click
 from tabulate import tabulate
@@ -15,6 +15,7 @@ from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.data.split import imported_environments
 from oodd_eval.errors import UnknownNameError
+from oodd_eval.plugins.contract import Training
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
 
@@ -108,6 +109,14 @@ def _anomaly(info: AnomalyInfo) -> Lines:
         yield f"strength in {environment}", text
 
 
+_TRAINING: Final[Mapping[Training, str]] = {
+    "nominal": "the nominal trajectories of a split",
+    "simulation": "simulation: nominal episodes of its own besides (boards do not rank it)",
+    "anomalies": "anomalies (boards do not rank it)",
+    "external": "external data (boards do not rank it)",
+}
+
+
 def _detector(offer: Offer) -> Lines:
     spec = offer.spec
     yield "detector", f"{spec.name}, {offer.origin}"
@@ -117,6 +126,7 @@ def _detector(offer: Offer) -> Lines:
     yield "source", spec.reference or "not given"
     yield "looks at", spec.inputs.replace("+", " and ")
     yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
+    yield "trained on", _TRAINING[spec.training]
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
     for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):
         default = f"{name} = {json.dumps(parameter.default, default=str)}"

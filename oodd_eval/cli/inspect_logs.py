@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from pathlib import Path
 
 import click
 
@@ -21,7 +20,7 @@ from oodd_eval.errors import OutputError
     "data inspect run.csv --read 'separator=;' --read decimal=,",
     plugins=True,
 )
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=FILE)
 @click.option("--recipe", type=FILE, help="write a first recipe there, for `data import`")
 @click.option("--format", metavar="NAME", help="of the files (default: by their endings)")
 @click.option(

@@ -73,7 +73,10 @@ def _imported() -> Rows:
 def _detectors(plugins: Plugins) -> Rows:
     for name, offer in plugins.offers.items():
         why = offer.unavailable()
-        yield name, offer.origin, (f"[unavailable: {why}] " if why else "") + offer.spec.summary
+        training = offer.spec.training
+        marks = f"[unavailable: {why}] " if why else ""
+        marks += f"[trained on {training}] " if training != "nominal" else ""
+        yield name, offer.origin, marks + offer.spec.summary
     for name, origin, forms in plugins.spec_forms():
         yield f"({name})", origin, forms
     yield from ((b.plugin, b.distribution, f"[broken plug-in] {b.reason}") for b in plugins.broken)

@@ -14,6 +14,7 @@ from click.shell_completion import shell_complete
 
 from oodd_eval._version import __version__
 from oodd_eval.cli import Commands, Group, Options, command, say, write_section
+from oodd_eval.cli.streams import plain_streams
 from oodd_eval.errors import OoddError
 
 FIRST_STEPS: Final = (
@@ -49,7 +50,7 @@ LEADERBOARD: Final[Commands] = {
     "place": ("show where a run would stand on it", "oodd_eval.cli.board:place_run"),
     "submit": ("write an entry from a results directory", "oodd_eval.cli.leaderboard:submit"),
     "verify": ("check entries as data", "oodd_eval.cli.leaderboard:verify"),
-    "rerun": ("run an entry's detectors again on new seeds", "oodd_recording.rerun:rerun"),
+    "rerun": ("run an entry again on new seeds (extra sim)", "oodd_recording.rerun:rerun"),
     "build": ("render tables and site from the entries", "oodd_eval.cli.leaderboard:build"),
 }
 
@@ -116,16 +117,20 @@ def completion(options: Options) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code; by default end this process with it."""
+    # Pydantic would look for plug-ins of its own, and fail at broken metadata of any distribution.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     if arguments is not None:
-        return _exit_code(list(arguments))
+        with plain_streams():
+            return _exit_code(list(arguments))
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, signal.default_int_handler)
-    if question := os.environ.get(COMPLETION):
-        with contextlib.suppress(OoddError):  # of a broken split, say: then there are no names
-            shell_complete(PROGRAM, {}, "oodd-eval", COMPLETION, question)
-        return 0
-    code = _exit_code(sys.argv[1:])
+    with plain_streams():
+        if question := os.environ.get(COMPLETION):
+            with contextlib.suppress(OoddError):  # of a broken split, say: then there are no names
+                shell_complete(PROGRAM, {}, "oodd-eval", COMPLETION, question)
+            return 0
+        code = _exit_code(sys.argv[1:])
     # Threads and exit handlers of plug-ins, which might never end, have no say.
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError, AttributeError):

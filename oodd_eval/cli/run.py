@@ -1,7 +1,6 @@
 """``oodd-eval run``: fit and score every selected cell, print tables and write them."""
 
 import json
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from oodd_eval.cli import (
     say_notes,
 )
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
+from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
@@ -92,8 +92,14 @@ def run(options: Options) -> int:
     The exit code is 1 when a cell failed, and 2 when the run was interrupted. What was done before
     is kept: the same command goes on.
     """
-    plugins = discovered(options)
-    split = load_split(options.split)
+    split, hidden = load_split(options.split), None
+    if options.sandbox:
+        if options.executor != LOCAL:
+            raise UsageError("--sandbox is for workers of this machine, without --executor")
+        require_sandbox()
+        hidden = (*split_places(split), str(options.output))
+    limits = Limits(options.timeout, options.memory, hidden)
+    plugins = discovered(options, limits)
     environments, anomalies = split.select(options.env, options.anomaly)
     plan = make_plan(
         plugins,
@@ -117,13 +123,6 @@ def run(options: Options) -> int:
             console.print("\n".join(map(str, plan.cells)))
         console.print(f"{len(plan.cells)} cells in {len(plan.units)} fits")
         return 0
-    hidden = None
-    if options.sandbox:
-        if options.executor != LOCAL:
-            raise UsageError("--sandbox is for workers of this machine, without --executor")
-        require_sandbox()
-        hidden = (*split_places(split), str(options.output))
-    limits = Limits(options.timeout, options.memory, hidden)
     settings = RunSettings(
         jobs=options.jobs,
         limits=limits,
@@ -176,10 +175,7 @@ class _Doubts:
 
 def _options_of(file: str) -> list[str]:
     """Return a TOML file's content, long names of options with their values, as options."""
-    try:
-        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"configuration file {file!r} cannot be read: {error}") from None
+    content = read_toml(Path(file), UsageError)
     return [option for key, value in content.items() for option in _option(file, key, value)]
 
 

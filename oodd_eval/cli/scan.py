@@ -3,14 +3,13 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
 import click
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, DIRECTORY, FILE, PARAMETER, Name, Options, command
+from oodd_eval.cli import COUNT, FILE, PARAMETER, Name, Options, command
 from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
@@ -33,10 +32,10 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
     "scan logs",
     "scan logs --html scan.html --json scan.json",
     "scan logs --recipe arm.toml --detector pe --jobs 4",
-    "scan today --recipe arm.toml --watchdog arm-watchdog --mcap scan.mcap",
+    "scan today --recipe arm.toml --watchdog arm.npz --mcap scan.mcap",
     plugins=True,
 )
-@click.argument("logs", type=click.Path(path_type=Path))
+@click.argument("logs", type=FILE)
 @click.option(
     "--recipe", type=FILE, help="how the logs are read (default: as `data inspect` has it)"
 )
@@ -47,7 +46,7 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
 @click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
 @click.option("--detector", default="mewma", type=Name("detectors"), help="that judges")
 @click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text")
-@click.option("--watchdog", type=DIRECTORY, help="a saved watchdog judges, and nothing is fitted")
+@click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
 @click.option(
     "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
 )
@@ -137,7 +136,7 @@ def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
     yield (
         f"{len(labelled)} episodes are anomalous by their labels, {odd} of them odd here."
         + " Where more than a fifth are, they pass for nominal: scan nominal logs alone, or judge "
-        "by a watchdog that was fitted on these (--watchdog DIR)." * many
+        "by a watchdog that was fitted on these (--watchdog FILE)." * many
     )
 
 

@@ -4,22 +4,26 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
 from rich.text import Text
 
 from oodd_eval._version import __version__
 from oodd_eval.cli import Options, say
+from oodd_eval.cli.streams import plain_text, raw
 from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.logs import register_readers
 from oodd_eval.data.registry import Spec, register
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.plugins import hookimpl
-from oodd_eval.plugins.discovery import Plugins, discover, printable
+from oodd_eval.plugins.discovery import Plugins, discover
+from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.describe import discover_in_sandbox
 from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render.text import print_prose, print_sections
@@ -31,19 +35,36 @@ _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
 
 class _Console(Console):
+    """Writes styles and moves of the cursor of its own, and of what it is to print `plain_text`."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=plain_text(segment.text))
+
     def on_broken_pipe(self) -> None:
         """Raise the error; rich would end the process with the exit code of a failure."""
         raise BrokenPipeError
 
 
-def make_console(*, quiet: bool = False) -> Console:
-    """Return a console on standard output: coloured on a terminal, plain text in a pipe."""
-    return _Console(file=sys.stdout, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
+def make_console(*, quiet: bool = False, stderr: bool = False) -> Console:
+    """Return a console on a standard stream: coloured on a terminal, plain text in a pipe."""
+    file = raw(sys.stderr if stderr else sys.stdout)
+    return _Console(file=file, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
 
 
-def discovered(options: Options) -> Plugins:
-    """Discover plug-ins without those of ``-p``; broken ones are reported on standard error."""
-    plugins = discover(options.disabled)
+def discovered(options: Options, limits: Limits | None = None) -> Plugins:
+    """Discover plug-ins without those of ``-p``; broken ones are reported on standard error.
+
+    With limits that hide paths, only sandboxes load plug-ins: this process imports none.
+    """
+    if limits is None or limits.hidden is None:
+        plugins = discover(options.disabled)
+    else:
+        plugins = discover_in_sandbox(options.disabled, limits)
+        if watching := ", ".join(point.name for point in plugins.observer_points):
+            say(f"plug-ins that observe runs are left out of a sandboxed one: {watching}")
     plugins.report_broken_to(
         lambda b: say(f"plug-in {b.plugin!r} of {b.distribution} is broken: {b.reason}")
     )
@@ -174,7 +195,7 @@ class TerminalReporter:
             if (path := self._log(record.scores)).is_file():
                 self._print(f"  {path}:")
                 for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-                    self._print(f"    {printable(line)}")
+                    self._print(f"    {line}")
 
     def _line(self, last: Record, name: str, cells: Sequence[Record], *, resumed: bool) -> None:
         parts = [f"{last.status:<12} {name}"]

@@ -4,9 +4,15 @@ A few bytes can announce or unpack to gigabytes, so sizes are compared with a bo
 is read. HDF5 files are read by `oodd_eval.data.stored`, within the same bounds.
 """
 
+import errno
+import io
+import json
 import math
+import os
+import stat
+import tomllib
 import zipfile
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
@@ -39,12 +45,15 @@ class Bounds:
         What to do then; it ends the message.
     kinds
         Kinds of NumPy dtypes that arrays may have; empty where the caller checks dtypes.
+    entries
+        Arrays that one ``.npz`` file may have.
     """
 
     most: int
     error: type[OoddError]
     advice: str = ""
     kinds: str = "fiub"
+    entries: int = 2**20
 
     def check(self, what: str, dtype: np.dtype[Any], size: int, taken: int = 0) -> int:
         """Return the bytes taken with `size` more; raise `error` beyond the bounds."""
@@ -63,11 +72,12 @@ SPLIT: Final = Bounds(2**27, SplitError, "build or fetch it again", kinds="")
 """Of a file of a split, all but the rows of episodes, which are read in blocks."""
 EPISODE: Final = Bounds(2**28, TrajectoryError, "split the episode")
 SCORES: Final = Bounds(2 * 10**7 * 8, ResultsError, kinds="f")
-STATE: Final = Bounds(2**32, FittedStateError)
+STATE: Final = Bounds(520 * 10**6, FittedStateError, "fit again", entries=5000)
 POLICY: Final = Bounds(2**28, PolicyError, kinds="fiu")
 
 MANIFEST_BYTES: Final = 10**7
-STATE_BYTES: Final = 2**24  # of the JSON file of a saved detector
+TOML_BYTES: Final = 10**6  # of a recipe or configuration
+_DEEPEST: Final = 50  # levels of lists and objects
 LINE_CHARACTERS: Final = 2**20  # of a line of a CSV file
 CHUNK_BYTES: Final = 2**26  # of a chunk of an HDF5 dataset, packed or not
 EPISODES: Final = 200_000  # of a part of imported logs
@@ -76,18 +86,63 @@ _METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that NumPy
 _HEADERS: Final = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
-def read_bytes(path: Path, most: int, error: type[OoddError]) -> bytes:
-    """Return the content of a plain file of at most `most` bytes; raise `error` for others.
+def open_plain(path: Path) -> io.BufferedReader:
+    """Open a plain file for reading; `OSError` for what is none, such as a pipe or a device.
 
-    `OSError` when it cannot be opened.
+    Opening a pipe waits for somebody to write into it, and a device may have no end.
     """
-    if path.exists() and not path.is_file():
-        raise error(f"{path} is no plain file")
-    with path.open("rb") as file:
-        content = file.read(min(path.stat().st_size, most) + 1)
-    if len(content) > most:
-        raise error(f"{path} has more than {most} bytes")
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "is no plain file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_bytes(path: Path, most: int, error: type[OoddError]) -> bytes:
+    """Return the content of a plain file of at most `most` bytes; raise `error` for others."""
+    try:
+        with open_plain(path) as file:
+            large = os.fstat(file.fileno()).st_size > most
+            content = b"" if large else file.read(most + 1)
+    except (OSError, ValueError) as problem:  # a name may hold what no file's name may
+        why = getattr(problem, "strerror", None) or problem
+        raise error(f"{str(path)!r} cannot be read: {why}") from None
+    if large or len(content) > most:
+        raise error(f"{str(path)!r} has more than {most} bytes")
     return content
+
+
+def read_json(path: Path, most: int, error: type[OoddError]) -> Any:
+    """Return the value in a file of JSON of at most `most` bytes; raise `error` for others."""
+    return _parsed(path, read_bytes(path, most, error), json.loads, error)
+
+
+def read_toml(path: Path, error: type[OoddError]) -> dict[str, Any]:
+    """Return the content of a file in TOML that people write; raise `error` for others."""
+    content: dict[str, Any] = _parsed(
+        path, read_bytes(path, TOML_BYTES, error), lambda text: tomllib.loads(text.decode()), error
+    )
+    return content
+
+
+def _parsed(
+    path: Path, content: bytes, parse: Callable[[bytes], Any], error: type[OoddError]
+) -> Any:
+    try:
+        level = [value := parse(content)]
+        for _ in range(_DEEPEST):
+            level = [inner for outer in level for inner in _inner(outer)]
+        if level:
+            raise RecursionError("is nested too deep")  # noqa: TRY301
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{str(path)!r} cannot be read: {problem}") from None
+    return value
+
+
+def _inner(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
 
 
 def read_npz(
@@ -115,7 +170,7 @@ def read_npz(
     taken = 0
     try:
         with zipfile.ZipFile(path) as archive:
-            for item in archive.infolist():
+            for item in _few(archive.infolist(), path, bounds):
                 name = item.filename.removesuffix(".npy")
                 if names is None or name in names:
                     dtype, size = _announced(archive, item)
@@ -125,8 +180,15 @@ def read_npz(
     except bounds.error:
         raise
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds for damage
-        raise bounds.error(f"{path} cannot be read: {type(error).__name__}: {error}") from error
+        problem = f"{path} cannot be read: {type(error).__name__}: {error}"
+        raise bounds.failure(problem) from error
     return arrays
+
+
+def _few(items: list[zipfile.ZipInfo], path: Path, bounds: Bounds) -> list[zipfile.ZipInfo]:
+    if len(items) > bounds.entries:
+        raise bounds.failure(f"{path} has {len(items)} arrays, limit {bounds.entries}")
+    return items
 
 
 def _announced(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> tuple[np.dtype[Any], int]:

@@ -398,6 +398,11 @@ class _Maker:
             base = self._base = self._base or _Base.of(recording, chosen, self._recipe)
             self._selections[layout] = base.in_order(chosen, recording), base
         selection, base = self._selections[layout]
+        if (choices := _choices(recording)) != base.choices:
+            raise TrajectoryError(
+                f"{recording.source}: its actions are {choices}, expected {base.choices} as in "
+                f"{base.source}"
+            )
         self._recordings += 1
         self._names |= {recorded.relative, recording.name}
         outcome = self._outcome(recorded)
@@ -748,6 +753,7 @@ class _Base:
     converter: Converter
     spool: Spool
     source: str
+    choices: str
 
     @classmethod
     def of(cls, recording: Recording, selection: Selection, recipe: Recipe) -> "_Base":
@@ -757,7 +763,8 @@ class _Base:
             recipe = dataclasses.replace(recipe, discrete=names or int(number))
         start = int(recording.fields.get("start", 0)) if number else 0
         converter = Converter(selection, recipe, start)
-        return cls(selection, converter, Spool(converter.width), recording.source)
+        spool = Spool(converter.width)
+        return cls(selection, converter, spool, recording.source, _choices(recording))
 
     def in_order(self, selection: Selection, recording: Recording) -> Selection:
         """Return a selection with the columns of the first recording, in their order.
@@ -900,3 +907,8 @@ def _moments(source: EpisodeSource, episodes: Iterable[EpisodeFacts]) -> Running
         for rows in source.blocks(facts):
             moments.add(rows[:, : len(source.sensors)])
     return moments
+
+
+def _choices(recording: Recording) -> str:
+    number, start = (str(recording.fields.get(name, 0)) for name in ("discrete", "start"))
+    return f"{number:.40} choices from {start:.40} on" if number != "0" else "numbers"

@@ -136,6 +136,10 @@ class SplitDefinition:
         Noise of every sensor in nominal operation, in shares of its spread.
     strengths
         Strengths of all conditions, in place of a suite.
+    drawn
+        SHA-256 of 128 random bits, from which NumPy's ``SeedSequence`` makes 128 bits for each
+        episode, and which the split does not hold. Then the base is 0, and the rule of `seed_base`
+        gives an episode's number. Empty where it gives the seed.
     """
 
     name: str
@@ -148,13 +152,14 @@ class SplitDefinition:
     base: str = ""
     noise: float = 0.0
     strengths: Mapping[str, float] = field(default_factory=dict)
+    drawn: str = ""
 
     @property
     def recipe(self) -> dict[str, Any]:
         """The manifest's ``definition``: all fields but those that are at their default."""
         recipe = {field.name: getattr(self, field.name) for field in fields(self)}
         # Older manifests lack these.
-        later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}}
+        later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}, "drawn": ""}
         return {n: value for n, value in recipe.items() if n not in later or value != later[n]}
 
 

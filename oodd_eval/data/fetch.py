@@ -13,7 +13,6 @@ import io
 import shutil
 import stat
 import tarfile
-import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -26,7 +25,7 @@ from urllib.request import url2pathname
 
 from oodd_eval._version import __version__
 from oodd_eval.data.bounded import MANIFEST_BYTES
-from oodd_eval.data.files import lock
+from oodd_eval.data.files import lock, temporary_directory
 from oodd_eval.data.layout import MANIFEST, read_manifest
 from oodd_eval.data.split import SHIPPED, Split, data_home
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
@@ -179,8 +178,7 @@ def _bring_file(
     most = 2 * _MIB + sum(_MIB + row * steps + trajectory * n for steps, n in sizes)
     source(entry["file"], part, most)
     # What ends the check, or this process, leaves nothing that a later fetch would go on from.
-    with tempfile.TemporaryDirectory(prefix="doubtful", dir=staging) as directory:
-        doubtful = Path(directory)
+    with temporary_directory(staging, "doubtful") as doubtful:
         shutil.copy(fresh / MANIFEST, doubtful)
         part.replace(doubtful / entry["file"])
         Split(doubtful).environment(environment).close()

@@ -1,14 +1,17 @@
 """Files that are whole or absent: atomic replacement, a lock per directory, bounded compression."""
 
 import contextlib
+import glob
 import gzip
 import hashlib
 import io
 import lzma
 import os
 import re
+import secrets
 import shutil
 import sys
+import tempfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +19,7 @@ from typing import IO, Any, Final
 
 import psutil
 
+from oodd_eval.data.bounded import read_bytes
 from oodd_eval.errors import OutputError, ResultsError
 
 GZIP: Final = ".gz"
@@ -25,15 +29,24 @@ PACKED: Final = (XZ, GZIP)
 
 COMPRESSED_FROM: Final = 10**6  # bytes; smaller files stay readable in a pull request
 MAX_BYTES: Final = 64 * 10**6  # most bytes that a compressed file may decompress to
+MAX_TEXT: Final = 2**30  # most bytes of a file of text
 _MEMORY: Final = 128 * 2**20  # bytes that decompressing may need: twice what xz -9 asks for
+
+
+UNFINISHED: Final = re.compile(r"\..+\.(\d{1,9})", re.ASCII)
+"""Names of files and directories that are being written, ``.NAME.PID`` with the process."""
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path that is moved to `path` when the block ends without an error."""
+    """Give a temporary path that is moved to `path` when the block ends without an error.
+
+    What killed processes have left of the same file is removed.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path.parent, path.name)
         yield temporary
         temporary.replace(path)
     except OSError as error:
@@ -41,6 +54,27 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             temporary.unlink()
+
+
+@contextlib.contextmanager
+def temporary_directory(parent: Path | None = None, name: str = "oodd-eval") -> Iterator[Path]:
+    """Give an empty directory, which is removed afterwards unless it was moved.
+
+    What killed processes have left under the same name is removed, too. Without a `parent` it is
+    private, and lies where temporary files do.
+    """
+    directory = parent or Path(tempfile.gettempdir())
+    path = directory / f".{name}.{secrets.token_hex(4)}.{os.getpid()}"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(directory, name)
+        path.mkdir(0o777 if parent else 0o700)
+    except OSError as error:
+        raise OutputError(f"{str(directory)!r} cannot be written to: {error}") from error
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 class Unfailing(io.FileIO):
@@ -91,26 +125,40 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_abandoned(directory: Path, name: str = "*") -> None:
-    """Remove what has a temporary name, ``.NAME.PID`` as in `replacing`, of an ended process.
+    """Remove what has an `UNFINISHED` name of an ended process.
 
     Where others may keep files, too, `name` says which of them this program writes.
     """
-    for path in directory.glob(f".{name}.*"):
-        process = re.fullmatch(r"\..+\.(\d{1,9})", path.name)
+    for path in directory.glob(f".{name if name == '*' else glob.escape(name)}.*"):
+        process = UNFINISHED.fullmatch(path.name)
         if process and not psutil.pid_exists(int(process[1])):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True)
+            with contextlib.suppress(OSError):  # a directory, or another user's
+                path.unlink()
 
 
-def digests(directory: Path, *, without: str = "") -> dict[str, str]:
-    """Return the SHA-256 of files below a directory by relative name, but for those of a name."""
+def digests(directory: Path) -> dict[str, str]:
+    """Return the SHA-256 of files below a directory by relative name."""
     return {
         path.relative_to(directory).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(directory.rglob("*"))
-        if path.is_file() and path.name != without
+        if path.is_file()
     }
+
+
+@contextlib.contextmanager
+def only_writer(directory: Path) -> Iterator[None]:
+    """Let no other process write into a directory meanwhile; `OutputError` while one does."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{str(directory)!r} cannot be written to: {error}") from None
+    with lock(directory, wait=False) as held:
+        if not held:
+            raise OutputError(
+                f"{str(directory)!r} is being written by another process: wait for its end"
+            )
+        yield
 
 
 @contextlib.contextmanager
@@ -212,9 +260,8 @@ def find_file(path: Path) -> Path | None:
 
 def read_text(path: Path) -> str:
     """Read UTF-8 text, decompressed if the name ends in ``.xz`` or ``.gz``."""
-    if path.suffix not in PACKED:
-        return path.read_text(encoding="utf-8")
+    content = read_bytes(path, MAX_TEXT, ResultsError)
     try:
-        return decompress(path.read_bytes()).decode()
-    except ResultsError as error:
-        raise ResultsError(f"{str(path)!r} {error}") from None
+        return (decompress(content) if path.suffix in PACKED else content).decode()
+    except (UnicodeDecodeError, ResultsError) as error:
+        raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None

@@ -32,6 +32,7 @@ from oodd_eval.data.facts import (
     Quantity,
     in_order,
 )
+from oodd_eval.data.files import only_writer
 from oodd_eval.data.layout import IMPORTED, Blocks
 from oodd_eval.data.logs import reader_for, readers
 from oodd_eval.data.marks import IntervalList, read_intervals
@@ -378,13 +379,14 @@ class _Target:
     recipe: Recipe
     directory: Path
     entries: Mapping[str, Any]
+    replace: bool
 
     @classmethod
     def of(cls, recipe: Recipe, output: Path | None, *, replace: bool) -> "_Target":
         """Return it; `UsageError` when names are taken, by what is not to be replaced."""
         directory = output or data_home() / recipe.split
         if not (directory / layout.MANIFEST).exists():
-            return cls(recipe, directory, {})
+            return cls(recipe, directory, {}, replace)
         manifest = layout.read_manifest(directory)
         name, environment = recipe.split, recipe.environment
         if manifest["definition"] != _definition(name):
@@ -397,7 +399,7 @@ class _Target:
                 f"split {name!r} has an environment {environment!r} already: choose another name, "
                 "or replace it (--replace, replace=True)"
             )
-        return cls(recipe, directory, manifest["environments"])
+        return cls(recipe, directory, manifest["environments"], replace)
 
     def write(self, source: EpisodeSource, progress: Say, report: Say) -> Split:
         """Write the episodes as the environment, and the manifest."""
@@ -413,20 +415,25 @@ class _Target:
             licence=recipe.licence,
             citation=recipe.citation,
         )
-        entry = layout.write_environment(
-            self.directory / f"{environment}.h5",
-            _groups(source, progress, paired=recipe.paired),
-            IMPORTED,
-            sensors=source.sensors,
-            actions=source.actions,
-            custom=layout.own_facts(environment, discrete=source.discrete, groups=source.groups),
-            # What earlier versions could import keeps its digest.
-            logs=None if facts == LogFacts() else facts,
-        )
-        entries = {**self.entries, environment: entry}
-        ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
-        versions = {"oodd-eval": __version__, "numpy": np.__version__}
-        layout.write_manifest(self.directory, _definition(recipe.split), ordered, 0, versions)
+        with only_writer(self.directory):
+            # Another import may have added an environment meanwhile.
+            entries = self.of(recipe, self.directory, replace=self.replace).entries
+            entry = layout.write_environment(
+                self.directory / f"{environment}.h5",
+                _groups(source, progress, paired=recipe.paired),
+                IMPORTED,
+                sensors=source.sensors,
+                actions=source.actions,
+                custom=layout.own_facts(
+                    environment, discrete=source.discrete, groups=source.groups
+                ),
+                # What earlier versions could import keeps its digest.
+                logs=None if facts == LogFacts() else facts,
+            )
+            entries = {**entries, environment: entry}
+            ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
+            versions = {"oodd-eval": __version__, "numpy": np.__version__}
+            layout.write_manifest(self.directory, _definition(recipe.split), ordered, 0, versions)
         for line in source.notes:
             report(line)
         return Split(self.directory)

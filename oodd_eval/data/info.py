@@ -55,6 +55,8 @@ def describe(
     if "seed_base" in definition:
         cap = definition["episode_cap"] or "the simulator's"
         seeds = f"seed base {definition['seed_base']}"
+        if "drawn" in definition:
+            seeds = f"seeds of 128 random bits with SHA-256 {definition['drawn'][:12]}"
         how = f"episode cap {cap}; {seeds}; generator {manifest['generator']}"
     else:
         text = "{train} training, {calibration} calibration and {test} nominal test episodes; "

@@ -32,7 +32,7 @@ from oodd_eval.data.facts import (
     Quantity,
     SplitDefinition,
 )
-from oodd_eval.data.files import Unfailing, remove_abandoned, replacing, write_text
+from oodd_eval.data.files import Unfailing, replacing, write_text
 from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
 from oodd_eval.errors import SplitError
 
@@ -288,7 +288,6 @@ def write_environment(
         "actions": [dataclasses.asdict(q) for q in actions],
     }
     entries: dict[str, dict[str, Any]] = {}
-    remove_abandoned(path.parent, path.name)
     with (
         replacing(path) as partial,
         Unfailing(partial) as disk,
@@ -442,8 +441,6 @@ def read_manifest(directory: Path) -> dict[str, Any]:
             for p in problems
         )
         raise SplitError(f"{file} is not a split's manifest: {problem}") from None
-    except OSError as error:
-        raise SplitError(f"{file} cannot be read as a split's manifest: {error}") from error
     for problem in _problems(manifest["environments"]):
         raise SplitError(f"{file} has {problem}: build, fetch or import it again")
     try:

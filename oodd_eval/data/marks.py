@@ -20,6 +20,7 @@ from oodd_eval.data.bounded import read_bytes
 from oodd_eval.data.recipe import Interval, Recipe
 from oodd_eval.data.recording import Column
 from oodd_eval.errors import TrajectoryError, UnknownNameError
+from oodd_eval.names import is_plain, natural
 
 NOMINAL_LABELS: Final = ("", "0", "0.0", "false", "h")
 """Labels of nominal rows, regardless of case, unless a recipe names others; so is the number 0."""
@@ -183,10 +184,7 @@ def read_intervals(path: Path) -> list[Interval]:
     TrajectoryError
         When it cannot be read; the message names the line.
     """
-    try:
-        text = read_bytes(path, _BYTES, TrajectoryError).decode("utf-8-sig", errors="replace")
-    except OSError as error:
-        raise TrajectoryError(f"{path} cannot be read as a list of intervals: {error}") from None
+    text = read_bytes(path, _BYTES, TrajectoryError).decode("utf-8-sig", errors="replace")
     table = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     try:
         header = [cell.strip() for cell in next(table, [])]
@@ -204,7 +202,11 @@ def read_intervals(path: Path) -> list[Interval]:
         if not any(row):
             continue
         cells = dict(itertools.zip_longest(header, row[: len(header)], fillvalue=""))
-        if not cells["file"] or (start == "onset" and not cells[start].isdigit()):
+        if (
+            not cells["file"]
+            or any(row[len(header) :])
+            or (start == "onset" and natural(cells[start]) < 0)
+        ):
             raise TrajectoryError(
                 f"{path}, line {line}: {row}, expected the columns file and {start}, a row or time"
             )
@@ -221,9 +223,9 @@ def _moment(text: str) -> int | float | str | None:
     """Return a row, a time or a stamp."""
     if text in {"", "-1"}:
         return None
-    if text.isdigit():
-        return int(text)
+    if (row := natural(text)) >= 0:
+        return row
     try:
-        return float(text)
+        return float(text) if is_plain(text) else text
     except ValueError:
         return text

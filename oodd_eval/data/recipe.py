@@ -5,13 +5,12 @@ A recipe names files, columns and labels, and says how rows become episodes. Not
 
 import datetime as dt
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from oodd_eval.data.bounded import read_bytes
+from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, SPLITS, Group, Order
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import check_known
@@ -25,7 +24,6 @@ SHARES: Final = (0.4, 0.3, 0.3)
 MISSING_ROWS: Final = 20
 """Most rows in a run whose missing values are held or dropped, unless a recipe says others."""
 
-_RECIPE_BYTES: Final = 10**7
 
 Missing = Literal["refuse", "hold", "drop", "keep"]
 """Treatments of missing values; they are kept, as NaN, for scans alone."""
@@ -221,12 +219,7 @@ class Recipe:
         UsageError
             When the file cannot be read or is no recipe; the message names the key.
         """
-        try:
-            text = read_bytes(path, _RECIPE_BYTES, UsageError).decode()
-            content = tomllib.loads(text)
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-            raise UsageError(f"{path} cannot be read as a recipe in TOML: {error}") from None
-        return cls.parse(content, str(path))
+        return cls.parse(read_toml(path, UsageError), str(path))
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], source: str = "the recipe") -> "Recipe":

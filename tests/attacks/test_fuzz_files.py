@@ -27,7 +27,7 @@ from oodd_eval.leaderboard.entry import GRANTS, read_grants
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import verify
 from oodd_eval.leaderboard.verify.rerun import ORDER, read_order
-from oodd_eval.plugins.state import ARRAYS, STATE, load_state, save_state
+from oodd_eval.plugins.state import PackedState, labelled, pack, read_state, unlabelled, write_state
 
 
 def paths(value, above=()):
@@ -122,8 +122,8 @@ def test_whatever_stands_in_an_entry_is_valid_or_refused(fuzzed, results, name):
 
 
 GRANT = {"entry": "0" * 64, "trust": "re-run", "by": "us", "day": "2026-11-23", "how": "so"}
-ORDERED = {"entry": "0" * 64, "seed_base": 7, "day": "2026-11-23", "environments": ["ant"],
-           "sandbox": True, "schema": 1}  # fmt: skip
+ORDERED = {"entry": "0" * 64, "bits": "f" * 32, "day": "2026-11-23", "environments": ["ant"],
+           "schema": 2}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -144,25 +144,34 @@ def test_whatever_stands_in_files_of_maintainers_is_read_or_refused(fuzzed, name
     fuzzed(changed(whole), tried)
 
 
-def state(place):
-    arrays = {"mean": np.zeros(5), "scale": np.ones(5), "count": np.arange(3)}
-    save_state(place, kind="mine/1", settings={"size": 3}, arrays=arrays)
+ARRAYS = {"mean": np.zeros(5), "scale": np.ones(5), "count": np.arange(3)}
+KEPT = labelled("mine/1", {"size": 3}, ARRAYS)
 
 
-@pytest.mark.parametrize("name", [STATE, ARRAYS])
-def test_whatever_stands_in_a_saved_detector_is_loaded_or_refused(fuzzed, tmp_path, name):
-    state(tmp_path)
-    whole = (tmp_path / name).read_bytes()
-    contents = damaged(st.just(whole)) | st.binary(max_size=99)
-    if name == STATE:
-        contents |= changed(json.loads(whole))
+def restored(file):
+    return unlabelled(read_state(file).state(), "mine/1", {"size": 3})
+
+
+def test_whatever_stands_in_a_state_is_read_or_refused(fuzzed, tmp_path):
+    write_state(tmp_path / "fit.npz", pack(KEPT))
+    whole = (tmp_path / "fit.npz").read_bytes()
 
     def tried(content):
-        (tmp_path / name).write_bytes(content)
+        (tmp_path / "fit.npz").write_bytes(content)
         with suppress(FittedStateError):
-            load_state(tmp_path, kind="mine/1", settings={"size": 3})
+            restored(tmp_path / "fit.npz")
 
-    fuzzed(contents, tried)
+    fuzzed(damaged(st.just(whole)) | st.binary(max_size=99), tried)
+
+
+def test_whatever_the_values_of_a_state_are_they_are_read_or_refused(fuzzed, tmp_path):
+    def tried(content):
+        text = content.decode(errors="replace")
+        write_state(tmp_path / "fit.npz", PackedState(ARRAYS, text))
+        with suppress(FittedStateError):
+            restored(tmp_path / "fit.npz")
+
+    fuzzed(changed({"kind": "mine/1", "settings": {"size": 3}}), tried)
 
 
 def npz(**members):
@@ -192,27 +201,33 @@ def encrypted():
     return bytes(content)
 
 
+def values(text):
+    return npz(_json=npy((len(text),), "|u1", text))
+
+
 STATES = {
-    "deep": (STATE, b"[" * 10**6), "long": (STATE, b'"' + b"x" * 2**25 + b'"'),
-    "not-utf-8": (STATE, b"\xff\xfe"), "empty": (STATE, b""), "number": (STATE, b"1" * 10**5),
-    "no-zip": (ARRAYS, b"x"), "no-bytes": (ARRAYS, b""), "one-array": (ARRAYS, single()),
-    "bomb": (ARRAYS, npz(**{f"a{k}": npy((10**9,), "|i1", bytes(10**6)) for k in range(3)})),
-    "huge-shape": (ARRAYS, npz(a=npy((10**15,)))), "negative": (ARRAYS, npz(a=npy((-1,)))),
-    "objects": (ARRAYS, npz(a=npy((1,), "|O", b"cos\nsystem\n(S'true'\ntR."))),
-    "pickle": (ARRAYS, b"cos\nsystem\n(S'touch /tmp/x'\ntR."),
-    "header": (ARRAYS, npz(a=npy("(" * 5000))), "version": (ARRAYS, npz(a=b"\x93NUMPY\x09\x00")),
-    "encrypted": (ARRAYS, encrypted()),
-    "method": (ARRAYS, npz(a=b"x").replace(b"\x08\x00", b"\x63\x00")),
+    "deep": values(b"[" * 10**6), "long": values(b'"' + b"x" * 2**25 + b'"'),
+    "not-utf-8": values(b"\xff\xfe"), "empty": values(b""), "number": values(b"1" * 10**5),
+    "nan": values(b'{"size": NaN}'), "list": values(b"[]"), "other": values(b"{}"),
+    "no-values": npz(mean=npy((1,), content=bytes(8))),
+    "no-zip": b"x", "no-bytes": b"", "one-array": single(),
+    "bomb": npz(**{f"a{k}": npy((10**9,), "|i1", bytes(10**6)) for k in range(3)}),
+    "huge-shape": npz(a=npy((10**15,))), "negative": npz(a=npy((-1,))),
+    "objects": npz(a=npy((1,), "|O", b"cos\nsystem\n(S'true'\ntR.")),
+    "pickle": b"cos\nsystem\n(S'touch /tmp/x'\ntR.",
+    "header": npz(a=npy("(" * 5000)), "version": npz(a=b"\x93NUMPY\x09\x00"),
+    "encrypted": encrypted(),
+    "method": npz(a=b"x").replace(b"\x08\x00", b"\x63\x00"),
+    "other-order": npz(_json=npy((2,), "|u1", b"{}"), a=npy((1,), ">f8", bytes(8))),
+    "long-numbers": npz(_json=npy((2,), "|u1", b"{}"), a=npy((1,), "<f16", bytes(16))),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", STATES)
-def test_a_saved_detector_that_is_none_is_refused(tmp_path, case):
-    state(tmp_path)
-    name, content = STATES[case]
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(FittedStateError, match=r"cannot be read as a saved detector|holds "):
-        load_state(tmp_path, kind="mine/1", settings={"size": 3})
+def test_a_state_that_is_none_is_refused(tmp_path, case):
+    (tmp_path / "fit.npz").write_bytes(STATES[case])
+    with pytest.raises(FittedStateError):
+        restored(tmp_path / "fit.npz")
 
 
 @pytest.mark.parametrize(

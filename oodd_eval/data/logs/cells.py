@@ -10,6 +10,7 @@ import numpy as np
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.data.recording import MISSING, Column
 from oodd_eval.errors import TrajectoryError
+from oodd_eval.names import is_plain
 
 _TRUTHS: Final = {"true": 1.0, "false": 0.0}
 _KINDS: Final = {
@@ -46,7 +47,7 @@ def number(cell: str, decimal: str = ".") -> float:
         if word in _TRUTHS:
             return _TRUTHS[word]
         raise
-    if "_" in cell:  # which Python takes within numbers
+    if not is_plain(cell):
         raise ValueError(cell)
     return value
 
@@ -67,7 +68,7 @@ def numbers(cells: Sequence[str], decimal: str = ".") -> Column | None:
     try:
         if decimal == ".":  # the quick way for numbers alone
             column = np.array([*map(float, cells)], np.float64)
-            return None if any("_" in cell for cell in cells) else column
+            return column if all(map(is_plain, cells)) else None
     except ValueError:
         pass
     try:

@@ -11,12 +11,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.data.bounded import EPISODE, read_bytes
+from oodd_eval.data.bounded import EPISODE, read_bytes, read_json
 from oodd_eval.data.logs import Options, Reader, in_order, library, unreadable
 from oodd_eval.data.logs.cells import column_names
 from oodd_eval.data.logs.parquet import ParquetRows
 from oodd_eval.data.recording import Column, Recording, Topic
 from oodd_eval.errors import TrajectoryError
+from oodd_eval.names import natural
 
 _TIME: Final = "timestamp"
 _COUNTERS: Final = ("episode_index", "index", "task_index", "frame_index")
@@ -30,7 +31,7 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     info = next((directory / p for p in READER.directory_markers if (directory / p).exists()), None)
     if info is None:
         raise TrajectoryError(f"{directory} has no meta/info.json, expected {READER.part}")
-    facts = _json(read_bytes(info, EPISODE.most, TrajectoryError), info)
+    facts = _object(read_json(info, EPISODE.most, TrajectoryError), info)
     fps = facts.get("fps")
     if not isinstance(fps, int | float) or not 0 < fps < 1e9:
         raise TrajectoryError(f"{info}: fps is {fps!r}, expected rows a second")
@@ -47,7 +48,7 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     for path in sorted(files, key=lambda path: in_order(path.stem)):
         rows = ParquetRows(path)
         number = path.stem.removeprefix("episode_")
-        more = known.get(int(number) if number.isdigit() else -1, {})
+        more = known.get(natural(number), {})
         yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more)
 
 
@@ -137,7 +138,7 @@ def _columns(names: Sequence[str], facts: Facts, source: str) -> dict[str, str]:
     labels: dict[str, str] = {}
     for name in names:
         feature, _, item = name.rpartition(".")
-        if feature not in features or not item.isdigit() or name in features:
+        if feature not in features or natural(item) < 0 or name in features:
             feature, item = name, ""
         if feature in _COUNTERS:
             continue
@@ -172,11 +173,7 @@ def _flat(names: Any) -> list[str]:
     return [] if names is None else [str(names)]
 
 
-def _json(text: bytes, path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise unreadable(path, error) from error
+def _object(value: Any, path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise TrajectoryError(f"{path} holds {value!r:.80}, expected a JSON object")
     return value
@@ -187,7 +184,7 @@ def _lines(path: Path, key: str) -> dict[int, Facts]:
     if not path.exists():
         return {}
     lines = read_bytes(path, EPISODE.most, TrajectoryError).splitlines()
-    rows = [_json(line, path) for line in lines if line.strip()]
+    rows = [_object(json.loads(line), path) for line in lines if line.strip()]
     return {row[key]: row for row in rows if isinstance(row.get(key), int)}
 
 

@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import json
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -17,8 +16,9 @@ import h5py
 import numpy as np
 
 from oodd_eval._version import __version__
-from oodd_eval.data.bounded import EPISODE, read_bytes
+from oodd_eval.data.bounded import EPISODE, read_json
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity, title_of
+from oodd_eval.data.files import Unfailing, remove_abandoned, temporary_directory
 from oodd_eval.data.logs import Options, Reader, unreadable
 from oodd_eval.data.logs.hdf5 import read_groups
 from oodd_eval.data.parts import AnomalousSet, EnvironmentData, LabelledSet, TrajectorySet, parts_of
@@ -38,7 +38,7 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
             "data/metadata.json in it"
         )
     try:
-        facts = json.loads(read_bytes(metadata, EPISODE.most, TrajectoryError))
+        facts = read_json(metadata, EPISODE.most, TrajectoryError)
         observations, actions = (
             json.loads(facts[f"{kind}_space"]) for kind in ("observation", "action")
         )
@@ -110,6 +110,8 @@ def export(
         for e in environments
         for part in entries[e]["groups"]
     ]
+    for parent in {target.parent for target in targets}:
+        remove_abandoned(parent)
     for target in (target for target in targets if target.exists()):
         raise OutputError(f"{str(target)!r} exists: remove it, or export to another directory")
     written = []
@@ -137,12 +139,10 @@ def _write(
     """Write one dataset, all or nothing."""
     target = directory / identity
     policy = ENVIRONMENTS[data.id].policy if data.id in ENVIRONMENTS else "own"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".", dir=target.parent) as temporary:
-        partial = Path(temporary)
+    with temporary_directory(target.parent, target.name) as partial:
         file = partial / "data" / "main_data.hdf5"
         file.parent.mkdir()
-        with h5py.File(file, "w", track_order=True) as stored:
+        with Unfailing(file) as disk, h5py.File(disk, "w", track_order=True) as stored:
             ended = trajectories.terminated.tolist()
             for i, trajectory in enumerate(trajectories):
                 group = stored.create_group(f"episode_{i}")
@@ -187,7 +187,6 @@ def _write(
             # Offsets have been subtracted from observations, as float32 has no room for them.
             metadata |= {"author": [], "logs": dataclasses.asdict(data.logs)}
         file.with_name("metadata.json").write_text(json.dumps(metadata, indent=1), "utf-8")
-        partial.chmod(0o755)  # temporary directories are their maker's alone
         partial.rename(target)
 
 

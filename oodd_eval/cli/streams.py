@@ -1,0 +1,81 @@
+"""Standard streams from which nothing but text reaches a terminal, whoever has written the text.
+
+Names, summaries, messages and records are of strangers, and a terminal obeys what it is sent:
+escape sequences move its cursor and rename its window, marks of direction exchange letters.
+"""
+
+import contextlib
+import sys
+import unicodedata
+from collections.abc import Iterator
+from typing import IO, Any, Final
+
+_KEPT: Final = {"\n", "\t"}
+_OBEYED: Final = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # categories of characters that are not drawn
+
+
+class _Table(dict[int, int]):
+    """A table of `str.translate`, which learns a character when it comes."""
+
+    def __missing__(self, point: int) -> int:
+        is_text = chr(point) in _KEPT or unicodedata.category(chr(point)) not in _OBEYED
+        return self.setdefault(point, point if is_text else 0xFFFD)
+
+
+_TABLE: Final = _Table()
+
+
+def plain_text(text: str) -> str:
+    r"""Return a text with a replacement character for each one that steers a terminal.
+
+    >>> plain_text("a\x1b[2Jb\n")
+    'a�[2Jb\n'
+    """
+    return text if text.isascii() and text.isprintable() else text.translate(_TABLE)
+
+
+class PlainStream:
+    """A stream of text that writes `plain_text` to another one, `raw`, and is like it otherwise.
+
+    Parameters
+    ----------
+    raw
+        The other stream.
+    """
+
+    def __init__(self, raw: IO[str]) -> None:
+        self.raw = raw
+
+    def write(self, text: str) -> int:
+        """Write a text; what the encoding of the stream lacks becomes a question mark."""
+        encoding = getattr(self.raw, "encoding", None) or "utf-8"
+        self.raw.write(plain_text(text).encode(encoding, "replace").decode(encoding))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        """Write several texts."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.raw, name)
+
+
+@contextlib.contextmanager
+def plain_streams() -> Iterator[None]:
+    """Have standard output and standard error be a `PlainStream` each."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (_plain(stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def _plain(stream: Any) -> Any:
+    return stream if stream is None or isinstance(stream, PlainStream) else PlainStream(stream)
+
+
+def raw(stream: Any) -> Any:
+    """Return the stream behind a `PlainStream`: for who writes styles of its own to a terminal."""
+    return stream.raw if isinstance(stream, PlainStream) else stream
