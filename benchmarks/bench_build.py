@@ -32,7 +32,8 @@ SHARE = 0.75
 
 def recorded(environment, part, seed, work):
     """Record one seed as a build does; return steps, CPU seconds and the nominal actions."""
-    chunk = Chunk(environment, part, seed, 1, None, "", load_policy(environment).digest)
+    policy = load_policy(environment).digest
+    chunk = Chunk(environment, part, seed, 1, None, 0.0, (), None, policy, "")
     start = time.process_time()
     record_chunk(chunk, work)
     seconds = time.process_time() - start

@@ -1,9 +1,9 @@
-"""What the checks of a run cost: of the split, of messages, scores, kept files, and of limits.
+"""Cost of the checks of a run: of the split, of messages, scores, kept files, and of limits.
 
 ``python benchmarks/bench_checks.py [DETECTOR ...]`` (default rf, npn and riqn): runs them on hopper
 of split mini, each in a worker process as ``oodd-eval run`` does, and adds up the seconds in which
-the harness checks what it reads and receives. Groups apart, and prefixes that are scored again, are
-what ``bench_isolation.py`` times. Exit code 1 when a check costs more than 5 % of the run.
+the harness checks what it reads and receives. What groups apart cost ``bench_isolation.py``
+times. Exit code 1 when a check costs more than 5 % of the run.
 """
 
 import sys
@@ -14,7 +14,7 @@ from functools import wraps
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data import bounded, layout, stored
-from oodd_eval.plugins import contract, discovery, explanations
+from oodd_eval.plugins import contract, explanations, specs
 from oodd_eval.plugins.isolation import child, supervisor
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring import plan
@@ -24,12 +24,12 @@ CHECKS = {
     layout: ["content_digest", "check_layout", "check_names"],
     stored: ["check_plain"],
     bounded: ["read_npz"],
-    discovery: ["check_detector_spec"],
+    specs: ["check_detector_spec"],
     plan: ["source_digest"],
-    supervisor: ["_typed", "_number"],
-    contract: ["check_scores", "check_prefix"],
+    supervisor: ["_value", "_number"],
+    contract: ["check_scores"],
     explanations: ["checked_explanation", "check_named"],
-    child.Child: ["_check"],
+    child.Child: ["check", "_judge"],
     ResultsDirectory: ["_opened"],
 }
 seconds = Counter()

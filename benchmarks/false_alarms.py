@@ -54,7 +54,7 @@ def fitted(offer, split, data, stores):
     unit = make_unit(offer, {}, data.id, (), 1, 0, split.digest, None)
     kept = next(filter(None, (store.find(unit.fit_key) for store in stores)), None)
     if kept:
-        detector.load(kept.path)
+        detector.restore(kept.packed.state())
         return detector
     detector.fit(shown(offer.spec, data.train))
     return detector

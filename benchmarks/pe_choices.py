@@ -1,4 +1,4 @@
-"""What each choice of the ensemble's statistic gives: charts learnt anew on the same networks.
+"""Results of each choice of the ensemble's statistic: charts learnt anew on the same networks.
 
 ``python benchmarks/pe_choices.py SPLIT [--env NAMES] [--fits DIR]``, half an hour for the split of
 120 training episodes that the choices were made on (see detectors/pe/README.md).
@@ -24,6 +24,7 @@ from tabulate import tabulate
 from oodd_eval import DetectorSpec, evaluate, load_split
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.names import select
+from oodd_eval.plugins.state import pack, read_state, write_state
 
 METRICS = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
 VARIANTS = {
@@ -39,16 +40,15 @@ VARIANTS = {
 
 
 def fitted(environment, split, fits):
-    """Return `pe-a` fitted, loaded where there is a fit and kept where fits are."""
+    """Return `pe-a` fitted, restored where there is a fit and kept where fits are."""
     detector = make_pe("pe-a", seed=0)
-    place = fits and fits / environment
+    place = fits and fits / f"{environment}.npz"
     if place and place.exists():
-        detector.load(place)
+        detector.restore(read_state(place).state())
         return detector
     detector.fit(list(load_split(split).environment(environment).train))
     if place:
-        place.mkdir(parents=True)
-        detector.save(place)
+        write_state(place, pack(detector.state()))
     return detector
 
 

@@ -29,6 +29,7 @@ from oodd_eval import load_split
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.metrics.auc import auc_same_times
 from oodd_eval.names import select
+from oodd_eval.plugins.state import pack, read_state, write_state
 
 SCORES = ("E|o - X|", "CRPS", "median")
 DETECTORS = {"riqn": (riqn, 8), "npn": (npn, 1)}
@@ -36,16 +37,15 @@ DETECTORS = {"riqn": (riqn, 8), "npn": (npn, 1)}
 
 
 def fitted(name, data, environment, fits):
-    """Return a fitted detector, loaded where there is a fit and kept where fits are."""
+    """Return a fitted detector, restored where there is a fit and kept where fits are."""
     detector = DETECTORS[name][0](seed=0, horizon=1)
-    place = fits / name / environment if fits else None
+    place = fits / name / f"{environment}.npz" if fits else None
     if place and place.exists():
-        detector.load(place)
+        detector.restore(read_state(place).state())
         return detector
     detector.fit(list(data.train))
     if place:
-        place.mkdir(parents=True)
-        detector.save(place)
+        write_state(place, pack(detector.state()))
     return detector
 
 

@@ -1,4 +1,4 @@
-"""How far training goes: matched AUC and held-out loss against the number of updates.
+"""Progress of training: matched AUC and held-out loss against the number of updates.
 
 ``python benchmarks/riqn_updates.py [--split mini] [--env all] [--updates 250,800,2500]``, one
 core. One fit per environment and number of updates, detector seed 0, Δ = 1. The loss is that on the
@@ -8,9 +8,7 @@ score (riqn) and for the median forecast in nominal distances (riqn-r) of the sa
 """
 
 import argparse
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -40,9 +38,7 @@ def measured(data, updates):
     detector = riqn(seed=0, horizon=1, updates=updates).fit(list(data.train))
     seconds = time.process_time() - start
     other = riqn_r(seed=0, horizon=1, updates=updates)
-    with tempfile.TemporaryDirectory() as place:
-        detector.save(Path(place))
-        other.load(Path(place))
+    other.restore(detector.state())
     loss = np.mean(detector.history_[-1])
     return loss, auc_of(detector, data), auc_of(other, data), seconds
 

@@ -15,8 +15,9 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import PromiseWarning, UsageError
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import Detector, DetectorSpec
-from oodd_eval.plugins.discovery import Offer, Plugins, check_detector_spec, discover
+from oodd_eval.plugins.discovery import Offer, Plugins, discover
 from oodd_eval.plugins.parameters import declared_by
+from oodd_eval.plugins.specs import check_detector_spec
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.record import Record

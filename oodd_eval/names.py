@@ -61,13 +61,26 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     return list(chosen)
 
 
+def natural(text: str) -> int:
+    """Return the whole number from 0 on that at most 18 digits stand for; -1 for another text.
+
+    `int` also takes digits of other scripts, signs and underscores, and thousands of digits.
+
+    >>> natural(" 12"), natural("1_000"), natural("-3"), natural("٣")
+    (12, -1, -1, -1)
+    """
+    return int(text) if re.fullmatch(r"\s*[0-9]{1,18}\s*", text) else -1
+
+
+def is_plain(number: str) -> bool:
+    """Tell a number from what `float` takes for one, too: 1_000, and digits of other scripts."""
+    return "_" not in number and (number.isascii() or number.strip().isascii())
+
+
 def whole_numbers(text: str, *, least: int) -> list[int]:
     """Return the numbers of a comma list, each once; `UsageError` when one is below `least`."""
-    try:
-        numbers = list(dict.fromkeys(map(int, text.split(","))))
-    except ValueError:
-        numbers = []
-    if numbers and min(numbers) >= least:
+    numbers = list(dict.fromkeys(map(natural, text.split(","))))
+    if min(numbers) >= least:
         return numbers
     raise UsageError(f"{text!r}, expected whole numbers of at least {least}, separated by commas")
 
@@ -83,7 +96,7 @@ def memory_bytes(text: str) -> int:
 
 
 def _quantity(text: str, units: dict[str, int], expected: str) -> float:
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
+    match = re.fullmatch(r"\s*([0-9]{1,18}(?:\.[0-9]+)?)\s*([A-Za-z]*)\s*", text)
     if not match or match[2].lower() not in units or float(match[1]) == 0:
         raise UsageError(f"{text!r}, expected {expected}")
     return float(match[1]) * units[match[2].lower()]
@@ -104,6 +117,8 @@ def parameter(text: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except json.JSONDecodeError:
         return name, value
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{name}={value[:40]}...: the value cannot be read: {error}") from None
 
 
 def expression(text: str | None) -> Predicate:

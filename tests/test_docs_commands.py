@@ -121,7 +121,7 @@ KNOWN = {
                 nominal = [rng.normal(size=(60, 2)) for _ in range(40)]
                 names = ["speed", "torque"]
                 watchdog = Watchdog.fit("mewma", nominal[:20], nominal[20:], 0.1, sensors=names)
-                watchdog.save("arm-watchdog")
+                watchdog.save("arm.npz")
             """,
         },
         "before": ["python -m make"],

@@ -1,9 +1,11 @@
 """Records are written from time to time, in the plan's order; leftovers of killed runs go away."""
 
+import json
 import os
 import subprocess
+from dataclasses import replace
 
-from oodd_eval.results.directory import RecordWriter, ResultsDirectory
+from oodd_eval.results.directory import RECORDS, RecordWriter, ResultsDirectory
 from oodd_eval.results.record import Record
 
 
@@ -75,3 +77,12 @@ def test_leftovers_of_killed_processes_go_away_and_those_of_living_ones_stay(tmp
     assert living.exists()
     assert all(file.exists() for file in foreign)
     assert [fit.exists() for fit in fits] == [False, True]
+
+
+def test_a_line_of_records_ends_at_a_new_line_alone(tmp_path):
+    """JSON may hold other ends of lines, such as U+2028, as they are."""
+    strange = replace(record("mine"), status="error", reason="a\u2028b\x85c")
+    line = json.dumps(json.loads(strange.to_json()), ensure_ascii=False)
+    (tmp_path / RECORDS).write_text(line + "\n")
+    (read,) = ResultsDirectory(tmp_path).records()
+    assert read.reason == strange.reason

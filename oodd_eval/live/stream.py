@@ -105,7 +105,8 @@ class StreamLimits:
 
     def arrays(self) -> Arrays:
         """Return what `of` reads, which is finite."""
-        return {f.name: np.nan_to_num(np.asarray(getattr(self, f.name))) for f in fields(self)}
+        finite = {f.name: np.nan_to_num(getattr(self, f.name)) for f in fields(self)}
+        return {name: np.asarray(value) for name, value in finite.items()}
 
     @classmethod
     def of(cls, arrays: Arrays) -> "StreamLimits":

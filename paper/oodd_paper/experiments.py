@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
+from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, paper_tables
 from oodd_eval.errors import OoddError, ResultsError
 from oodd_eval.names import check_known
@@ -129,10 +130,7 @@ def scope(name: str) -> Scope:
 
 def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...]:
     """Make an object of every table ``[[kind]]`` of a TOML file; ResultsError names a wrong one."""
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8")).get(kind, [])
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"{str(file)!r} cannot be read: {error}") from None
+    tables = read_toml(file, ResultsError).get(kind, [])
     objects: dict[str, _T] = {}
     for number, table in enumerate(tables, start=1):
         name = str(table.get("id") or table.get("name") or number)

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from pydantic import TypeAdapter
 
+from oodd_eval.data.bounded import MANIFEST_BYTES, read_json
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import TABLE1
 from oodd_eval.data.files import forms, write_bytes
@@ -55,15 +56,15 @@ class Reproduction:
     def load(cls, directory: Path) -> "Reproduction":
         """Read the header of a directory, fields of other versions left out."""
         path = directory / HEADER
+        if not path.exists():
+            what = f"expected a file {HEADER}, written by oodd-eval reproduce"
+            raise ResultsError(f"no reproduction in {str(directory)!r}: {what}")
         try:
-            plain = json.loads(path.read_text(encoding="utf-8"))
+            plain = read_json(path, MANIFEST_BYTES, ResultsError)
             if plain.get("schema") != SCHEMA:
                 raise ValueError("it was written by another version of oodd-eval")  # noqa: TRY301
             return TypeAdapter(cls).validate_python(plain)
-        except FileNotFoundError:
-            what = f"expected a file {HEADER}, written by oodd-eval reproduce"
-            raise ResultsError(f"no reproduction in {str(directory)!r}: {what}") from None
-        except (OSError, ValueError, AttributeError) as error:
+        except (ValueError, AttributeError) as error:
             raise ResultsError(f"{str(path)!r} cannot be read: {error}") from None
 
     def check_same_data(self, directory: Path) -> None:
@@ -145,13 +146,13 @@ def dump_returns(returns: Returns, digest: str) -> str:
 def load_returns(directory: Path, digest: str) -> Returns | None:
     """Read ``returns.json``; None where it is absent or of other data."""
     path = directory / RETURNS
+    if not path.exists():
+        return None
     try:
-        whole = json.loads(path.read_text(encoding="utf-8"))
+        whole = read_json(path, MANIFEST_BYTES, ResultsError)
         returns: Returns = whole["returns"]
         return returns if whole["split_digest"] == digest else None
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         todo = "delete it, and it will be made again"
         raise ResultsError(f"{str(path)!r} cannot be read: {error!r}; {todo}") from None
 
