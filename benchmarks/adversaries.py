@@ -26,7 +26,8 @@ import numpy as np
 import pytest
 
 TESTS = Path(__file__).parents[1] / "tests"
-sys.path[0] = str(TESTS)  # in place of this directory, which has names of libraries
+HERE = str(Path(__file__).parent)
+sys.path[:] = [str(TESTS), *(path for path in sys.path if path != HERE)]  # it has libraries' names
 
 import adversaries  # noqa: E402
 from helpers_plugins import install_adversaries  # noqa: E402
