@@ -143,7 +143,7 @@ def test_a_check_that_ended_the_process_is_done_anew(small, home, monkeypatch):
         patch.setattr(fetching.shutil, "rmtree", lambda *_, **__: None)
         with pytest.raises(ZeroDivisionError):
             fetch(str(small))
-    assert list(home.rglob("doubtful*/*.h5"))
+    assert list(home.rglob(".doubtful.*/*.h5"))
     assert fetch(str(small)).split.path == home / "tiny"
 
 
