@@ -293,7 +293,7 @@ class EnvironmentData:
 
     @property
     def paired(self) -> bool:
-        """Whether each anomalous episode has a nominal twin."""
+        """True where each anomalous episode has a nominal twin."""
         return self.logs is None or self.logs.paired
 
     def test_set(self, condition: str | Condition) -> TrajectorySet:

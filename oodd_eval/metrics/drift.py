@@ -1,4 +1,4 @@
-"""Whether nominal episodes are alike in any order, by permutation; pure arrays, no detector.
+"""A permutation test of drift: nominal episodes against their recorded order, without a detector.
 
 A promise on false alarms holds for episodes that are exchangeable with those of the calibration.
 Machines drift, and then it breaks.
@@ -45,7 +45,7 @@ class PermutationTest:
 
     @property
     def significant(self) -> bool:
-        """Whether this would be remarkable in exchangeable episodes."""
+        """True where exchangeable episodes would rarely give this."""
         return self.p <= SIGNIFICANT
 
 

@@ -1,4 +1,4 @@
-"""Which of many episodes are odd, judged by their largest statistics alone.
+"""Odd ones among many episodes, found by their largest statistics alone.
 
 A rank among n others is never below 1 / (n + 1), so that a rank alone rejects nothing where all
 episodes are tested against one another: the k-th smallest of n such p-values is k / n. Beyond the

@@ -1,4 +1,4 @@
-"""What speaks for and against a promise on false alarms, before anything has alarmed.
+"""Reasons to trust a promise on false alarms, or to doubt it, before anything has alarmed.
 
 The promise holds for episodes that are exchangeable with those of the calibration: for as many as
 the level takes, of a machine that does not drift, as long as those that are judged.
@@ -36,7 +36,7 @@ _REMEDY: Final = (
 
 @dataclass(frozen=True, slots=True)
 class PromiseFinding:
-    """What was found out about a promise.
+    """One reason to trust or to doubt a promise.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What speaks for and against promises on a split, before a run and by the scores of one."""
+"""Reasons to trust or doubt promises on a split, before a run and by the scores of one."""
 
 from collections.abc import Iterator, Sequence
 from itertools import islice

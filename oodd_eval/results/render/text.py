@@ -209,7 +209,7 @@ _NARROW: Final = 9
 """Width of a column that headings are wrapped to where its figures are narrower."""
 
 _PARTS: Final = re.compile(r"(\s+|[^-\[,:.=\s]*[-\[,:.=]+)")
-"""Where lines may end: between words, and in names behind what separates their parts."""
+"""Ends of lines are between words, and in names behind what separates their parts."""
 
 
 def _width(table: Table) -> int:
