@@ -224,14 +224,12 @@ def test_a_metric_is_judged_by_the_range_that_its_table_has(submissions, tmp_pat
         assert draft.verdict().ok == sound
 
 
-def test_a_row_without_some_cells_is_noted(submissions, tmp_path):
-    """It is listed, and not ranked."""
+def test_an_environment_counts_with_all_its_anomalies(submissions, tmp_path):
     draft = Draft(submissions.plain, tmp_path)
-    del draft.records[2]
+    left_out = draft.records.pop(2)
     verdict = draft.verdict(submissions.split)
-    assert verdict.ok
-    notes = " ".join(verdict.findings.notes)
-    assert "persistence[h=1,seed=0] is partial: it lacks 1 of 8 cells" in notes
+    problems = [problem.text for problem in verdict.findings.problems]
+    assert any(f"cartpole lacks {left_out['anomaly']}" in text for text in problems), problems
 
 
 @pytest.mark.parametrize("side", [0, 1])

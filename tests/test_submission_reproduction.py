@@ -72,7 +72,7 @@ def test_without_being_asked_nothing_is_left_out_and_what_is_partial_is_said(
 ):
     assert submit(many, tmp_path) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "random[h=1,seed=2] is partial: 1 of 7 environments" in out
+    assert "random[h=1,seed=2] is partial: 1 of 2 environments (without hopper)" in out
     (entry,) = read_entries(tmp_path)
     assert labels(entry) == ALL | {"random[h=1,seed=2]"}
 

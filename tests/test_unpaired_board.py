@@ -299,12 +299,12 @@ def test_a_tampered_record_is_refused(small, split, tmp_path, path, value, probl
     assert any(problem in text.text for text in verdict.findings.problems)
 
 
-def test_a_row_without_a_cell_of_the_split_is_noted(small, split, tmp_path):
+def test_an_environment_counts_with_all_its_anomalies(small, split, tmp_path):
     draft = Draft(small, tmp_path)
     left_out = next(r for r in draft.records if r["anomaly"] == "leak")
     draft.records.remove(left_out)
     verdict = draft.verdict(split.path)
-    assert any("lacks 1 of" in note and "press/leak" in note for note in verdict.findings.notes)
+    assert any("press lacks leak" in p.text for p in verdict.findings.problems)
 
 
 def test_scores_of_other_parts_are_refused(small, split, tmp_path):
@@ -444,7 +444,7 @@ def test_the_board_of_logs_has_its_columns_filters_and_figures(window, board):
     identity, rows = board
     go(window, f"#/?board={identity}")
     titles = [text.splitlines()[0].strip("↕▼▲ ") for text in window.texts("#ranking thead th")]
-    assert titles[2:] == ["Pooled AUC", "Pooled AUC null", "AUC of rows", "Wins"]
+    assert titles[2:] == ["Pooled AUC", "Pooled AUC null", "AUC of rows", "Wins", "Lead"]
     assert window.text("#ranking thead [aria-sort='descending'] button").startswith("Pooled AUC")
     window.choose("environment", "press")
     assert window.text("#ranking caption").startswith("Separability: press")

@@ -127,7 +127,8 @@ def check_together(
 ) -> None:
     """Check that records are of the entry's split, each cell once, and of few rows.
 
-    Rows that lack some of the `cells` that their split has are noted: boards do not rank them.
+    `cells` are those that the split has; without them, those that any row of the entry has. A row
+    has all of an environment's cells, or none: then it is noted, as boards do not rank it.
     """
     seen: dict[Any, str] = {}
     positions: dict[str, set[Position]] = defaultdict(set)
@@ -140,11 +141,19 @@ def check_together(
         positions[record.cell.label].add(record.position)
     if (rows := len({record.setting for record in records.values()})) > MOST_ROWS:
         findings.refuse(RECORDS, "rows", f"are {rows}, expected at most {MOST_ROWS} of one entry")
+    known = set(cells) or set().union(*positions.values())
+    environments = {environment for environment, _ in known}
     for label, present in positions.items():
-        if missing := sorted(set(cells) - present):
+        evaluated = {environment for environment, _ in present}
+        for environment in sorted(evaluated):
+            if lacking := sorted(c for e, c in known - present if e == environment):
+                why = "an environment counts with all; run them, or leave out what is not complete"
+                message = f"{environment} lacks {', '.join(lacking)}: {why}"
+                findings.refuse(f"records of {label}", "anomaly", message)
+        if absent := sorted(environments - evaluated):
             findings.notes.append(
-                f"{label} is partial: it lacks {len(missing)} of {len(cells)} cells, such as "
-                f"{'/'.join(missing[0])}, so it is listed, but not ranked"
+                f"{label} is partial: {len(evaluated)} of {len(environments)} environments "
+                f"(without {', '.join(absent)}), so it is listed, but not ranked"
             )
 
 
