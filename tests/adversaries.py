@@ -1075,11 +1075,14 @@ class CountingState(Insider):
 
 
 class Forgetful(Honest):
-    """`restore` ignores the state, and makes one up."""
+    """`restore` ignores the state, and makes one up, of which it knows nothing.
+
+    With scales of its own it would be another honest detector, perhaps a better one.
+    """
 
     def restore(self, state):
         width = len(state["mean"])
-        super().restore({**state, "mean": np.zeros(width), "std": np.full(width, 1e-3)})
+        super().restore({**state, "mean": np.zeros(width), "std": np.full(width, np.inf)})
 
 
 # The worker itself: its sockets, its code, its end.
