@@ -155,7 +155,7 @@ def gains(board, name):
     for metric in METRICS:
         for environment in (None, *board.environments):
             mine = values(board, name, metric, environment)
-            base = values(board, adversaries.BASE, metric, environment)
+            base = values(board, adversaries.base_of(name), metric, environment)
             if not mine.state and mine.value > base.high and mine.low > base.value:
                 where = environment or "all"
                 places.append(f"{metric} {where}: {mine.value:.3f}, honest {base.value:.3f}")
@@ -216,15 +216,15 @@ def main():
                 gained += sum(told(*boards, name, options.verbose) for name in batch)
         finally:
             adversaries.sweep()
-        names = {name for batch in batches(options.names) for name in batch} - {adversaries.BASE}
+        names = {name for batch in batches(options.names) for name in batch} - {*adversaries.HONEST}
     print(f"{len(names)} adversaries in {time.monotonic() - start:.0f} s: {gained} gains")
     return int(gained > 0)
 
 
 def batches(names):
-    """Return the honest detector, and then those named, or all by kind."""
+    """Return the honest detectors, and then those named, or all by kind."""
     kinds = [[f"sly-{name}" for name in kind] for kind in adversaries.KINDS.values()]
-    return [[adversaries.BASE], *([names] if names else kinds)]
+    return [[*adversaries.HONEST], *([names] if names else kinds)]
 
 
 def told(plain, again, name, verbose):

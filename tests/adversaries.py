@@ -1074,15 +1074,20 @@ class CountingState(Insider):
         return self.asked_
 
 
-class Forgetful(Honest):
-    """`restore` ignores the state, and makes one up, of which it knows nothing.
+class Unscaled(Honest):
+    """Mean absolute change of the sensors as they are: the honest detector that `Forgetful` is."""
 
-    With scales of its own it would be another honest detector, perhaps a better one.
-    """
+    def prepare(self, nominal):
+        width = len(self.mean_)
+        self.mean_, self.std_ = np.zeros(width), np.full(width, 1e-3)
+
+
+class Forgetful(Honest):
+    """`restore` ignores the state, and makes one up."""
 
     def restore(self, state):
         width = len(state["mean"])
-        super().restore({**state, "mean": np.zeros(width), "std": np.full(width, np.inf)})
+        super().restore({**state, "mean": np.zeros(width), "std": np.full(width, 1e-3)})
 
 
 # The worker itself: its sockets, its code, its end.
@@ -1520,6 +1525,14 @@ KINDS = {
 """All adversaries by kind and name."""
 
 BASE = "sly-honest"
+HONEST = {BASE: Honest, "sly-unscaled": Unscaled}
+
+
+def base_of(name):
+    """Return the honest detector whose scores an adversary would have if it gained nothing."""
+    return "sly-unscaled" if name == "sly-forgetful" else BASE
+
+
 ADVERSARIES = {f"sly-{name}": made for kind in KINDS.values() for name, made in kind.items()}
 
 
@@ -1539,5 +1552,5 @@ def oodd_detectors():
     PatchesHarness.patch()
     return [
         DetectorSpec(name, made, made.__doc__.splitlines()[0], deterministic=True)
-        for name, made in {BASE: Honest, **ADVERSARIES}.items()
+        for name, made in {**HONEST, **ADVERSARIES}.items()
     ]
