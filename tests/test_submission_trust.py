@@ -14,7 +14,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import GRANTS, read_entry
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import grant, verify_entry
-from oodd_eval.leaderboard.verify.rerun import RerunOrder, compare_rerun
+from oodd_eval.leaderboard.verify.rerun import RerunDifference, RerunOrder, compare_rerun
 from oodd_eval.results.record import Record
 
 THREE = ("cartpole", "acrobot", "hopper")
@@ -24,7 +24,7 @@ THREE = ("cartpole", "acrobot", "hopper")
 def entry(tmp_path_factory):
     """An entry of one row on three environments."""
     home = tmp_path_factory.mktemp("entry")
-    split = make_split(home / "split", THREE, calibration=20, name="three")
+    split = make_split(home / "split", THREE, calibration=20, test=10, name="three")
     evaluate("persistence", split, output=home / "out")
     return submit(home / "out", home / "results", Statement(submitter="A. Tester")).path
 
@@ -33,7 +33,7 @@ def entry(tmp_path_factory):
 def fresh(tmp_path_factory):
     """Records of a run on a split of fresh seeds with the same sizes."""
     home = tmp_path_factory.mktemp("fresh")
-    split = make_split(home / "split", THREE, calibration=20, name="fresh", seed_base=77)
+    split = make_split(home / "split", THREE, calibration=20, test=10, name="fresh", seed_base=77)
     return list(evaluate("persistence", split, output=home / "out"))
 
 
@@ -197,6 +197,18 @@ def test_every_compared_metric_can_fail(entry, tmp_path, fresh, metric, change):
     draft = of_three(entry, tmp_path)
     records = changed(fresh, **{metric: change})
     assert_refused(compared(draft, records), f"persistence {metric} mean", "better by")
+
+
+@pytest.mark.parametrize(
+    ("freedom", "ratio", "z"),
+    # Ratios as rare as z, from tables of the t distribution (P = .01, .001) and of the normal one.
+    [(2, 6.965, 2.326), (6, -3.143, -2.326), (18, 3.610, 3.090), (60, 3.232, 3.090)],
+)
+def test_a_ratio_of_few_episodes_counts_by_its_t_distribution(freedom, ratio, z):
+    higher = RerunDifference("auc", "hopper", 0.5 + ratio / 100, 0.5, 0.01, freedom)
+    assert higher.z == pytest.approx(z, rel=0.03)
+    lower = RerunDifference("missed", "hopper", 0.5 + ratio / 100, 0.5, 0.01, freedom)
+    assert lower.z == pytest.approx(-z, rel=0.03)
 
 
 OTHERWISE = {

@@ -93,8 +93,8 @@ def read_order(directory: Path) -> RerunOrder | None:
 class RerunDifference(NamedTuple):
     """A metric of an entry and of its re-run in an environment, or with "" on the mean over them.
 
-    `error` is the standard error of the difference, and `z` by how many of them the entry is
-    better.
+    `error` is the standard error of the difference, and `freedom` its degrees of freedom: two less
+    than the test episodes of both sides.
     """
 
     metric: str
@@ -102,12 +102,21 @@ class RerunDifference(NamedTuple):
     entry: float
     rerun: float
     error: float
+    freedom: int
 
     @property
     def z(self) -> float:
-        """By how many standard errors the entry is better; negative where it is worse."""
+        """By how many standard errors the entry is better; negative where it is worse.
+
+        Few episodes do not tell an error well. Their ratio has a t distribution, and `z` is about
+        the quantile of the normal one that is as rare (Wallace, "Bounds on normal approximations to
+        Student's and the chi-square distributions", 1959).
+        """
         sign = -1 if metric_info(self.metric).better == "lower" else 1
-        return sign * (self.entry - self.rerun) / self.error
+        ratio = sign * (self.entry - self.rerun) / self.error
+        n = self.freedom
+        rare = (8 * n + 1) / (8 * n + 3) * math.sqrt(n * math.log1p(ratio * ratio / n))
+        return math.copysign(rare, ratio)
 
     @property
     def refused(self) -> bool:
@@ -225,7 +234,8 @@ def differences(
             entry = math.fsum(p.entry for p in parts) / len(parts)
             rerun = math.fsum(p.rerun for p in parts) / len(parts)
             error = math.hypot(*(p.error for p in parts)) / len(parts)
-            compared += [*parts, RerunDifference(metric, "", entry, rerun, error)]
+            freedom = sum(p.freedom for p in parts)
+            compared += [*parts, RerunDifference(metric, "", entry, rerun, error, freedom)]
     return compared
 
 
@@ -246,7 +256,14 @@ def _difference(
     )
     claimed = min(max(_standard_error(ours, metric), chance), MOST_CLAIMED * chance)
     entry, rerun = (mean_over_cells((r.seed, r.value(metric)) for r in s) for s in (ours, theirs))
-    yield RerunDifference(metric, environment, entry, rerun, math.hypot(claimed, chance))
+    error = math.hypot(claimed, chance)
+    freedom = max(1, sum(_episodes(side, metric) - 1 for side in (ours, theirs)))
+    yield RerunDifference(metric, environment, entry, rerun, error, freedom)
+
+
+def _episodes(records: Sequence[Record], metric: str) -> int:
+    """Return of how many test episodes a metric is."""
+    return max(len(record.per_trajectory[metric][0]) for record in records)
 
 
 def _one_episode(records: Sequence[Record], metric: str) -> float:
@@ -270,6 +287,6 @@ def _standard_error(records: Sequence[Record], metric: str) -> float:
         drawn_cell(r.environment, r.seed, contribution(r, metric), str(r.condition))
         for r in records
     ]
-    n = max(len(record.per_trajectory[metric][0]) for record in records)
+    n = _episodes(records, metric)
     of_test = float(np.nanstd(sample_cells(cells))) * math.sqrt(n / max(n - 1, 1))
     return math.hypot(of_test, float(calibration_samples(cells).std()))
