@@ -1,7 +1,9 @@
 """Re-runs: seeds drawn once for one version of an entry, what is run, and the whole command."""
 
 import dataclasses
+import itertools
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from helpers_submission import Draft
@@ -110,7 +112,7 @@ def test_what_is_not_installed_is_not_run(verdict):
 def submitted(tmp_path_factory):
     """An entry of two rows on a split that takes seconds to build, and the split's definition."""
     home = tmp_path_factory.mktemp("submitted")
-    sizes = {"train": 3, "calibration": 20, "test": 4, "episode_cap": 80}
+    sizes = {"train": 3, "calibration": 20, "test": 10, "episode_cap": 80}
     small = dataclasses.replace(SPLITS["mini"], name="small", seed_base=950, **sizes)
     split = build_split(small, home / "split", environments=["cartpole"])
     for detector in ("persistence", "random"):
@@ -124,8 +126,11 @@ def path(submitted, tmp_path, monkeypatch):
     require_sandbox()
     source, small = submitted
     monkeypatch.setattr(recording, "SPLITS", {**SPLITS, read_entry(source).meta.split: small})
-    # The same bits in every run of the tests: one honest row in a hundred is refused by chance.
-    monkeypatch.setattr(recording.secrets, "token_hex", lambda length: "5a" * length)
+    # The first draw is the same in every run of the tests, as one honest row in a hundred is
+    # refused by chance. Each further draw is another.
+    draws = (f"{n:032x}" for n in itertools.count(1))
+    stand_in = SimpleNamespace(token_hex=lambda _: next(draws))
+    monkeypatch.setattr(recording, "secrets", stand_in)
     monkeypatch.chdir(tmp_path)
     return shutil.copytree(source, tmp_path / "results" / source.name)
 
