@@ -6,7 +6,7 @@ stepped through the bare simulator as its authors made it: one simulator, no pol
 its reset not counted.
 Both are CPU time of this process and interleaved, so that a busy machine slows both alike.
 
-Run it with ``python benchmarks/bench_build.py [--rounds N] [ENV ...]``.
+Run it with ``python benchmarks/bench_build.py [--rounds N] [ENV ...]``; ENV may also be a world.
 """
 
 from __future__ import annotations
@@ -20,10 +20,15 @@ from pathlib import Path
 
 import numpy as np
 from oodd_recording.build import Chunk, record_chunk
-from oodd_recording.environments import make, quiet_streams
+from oodd_recording.environments import make
+from oodd_recording.info import info_of
 from oodd_recording.policies import load_policy
+from oodd_recording.simulator import quiet_streams
+from oodd_worlds import oodd_anomalies, oodd_environments
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.condition import conditions_of
+from oodd_eval.data.facts import ENVIRONMENTS, WORLDS
+from oodd_eval.data.registry import register
 
 FIRST_SEED = 990 * 10**6
 SHARE = 0.75
@@ -33,7 +38,9 @@ SHARE = 0.75
 def recorded(environment, part, seed, work):
     """Record one seed as a build does; return steps, CPU seconds and the nominal actions."""
     policy = load_policy(environment).digest
-    chunk = Chunk(environment, part, seed, 1, None, 0.0, (), None, policy, "")
+    suite = "ladder" if environment in WORLDS else "table1"
+    conditions = tuple(conditions_of(suite, environment).items()) if part == "test" else ()
+    chunk = Chunk(environment, part, seed, 1, None, 0.0, conditions, None, policy, "")
     start = time.process_time()
     record_chunk(chunk, work)
     seconds = time.process_time() - start
@@ -50,7 +57,7 @@ def stepped(environment, seed, actions):
     simulator = type(make(environment).env)()
     with quiet_streams():
         simulator.reset(seed=seed)
-    if ENVIRONMENTS[environment].discrete:
+    if info_of(environment).discrete:
         actions = actions.argmax(axis=1).tolist()
     step = simulator.step
     start = time.process_time()
@@ -85,6 +92,7 @@ def main():
     parser.add_argument("environments", nargs="*", default=list(ENVIRONMENTS), metavar="ENV")
     parser.add_argument("--rounds", type=int, default=7, help="seeds of each part (default: 7)")
     options = parser.parse_args()
+    register([*oodd_environments(), *oodd_anomalies()])
     print(f"{'environment':12} {'part':6} {'recorded/s':>11} {'stepped/s':>11} {'share':>6}")
     low = []
     for environment in options.environments:
@@ -92,7 +100,7 @@ def main():
             own, simulators, share = shares(environment, part, options.rounds)
             row = f"{environment:12} {part:6} {own:11.0f} {simulators:11.0f} {share:6.0%}"
             print(row, flush=True)
-            if ENVIRONMENTS[environment].family == "bullet" and share < SHARE:
+            if info_of(environment).family == "bullet" and share < SHARE:
                 low.append(f"{environment} {part}")
     if low:
         print(f"below {SHARE:.0%}: {', '.join(low)}")

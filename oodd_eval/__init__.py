@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from oodd_eval.data.importing import import_frames
     from oodd_eval.data.logs import Reader
     from oodd_eval.data.recording import Recording, Topic
-    from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec
+    from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec, Fault
     from oodd_eval.data.split import load_split
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.live.scan import scan_episodes
@@ -31,6 +31,7 @@ __all__ = [
     "DetectorSpec",
     "EnvironmentSpec",
     "Explanation",
+    "Fault",
     "Quantity",
     "Reader",
     "Recording",
@@ -52,7 +53,7 @@ _NAMES = {
     "data.importing": ("import_frames",),
     "data.logs": ("Reader",),
     "data.recording": ("Recording", "Topic"),
-    "data.registry": ("AnomalySpec", "Attribute", "EnvironmentSpec"),
+    "data.registry": ("AnomalySpec", "Attribute", "EnvironmentSpec", "Fault"),
     "data.split": ("load_split",),
     "data.trajectory": ("Trajectory",),
     "live.scan": ("scan_episodes",),

@@ -37,6 +37,10 @@ NOT_RUN = [
     Rule(r"^\. \.venv/bin/activate$", "the environment is this one; test_walk makes another"),
     Rule(r"^git ", "changes a repository"),
     Rule(
+        r"^(export|pip download|python -m zipfile) |^pip install -e examples/oodd-go1",
+        "gets a robot that others published",
+    ),
+    Rule(
         r"^rm -rf dist$|^python -m build$|^\.ci/check-dist", "test_packaging builds and tries both"
     ),
     Rule(r"^(mkdir|cp) ", "moves what a command of PARSED_ONLY would have made"),
@@ -62,6 +66,7 @@ PARSED_ONLY = [
     Rule(r"^oodd-eval data (inspect|import) (g1|bags|mug)\b",
          "needs a data set of LeRobot, or a bag; tests of the readers write both"),
     Rule(r"^oodd-eval data import plant --env pump ", "test_import imports such parts"),
+    Rule(r"^oodd-eval .*\b(go1|walks)\b", "needs a robot that others published"),
     Rule(r"--executor dask://", "needs a cluster; test_executors starts one"),
 ]  # fmt: skip
 """Commands whose options are checked, and no more."""

@@ -17,13 +17,13 @@ def forget_own():
             del known[name]
 
 
-TANK = '''
+BASIN = '''
 import gymnasium
 import numpy as np
 from oodd_eval import AnomalySpec, Attribute, EnvironmentSpec, Quantity, hookimpl
 
 
-class Tank(gymnasium.Env):
+class Basin(gymnasium.Env):
     """Two tanks of water in a row; a pump fills the first, and the level wobbles."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
@@ -46,7 +46,7 @@ class Tank(gymnasium.Env):
         return np.array([*self.level, flow], np.float32)
 
 
-class Valve(Tank):
+class Valve(Basin):
     """The same with two commands: closed, open."""
 
     action_space = gymnasium.spaces.Discrete(2)
@@ -71,15 +71,15 @@ def set_viscosity(env, value):
     env.viscosity = value
 
 
-def leak(strength, rng, simulator):
+def seep(strength, rng, simulator):
     from oodd_recording.faults import Fault
 
-    class Leak(Fault):
+    class Seep(Fault):
         def command(self, action, simulator):
             simulator.env.outflow = 0.2 * (1 + strength)
             return action
 
-    return Leak({})
+    return Seep({})
 
 
 SENSORS = tuple(Quantity(n, u) for n, u in (("upper", "m"), ("lower", "m"), ("outflow", "l/s")))
@@ -90,7 +90,7 @@ FRICTION = {"friction": Attribute(get_viscosity, set_viscosity)}
 def oodd_environments():
     valve = Quantity("close", "1"), Quantity("open", "1")
     return [
-        EnvironmentSpec("tank", Tank, proportional, SENSORS, (Quantity("pump", "1"),), 90,
+        EnvironmentSpec("basin", Basin, proportional, SENSORS, (Quantity("pump", "1"),), 90,
                         attributes=FRICTION),
         EnvironmentSpec("valve", Valve, bang, SENSORS, valve, 90),
     ]
@@ -98,5 +98,102 @@ def oodd_environments():
 
 @hookimpl
 def oodd_anomalies():
-    return [AnomalySpec("leak", "dynamics", "water leaves faster", "share of the flow", 3.0, leak)]
+    return [AnomalySpec("seep", "dynamics", "water leaves faster", "share of the flow", 3.0, seep)]
+'''
+
+
+CISTERN = '''
+import gymnasium
+import numpy as np
+from oodd_eval import AnomalySpec, EnvironmentSpec, Fault, Quantity, hookimpl
+from oodd_recording.faults import SensorFault
+
+ROWS = 120
+
+
+class Cistern(gymnasium.Env):
+    """A level that a pump of 0 to 8 V raises and an outlet lowers, and a set point that moves."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
+    action_space = gymnasium.spaces.Box(0.0, 8.0, (1,))
+    gain, inflow, volts = 0.1, 0.0, 0.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.level, self.goal = self.np_random.uniform(0.8, 1.2), 1.0
+        return self._row(), {}
+
+    def step(self, action):
+        self.volts = float(action[0])
+        self.level += 0.2 * (self.gain * self.volts + self.inflow - 0.3 * self.level)
+        if self.np_random.random() < 0.03:
+            self.goal = self.np_random.uniform(0.8, 1.4)
+        return self._row(), max(0.0, 1.0 - abs(self.level - self.goal)), False, False, {}
+
+    def _row(self):
+        return np.array([self.level, self.gain * self.volts, self.goal], np.float32)
+
+
+class Integral:
+    """A controller with memory, in steps of 1/1024 V, which float32 holds in any range."""
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        self.sum = 0.0
+
+    def act(self, row):
+        error = float(row[2]) - float(row[0])
+        self.sum += 0.2 * error
+        return [np.round(min(max(3.0 + 4.0 * error + self.sum, 0.0), 8.0) * 1024) / 1024]
+
+
+def clog(strength, rng, simulator):
+    """Wear: the pump loses a share of its gain."""
+    class Clog(Fault):
+        def command(self, action, simulator):
+            simulator.env.gain = 0.1 * (1 - self.share * strength)
+            return action
+
+    return Clog({})
+
+
+def surge(strength, rng, simulator):
+    """More water comes in for a while."""
+    class Surge(Fault):
+        def begin(self, simulator, rows):
+            simulator.env.inflow = strength
+
+        def end(self, simulator):
+            simulator.env.inflow = 0.0
+
+    return Surge({})
+
+
+def offset(strength, rng, simulator):
+    """The level is measured too high."""
+    return SensorFault(np.array([0]), lambda x, _: x + strength)
+
+
+SENSORS = (Quantity("level", "m", noise=0.01), Quantity("flow", "m/s", noise=0.002),
+           Quantity("goal", "m", "reference"))
+
+
+@hookimpl
+def oodd_environments():
+    return [EnvironmentSpec("cistern", Cistern, Integral, SENSORS, (Quantity("pump", "V"),), ROWS,
+                            task="loss", packages=("click",))]
+
+
+@hookimpl
+def oodd_anomalies():
+    where = ("cistern",)
+    return [
+        AnomalySpec("clog", "dynamics", "a pump wears", "share of it", 0.9, clog, where, ramp=20),
+        AnomalySpec("surge", "dynamics", "a surge", "m/s", 0.4, surge, where, lasts=15,
+                    ),
+        AnomalySpec("offset", "sensor", "the level is off", "m", 0.5, offset, where,
+                    intermittent=True),
+    ]
 '''

@@ -323,19 +323,19 @@ def test_verify_tells_sound_data_from_changed_data(run, tiny_split, tmp_path):
 @pytest.mark.parametrize(
     ("missing", "arguments", "extra"),
     [
-        ("gymnasium", BUILD, "sim"),
-        ("pybullet", ["policies", "evaluate", "hopper"], "sim"),
+        ("gymnasium", BUILD, "gym"),
+        ("pybullet", ["policies", "evaluate", "hopper"], "bullet"),
         ("torch", ["policies", "train", "hopper"], "train"),
     ],
 )
 def test_a_missing_extra_is_named_with_the_command(tmp_path, missing, arguments, extra):
-    code = (
-        f"import sys; sys.modules[{missing!r}] = None\n"
-        f"from oodd_eval.cli.main import main; sys.exit(main({arguments!r}))"
-    )
+    # Worker processes must not find it either.
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / f"{missing}.py").write_text("raise ImportError('none here')\n")
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "OODD_EVAL_DATA": str(tmp_path)},
+        [sys.executable, "-m", "oodd_eval", *arguments], cwd=tmp_path, capture_output=True,
+        text=True, check=False,
+        env={**os.environ, "OODD_EVAL_DATA": str(tmp_path), "PYTHONPATH": str(tmp_path / "first")},
     )  # fmt: skip
     assert done.returncode == 4, done.stderr
     assert f"pip install 'oodd-eval[{extra}]'" in done.stderr

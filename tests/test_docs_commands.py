@@ -93,8 +93,19 @@ KNOWN = {
         },
         "before": ["python -m make_logs"],
     },
+    "docs/data.md": {
+        "rules": {
+            r"data build worlds$": "data build worlds --env tank",
+            r"--split worlds --env all": "--split worlds --env tank",
+        }
+    },
     "docs/how-to/own-environment.md": {
         "files": {"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"}
+    },
+    "docs/how-to/policies.md": {
+        "files": {"make_actor.py": "```python"},
+        "folders": ["recording/policies"],
+        "rules": {r"recording/(?=policies/)": ""},
     },
     "docs/how-to/scan.md": {
         "files": {
@@ -151,6 +162,7 @@ WITH_PYTHON = [path for path in PAGES if python_blocks(path.read_text())]
 FRAGMENTS = {
     "README.md": "test_live_wrappers runs it and reads what it prints",
     "docs/board-data.md": "test_the_pages_program_reads_the_table builds a board for it",
+    "examples/oodd-go1/README.md": "needs episodes of a robot that others published",
     "docs/tutorial.md": "a piece of the test file that `new` writes, which test_new runs",
     "detectors/README.md": "the plug-in that the commands of the page run",
 }

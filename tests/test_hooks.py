@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from helpers_own import TANK
+from helpers_own import BASIN
 from helpers_plugins import install
 
 from oodd_eval import load_split
@@ -56,16 +56,16 @@ def watched(tiny_split):
 
 
 def test_oodd_environments(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "tank", TANK, header="")
-    found = discover(only=["tank"]).custom_specs
+    install(monkeypatch, tmp_path, "basin", BASIN, header="")
+    found = discover(only=["basin"]).custom_specs
     spec, origin = found["valve"]
-    assert origin == "plug-in 'tank' of oodd-tank"
+    assert origin == "plug-in 'basin' of oodd-basin"
     assert [quantity.name for quantity in spec.actions] == ["close", "open"]
 
 
 def test_oodd_anomalies(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "tank", TANK, header="")
-    spec, _ = discover(only=["tank"]).custom_specs["leak"]
+    install(monkeypatch, tmp_path, "basin", BASIN, header="")
+    spec, _ = discover(only=["basin"]).custom_specs["seep"]
     assert (spec.group, spec.bound) == ("dynamics", 3.0)
 
 

@@ -268,7 +268,7 @@ def test_noise_is_part_of_the_recipe_and_of_every_episode(base, in_process, tmp_
     [
         (["mine", "--base", "mini"], "expected --suite ladder"),
         (["mine", "--base", "mini", "--suite", "ladder", "--cap", "90"], "none of --train"),
-        (["mine", "--suite", "paper"], "--suite paper needs --base"),
+        (["mine", "--suite", "paper"], "or --base with a split that has them"),
         (["ladder", "--base", "mini", "--suite", "ladder"], "is published"),
         (["mine", "--train", "1", "--calibration", "1", "--test", "1", "--seed-base", "41",
           "--noise", "3"], "the noise must be 0 to 1 of the spread, got 3.0"),

@@ -750,14 +750,27 @@ def test_rows_that_tell_nothing_apart_are_not_those_of_one_another():
     assert not any(s.clone_of for s in ranks.standings)
 
 
-@pytest.mark.parametrize("training", ["simulation", "anomalies", "external"])
-def test_a_row_trained_on_more_is_shown_and_not_ranked(training):
+@pytest.mark.parametrize(
+    ("training", "mark"),
+    [
+        ("simulation", "trained on simulation"),
+        ("anomalies", "trained on anomalies"),
+        ("external", "trained on external"),
+        ("oracle", "oracle"),
+    ],
+)
+def test_a_row_that_knows_more_is_shown_and_not_ranked(training, mark):
     cheat = [dataclasses.replace(r, detector="wise", training=training)
              for r in board() if r.detector == "riqn" and r.horizon == 10]  # fmt: skip
     before, after = ranked(board()), ranked([*board(), *cheat])
     (row,) = (s for s in after.standings if s.training != "nominal")
     assert row.rank is row.alarm_rank is None
-    assert row.state == row.alarm_state == f"trained on {training}"
-    assert row.marks == f" (trained on {training})"
+    assert row.state == row.alarm_state == mark
+    assert row.marks == f" ({mark})"
     assert after.ranking == before.ranking
-    assert f"Not ranked: wise[h=10], trained on {training}." in tables.ranking_notes(after)
+    notes = tables.ranking_notes(after)
+    assert f"Not ranked: wise[h=10], {mark}." in notes
+    oracles = [note for note in notes if note.startswith("An oracle")]
+    assert (len(oracles), sum("Rows trained on more" in note for note in notes)) == (
+        (1, 0) if training == "oracle" else (0, 1)
+    )

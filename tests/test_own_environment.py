@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium", reason="needs the extra sim")
-from helpers_own import TANK, forget_own
+from helpers_own import BASIN, CISTERN, forget_own
 from helpers_plugins import install
 from oodd_recording.info import code_digest
 
@@ -27,8 +27,14 @@ def forgotten():
 
 
 @pytest.fixture
-def tank(monkeypatch, tmp_path, forgotten):
-    install(monkeypatch, tmp_path / "plugin", "tank", TANK, header="")
+def cistern(monkeypatch, tmp_path, forgotten):
+    install(monkeypatch, tmp_path / "plugin", "cistern", CISTERN, header="")
+    return tmp_path
+
+
+@pytest.fixture
+def basin(monkeypatch, tmp_path, forgotten):
+    install(monkeypatch, tmp_path / "plugin", "basin", BASIN, header="")
     monkeypatch.setenv("OODD_EVAL_DATA", str(tmp_path / "splits"))
     return tmp_path
 
@@ -37,13 +43,13 @@ def build(name, *options):
     return main(["data", "build", name, *SIZES, "--jobs", "1", *options])
 
 
-def test_a_split_of_ones_own_is_recorded_and_evaluated(tank, capsys):
-    strengths = ["--strength", "leak=0.5", "--strength", "iid=0.3", "--strength", "friction=0.4"]
-    assert build("mine", "--env", "tank", *strengths) == 0
+def test_a_split_of_ones_own_is_recorded_and_evaluated(basin, capsys):
+    strengths = ["--strength", "seep=0.5", "--strength", "iid=0.3", "--strength", "friction=0.4"]
+    assert build("mine", "--env", "basin", *strengths) == 0
     split = load_split("mine")
-    data = split.environment("tank")
-    assert data.anomalies == ("iid", "friction", "leak")
-    assert split.groups == {"iid": "sensor", "friction": "dynamics", "leak": "dynamics"}
+    data = split.environment("basin")
+    assert data.anomalies == ("iid", "friction", "seep")
+    assert split.groups == {"iid": "sensor", "friction": "dynamics", "seep": "dynamics"}
     assert [len(part) for part in (data.train, data.calibration, data.twins)] == [6, 6, 3]
     for kind in data.anomalies:
         part = data.anomalous(kind)
@@ -52,20 +58,20 @@ def test_a_split_of_ones_own_is_recorded_and_evaluated(tank, capsys):
             same = x.observations[:effect].tobytes() == twin.observations[:effect].tobytes()
             assert same, kind
             assert (x.observations[effect] != twin.observations[effect]).any()
-        assert part.parameters[0]["strength"] == {"leak": 0.5, "iid": 0.3, "friction": 0.4}[kind]
-    run = ["run", "--detector", "persistence", "--env", "tank", "--split", "mine"]
-    assert main([*run, "--output", str(tank / "results")]) == 0
-    assert "tank" in capsys.readouterr().out
+        assert part.parameters[0]["strength"] == {"seep": 0.5, "iid": 0.3, "friction": 0.4}[kind]
+    run = ["run", "--detector", "persistence", "--env", "basin", "--split", "mine"]
+    assert main([*run, "--output", str(basin / "results")]) == 0
+    assert "basin" in capsys.readouterr().out
 
 
-def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_byte(tank):
-    assert build("one", "--env", "valve", "--strength", "leak=0.1,2") == 0
+def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_byte(basin):
+    assert build("one", "--env", "valve", "--strength", "seep=0.1,2") == 0
     split = load_split("one")
-    assert split.anomalies == ("leak", "leak@0.1", "leak@2")
+    assert split.anomalies == ("seep", "seep@0.1", "seep@2")
     assert split.environment("valve").discrete
-    again = ["--jobs", "2", "--output", str(tank / "again")]
-    assert build("one", "--env", "valve", "--strength", "leak=0.1,2", *again) == 0
-    assert load_split(tank / "again").digest == split.digest
+    again = ["--jobs", "2", "--output", str(basin / "again")]
+    assert build("one", "--env", "valve", "--strength", "seep=0.1,2", *again) == 0
+    assert load_split(basin / "again").digest == split.digest
     weak, strong = (split.environment("valve").anomalous(c) for c in split.conditions("valve"))
     twins = split.environment("valve").twins
 
@@ -76,13 +82,13 @@ def test_several_strengths_are_conditions_and_the_number_of_workers_changes_no_b
     assert 0 < distance(weak) < distance(strong)
 
 
-def test_every_strength_has_a_number_in_split_and_records_and_a_column(tank, capsys):
-    assert build("one", "--env", "tank", "--strength", "leak=0.1,0.5,2,3") == 0
+def test_every_strength_has_a_number_in_split_and_records_and_a_column(basin, capsys):
+    assert build("one", "--env", "basin", "--strength", "seep=0.1,0.5,2,3") == 0
     split, numbers = load_split("one"), (0.1, 0.5, 2, 3)
-    assert split.strengths("tank") == {Condition("leak", f"{n:g}"): n for n in numbers}
+    assert split.strengths("basin") == {Condition("seep", f"{n:g}"): n for n in numbers}
     assert main(["data", "info", "one"]) == 0
-    assert "strengths of leak (share of the flow): 0.1, 0.5, 2, 3" in capsys.readouterr().out
-    out = str(tank / "results")
+    assert "strengths of seep (share of the flow): 0.1, 0.5, 2, 3" in capsys.readouterr().out
+    out = str(basin / "results")
     assert (
         main(["run", "--detector", "mewma", "--split", "one", "--env", "all", "--output", out]) == 0
     )
@@ -90,45 +96,45 @@ def test_every_strength_has_a_number_in_split_and_records_and_a_column(tank, cap
     columns = text.partition("Matched AUC (%) by strength")[2].splitlines()[1]
     assert columns.split() == ["detector", "0.1", "0.5", "2", "3"]
     assert "Anomalies have several strengths" in text
-    assert [r.magnitude for r in ResultsDirectory(tank / "results").records()] == [*numbers]
+    assert [r.magnitude for r in ResultsDirectory(basin / "results").records()] == [*numbers]
 
 
-def test_ones_own_anomaly_is_recorded_in_an_environment_of_the_benchmark(tank, monkeypatch):
-    code = TANK.replace("simulator.env.outflow = 0.2 * (1 + strength)",
+def test_ones_own_anomaly_is_recorded_in_an_environment_of_the_benchmark(basin, monkeypatch):
+    code = BASIN.replace("simulator.env.outflow = 0.2 * (1 + strength)",
                         "simulator.scale('gravity', 1 + strength)")  # fmt: skip
-    install(monkeypatch, tank / "other", "tank", code, header="")
+    install(monkeypatch, basin / "other", "basin", code, header="")
     sizes = ["--train", "1", "--calibration", "1", "--test", "1", "--seed-base", "77"]
     assert main(["data", "build", "poles", *sizes, "--cap", "80", "--env", "cartpole",
-                 "--strength", "leak=1", "--jobs", "1"]) == 0  # fmt: skip
+                 "--strength", "seep=1", "--jobs", "1"]) == 0  # fmt: skip
     split = load_split("poles")
-    assert split.groups == {"leak": "dynamics"}
-    assert split.manifest["environments"]["cartpole"]["own"]["anomalies"] == {"leak": "dynamics"}
+    assert split.groups == {"seep": "dynamics"}
+    assert split.manifest["environments"]["cartpole"]["own"]["anomalies"] == {"seep": "dynamics"}
 
 
-def test_they_are_listed_and_described(tank, capsys):
+def test_they_are_listed_and_described(basin, capsys):
     assert main(["list", "envs"]) == 0
     assert main(["list", "anomalies"]) == 0
-    assert main(["info", "tank"]) == 0
-    assert main(["info", "leak"]) == 0
+    assert main(["info", "basin"]) == 0
+    assert main(["info", "seep"]) == 0
     told = capsys.readouterr().out
-    for text in ("plug-in 'tank' of oodd-tank", "water leaves faster", "upper (m)", "0 to 3"):
+    for text in ("plug-in 'basin' of oodd-basin", "water leaves faster", "upper (m)", "0 to 3"):
         assert text in told
-    assert main(["policies", "evaluate", "tank", "--episodes", "2"]) == 0
-    assert "tank: return -" in capsys.readouterr().out
+    assert main(["policies", "evaluate", "basin", "--episodes", "2"]) == 0
+    assert "basin: return -" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--env", "tank"], "no strengths of anomalies are given for 'tank'"),
-        (["--env", "tank", "--strength", "leak=9"], "the strength of leak is 9, expected 0 to 3"),
-        (["--env", "tank", "--strength", "gravity=1"], "unknown anomaly that tank can have"),
-        (["--env", "tank", "--strength", "laek=1"], "did you mean 'leak'"),
-        (["--env", "tnak", "--strength", "leak=1"], "did you mean 'tank'"),
-        (["--env", "tank", "--strength", "leak=much"], "expected ANOMALY=NUMBER"),
+        (["--env", "basin"], "no strengths of anomalies are given for 'basin'"),
+        (["--env", "basin", "--strength", "seep=9"], "the strength of seep is 9, expected 0 to 3"),
+        (["--env", "basin", "--strength", "gravity=1"], "unknown anomaly that basin can have"),
+        (["--env", "basin", "--strength", "sepe=1"], "did you mean 'seep'"),
+        (["--env", "bsain", "--strength", "seep=1"], "did you mean 'basin'"),
+        (["--env", "basin", "--strength", "seep=much"], "expected ANOMALY=NUMBER"),
     ],
 )
-def test_what_cannot_be_recorded_is_said(tank, capsys, options, message):
+def test_what_cannot_be_recorded_is_said(basin, capsys, options, message):
     assert build("mine", *options) == 4
     assert message in capsys.readouterr().err
 
@@ -136,18 +142,18 @@ def test_what_cannot_be_recorded_is_said(tank, capsys, options, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"tank", Tank', '"hopper", Tank', "'hopper' cannot be the name of a custom"),
-        ('"tank", Tank', '"tank", lambda: Tank()', "at the top level of a module"),
-        ('"leak", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of a custom"),
+        ('"basin", Basin', '"hopper", Basin', "'hopper' cannot be the name of a custom"),
+        ('"basin", Basin', '"basin", lambda: Basin()', "at the top level of a module"),
+        ('"seep", "dynamics"', '"iid", "dynamics"', "'iid' cannot be the name of a custom"),
         ("return [AnomalySpec(", "return (AnomalySpec(", "expected a list of oodd_eval.Anomaly"),
-        ('EnvironmentSpec("valve"', 'EnvironmentSpec("leak"', "'leak' is offered twice"),
+        ('EnvironmentSpec("valve"', 'EnvironmentSpec("seep"', "'seep' is offered twice"),
     ],
 )
-def test_a_wrong_spec_makes_its_plugin_broken(tank, monkeypatch, capsys, old, new, message):
-    code = TANK.replace(old, new)
-    code = code.replace("leak)]", "leak),)") if "(AnomalySpec" in new else code
-    install(monkeypatch, tank / "other", "tank", code, header="")
-    assert build("mine", "--env", "tank", "--strength", "leak=1") == 4
+def test_a_wrong_spec_makes_its_plugin_broken(basin, monkeypatch, capsys, old, new, message):
+    code = BASIN.replace(old, new)
+    code = code.replace("seep)]", "seep),)") if "(AnomalySpec" in new else code
+    install(monkeypatch, basin / "other", "basin", code, header="")
+    assert build("mine", "--env", "basin", "--strength", "seep=1") == 4
     assert message in capsys.readouterr().err
 
 
@@ -162,11 +168,11 @@ def test_arguments_of_a_partial_are_part_of_what_acts(forgotten):
     assert len(digests) == 2
 
 
-def test_spaces_that_are_not_as_the_spec_says_are_refused(tank, monkeypatch, capsys):
-    code = TANK.replace("Box(-1.0, 1.0, (1,))", "Box(-2.0, 2.0, (1,))")
-    install(monkeypatch, tank / "other", "tank", code, header="")
-    assert build("mine", "--env", "tank", "--strength", "leak=1") == 4
-    assert "a Box of shape (1,) from -1 to 1" in capsys.readouterr().err
+def test_spaces_that_are_not_as_the_spec_says_are_refused(basin, monkeypatch, capsys):
+    code = BASIN.replace("Box(-1.0, 1.0, (1,))", "Box(-np.inf, 2.0, (1,))")
+    install(monkeypatch, basin / "other", "basin", code, header="")
+    assert build("mine", "--env", "basin", "--strength", "seep=1") == 4
+    assert "a Box of shape (1,) with finite ends" in capsys.readouterr().err
 
 
 def checked(name, capsys, *options):
@@ -174,13 +180,21 @@ def checked(name, capsys, *options):
     return code, " ".join(capsys.readouterr().out.split())
 
 
-def test_what_is_in_order_passes_its_checks(tank, capsys):
-    for name in ("tank", "valve"):
+def test_what_is_in_order_passes_its_checks(basin, capsys):
+    for name in ("basin", "valve"):
         assert checked(name, capsys)[0] == 0
-    code, told = checked("leak", capsys)
-    assert (code, "4 passed" in told) == (0, True)
-    assert checked("leak", capsys, "--env", "valve", "-k", "onset or draws")[0] == 0
-    assert checked("leak", capsys, "-k", "nothing")[0] == 5
+    code, told = checked("seep", capsys)
+    assert (code, "6 passed" in told) == (0, True)
+    assert checked("seep", capsys, "--env", "valve", "-k", "onset or draws")[0] == 0
+    assert checked("seep", capsys, "-k", "nothing")[0] == 5
+
+
+def test_what_grows_ends_and_rests_passes_its_checks(cistern, capsys):
+    assert checked("cistern", capsys)[0] == 0
+    for name, last in (("clog", "share"), ("surge", "end"), ("offset", "end")):
+        code, told = checked(name, capsys)
+        assert (code, "7 passed" in told, f" {last} " in told) == (0, True, True), told
+    assert checked("offset-intermittent", capsys, "-k", "end or sensors")[0] == 0
 
 
 NOISE = "0.01 * self.np_random.normal(size=2)"
@@ -189,34 +203,75 @@ NOISE = "0.01 * self.np_random.normal(size=2)"
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("tank", NOISE, "0.01 * np.random.default_rng().normal(size=2)",
+        ("basin", NOISE, "0.01 * np.random.default_rng().normal(size=2)",
          "FAILED seed two episodes of seed 960000000 differ"),
-        ("tank", "self.np_random.uniform(0.8, 1.2, 2)", "np.ones(2)",
+        ("basin", "self.np_random.uniform(0.8, 1.2, 2)", "np.ones(2)",
          "FAILED seed different seeds give the same episode"),
-        ("tank", "False, False, {}", "self.level[0] > 1.6, False, {}", "FAILED columns 0 of 8"),
-        ("tank", "return lambda row: [np.clip(2.0 - row[1], -1, 1)]",
+        ("basin", "False, False, {}", "self.level[0] > 1.6, False, {}", "FAILED columns 0 of 8"),
+        ("basin", "return lambda row: [np.clip(2.0 - row[1], -1, 1)]",
          "t = iter(range(10**9))\n    return lambda row: [next(t) % 2 - 0.5]",
          "FAILED policy the policy gives another action"),
-        ("tank", 'Quantity(n, u) for n, u in (("upper", "m"),', "Quantity(n, u) for n, u in (",
-         "FAILED columns environment 'tank' has observations"),
-        ("leak", "0.2 * (1 + strength)", "0.2 * (1.5 + strength)",
+        ("basin", 'Quantity(n, u) for n, u in (("upper", "m"),', "Quantity(n, u) for n, u in (",
+         "FAILED columns environment 'basin' has observations"),
+        ("seep", "0.2 * (1 + strength)", "0.2 * (1.5 + strength)",
          "FAILED zero-strength with seed 960000000 it differs from its twin"),
-        ("leak", "0.2 * (1 + strength)", "0.2", "FAILED onset at the largest strength 8 of 8"),
-        ("leak", "return Leak({})", "return Leak({'strong': strength > 1})",
+        ("seep", "0.2 * (1 + strength)", "0.2", "FAILED onset at the largest strength 8 of 8"),
+        ("seep", "return Seep({})", "return Seep({'strong': strength > 1})",
          "FAILED draws with seed 960000000 it draws {'strong': False} or {'strong': True}"),
-        ("leak", "0.2 * (1 + strength)", "0.2 * (1 + strength * (3 - strength))",
+        ("seep", "0.2 * (1 + strength)", "0.2 * (1 + strength * (3 - strength))",
          "FAILED strength the mean distance from the twins is"),
-        ("leak", "return Leak({})", "raise ValueError('no')",
+        ("seep", "return Seep({})", "raise ValueError('no')",
          "FAILED zero-strength it raised ValueError: no"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_an_environment_or_an_anomaly_is_found(
-    tank, monkeypatch, capsys, name, old, new, message
+    basin, monkeypatch, capsys, name, old, new, message
 ):
     noiseless = old.startswith("self.np_random.uniform")
-    code = TANK.replace(old, new).replace(NOISE, "0.01") if noiseless else TANK.replace(old, new)
-    assert code != TANK
-    install(monkeypatch, tank / "other", "tank", code, header="")
+    code = BASIN.replace(old, new).replace(NOISE, "0.01") if noiseless else BASIN.replace(old, new)
+    assert code != BASIN
+    install(monkeypatch, basin / "other", "basin", code, header="")
     code, told = checked(name, capsys)
     assert code == 1
     assert message in told
+
+
+CORRUPTING = """fault = Fault({{}})
+    fault.observe = lambda row, _: row + np.float32({})
+    return fault
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("cistern", "        self.sum = 0.0", "        self.sum = getattr(self, 'sum', 0.0)",
+         "FAILED policy the policy gives another action for row 0 of seed 960000000 after reset()"),
+        ("cistern", "max(0.0, 1.0 - abs", "(1.0 - 9 * abs",
+         "FAILED rewards rewards of seed 960000000 are -"),
+        ("cistern", "max(3.0 + 4.0 * error + self.sum, 0.0), 8.0)", "5.0 + 99 * error, 99.0)",
+         "FAILED policy the policy commands ["),
+        ("surge", "1.0 - abs(self.level - self.goal)", "1.0 + self.inflow",
+         "FAILED rewards rewards of seed 960000000 are 1 to 1.4"),
+        ("surge", "simulator.env.inflow = 0.0", "pass",
+         "FAILED end with seed 960000000 it differs from its twin though it ended"),
+        ("clog", "self.share * strength", "strength",
+         "FAILED share with seed 960000000 it differs from its twin while its share is 0"),
+        ("offset", "np.array([0])", "np.array([2])",
+         "FAILED onset offset corrupts goal (reference) in cistern, expected sensors"),
+        ("offset", "return SensorFault(np.array([0]), lambda x, _: x + strength)",
+         CORRUPTING.format("[0, 0, strength]"),
+         "FAILED sensors with seed 960000000 it corrupts 'goal' (reference)"),
+        ("offset", "return SensorFault(np.array([0]), lambda x, _: x + strength)",
+         CORRUPTING.format("[0, strength, 0]"),
+         "FAILED sensors with seed 960000000 it corrupts 'flow', number 1"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_memory_roles_or_schedules_is_found(
+    cistern, monkeypatch, capsys, name, old, new, message
+):
+    code = CISTERN.replace(old, new)
+    assert code != CISTERN
+    install(monkeypatch, cistern / "other", "cistern", code, header="")
+    code, told = checked(name, capsys)
+    assert (code, message in told) == (1, True), told

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers_simulate import SEEDS, Reflex
 from oodd_recording.anomalies import VALUES
-from oodd_recording.environments import _Acrobot, make
+from oodd_recording.classic import _Acrobot
+from oodd_recording.environments import make
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.split import load_split

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from oodd_recording.policies import TD3Policy
 
+from oodd_eval.data.facts import ENVIRONMENTS
+
 pytestmark = pytest.mark.slow
 
 torch = pytest.importorskip("torch")
@@ -137,7 +139,7 @@ def test_targets_and_actor_move_only_on_policy_updates(learner, batch):
 
 def test_the_actor_and_the_policy_file_agree(learner):
     rows = np.random.default_rng(2).normal(size=(20, OBSERVATIONS)).astype("f4")
-    policy = TD3Policy(learner.arrays())
+    policy = TD3Policy(ENVIRONMENTS["hopper"], learner.arrays())
     with torch.no_grad():
         trained = td3.actor(learner.networks["pi"], torch.from_numpy(rows)).numpy()
     np.testing.assert_allclose([policy.act(r) for r in rows], trained, atol=2.0**-17 + 1e-6)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import Any, Final
 
 import click
@@ -36,7 +37,9 @@ def info(options: Options) -> int:
         custom = plugins.custom_specs
         imported = {env: (split, entry) for env, split, entry in imported_environments()}
         try:
-            if name in custom:
+            if name in custom and name in imported:  # logs may have a plug-in's name
+                lines = chain(_custom(*custom[name]), _imported(name, *imported[name]))
+            elif name in custom:
                 lines = _custom(*custom[name])
             elif name in imported:
                 lines = _imported(name, *imported[name])
@@ -114,6 +117,7 @@ _TRAINING: Final[Mapping[Training, str]] = {
     "simulation": "simulation: nominal episodes of its own besides (boards do not rank it)",
     "anomalies": "anomalies (boards do not rank it)",
     "external": "external data (boards do not rank it)",
+    "oracle": "nominal trajectories, with the true equations (boards do not rank it)",
 }
 
 

@@ -12,6 +12,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
 from oodd_eval.names import check_known
+from oodd_eval.plugins.contract import training_mark
 from oodd_eval.plugins.discovery import Plugins, discover
 
 T = TypeVar("T")
@@ -73,9 +74,9 @@ def _imported() -> Rows:
 def _detectors(plugins: Plugins) -> Rows:
     for name, offer in plugins.offers.items():
         why = offer.unavailable()
-        training = offer.spec.training
         marks = f"[unavailable: {why}] " if why else ""
-        marks += f"[trained on {training}] " if training != "nominal" else ""
+        mark = training_mark(offer.spec.training)
+        marks += f"[{mark}] " if mark else ""
         yield name, offer.origin, marks + offer.spec.summary
     for name, origin, forms in plugins.spec_forms():
         yield f"({name})", origin, forms

@@ -43,6 +43,7 @@ DATA: Final[Commands] = {
     "export": ("write a split in another project's format", "oodd_eval.cli.data:export"),
     "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
     "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
+    "page": ("write the page of an environment (extra sim)", "oodd_recording.commands:page"),
 }
 
 LEADERBOARD: Final[Commands] = {
@@ -56,6 +57,10 @@ LEADERBOARD: Final[Commands] = {
 
 POLICIES: Final[Commands] = {
     "train": ("train a policy (extra train)", "oodd_recording.commands:train"),
+    "import": (
+        "take a policy over from ONNX (extra onnx)",
+        "oodd_recording.commands:import_policy",
+    ),
     "evaluate": ("mean return of a policy (extra sim)", "oodd_recording.commands:evaluate"),
 }
 

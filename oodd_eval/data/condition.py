@@ -14,7 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite, in_order
+from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
@@ -26,10 +27,15 @@ LEVELS: Final = MappingProxyType(
 )
 """Share of the nominal return that the policy keeps, by rung, weakest first."""
 
+GROWTH: Final = MappingProxyType(
+    {"loss1": 0.01, "loss5": 0.05, "loss10": 0.10, "loss25": 0.25, "loss100": 1.0}
+)
+"""Growth of the task's loss, by rung, weakest first, of environments whose task is a loss."""
+
 PAPER: Final = "paper"
 """The rung at which the return's ratio is that of the paper's Table 2."""
 
-RUNGS: Final = (*FRACTIONS, *LEVELS, PAPER)
+RUNGS: Final = (*FRACTIONS, *LEVELS, *GROWTH, PAPER)
 """Names of the strengths of the benchmark's suites, weakest first, and the paper's."""
 
 WHOLE: Final = "paper-whole"
@@ -149,9 +155,27 @@ def read_ladder() -> Mapping[str, Mapping[str, Any]]:
     return ladder
 
 
+def ladder_of(environment: str) -> Mapping[str, Any]:
+    """Return what is calibrated in an environment, by kind; of a plug-in's from its own file."""
+    if environment in ENVIRONMENTS:
+        return read_ladder().get(environment, {})
+    path = environment_spec(environment).ladder
+    if path is None:
+        return {}
+    try:
+        ladder: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))[environment]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplitError(
+            f"{str(path)!r} is no ladder of {environment}, which its plug-in names: {error!r}; "
+            f"make it with `oodd-eval data calibrate --env {environment}`"
+        ) from error
+    return ladder
+
+
 def _entry(environment: str, kind: str) -> Mapping[str, Any]:
-    check_known("anomaly", ANOMALIES, kind)
-    entry: Mapping[str, Any] | None = read_ladder().get(environment, {}).get(kind)
+    ladder = ladder_of(environment)
+    check_known("anomaly", [*ANOMALIES, *ladder], kind)
+    entry: Mapping[str, Any] | None = ladder.get(kind)
     if entry is None:
         raise SplitError(
             f"no strengths of {kind} are calibrated in {environment}: name others, or measure them "
@@ -198,7 +222,7 @@ def conditions_of(
         whole = episode_cap is None and not ENVIRONMENTS[environment].discrete
         rung = WHOLE if whole else PAPER
         return {Condition(a, PAPER): strength_of(environment, a, rung) for a in TABLE1}
-    kinds = [kind for kind in ANOMALIES if kind in read_ladder().get(environment, {})]
+    kinds = in_order(ladder_of(environment), ANOMALIES)
     if not kinds:
         _entry(environment, next(iter(ANOMALIES)))
     return {

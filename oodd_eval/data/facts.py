@@ -5,17 +5,22 @@ The module needs neither simulators nor data. Values of the paper are from Danes
 
 import functools
 import json
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
+
+from oodd_eval.errors import UsageError
 
 PROTOCOL: Final = 2
 """Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
 
 Group = Literal["sensor", "dynamics"]
+
+Role = Literal["measured", "reference", "memory"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +34,48 @@ class Quantity:
     unit
         What the number 1 means: ``"rad"``, or ``"10 rad/s"`` where the simulator divides angular
         speeds by ten, or ``"1"`` for a plain number.
+    role
+        ``"measured"`` by a sensor, a ``"reference"`` that the controller follows, or its
+        ``"memory"``. Only what is measured has noise, or breaks.
+    noise
+        Standard deviation of the sensor's noise in nominal operation, in `unit`.
     """
 
     name: str
     unit: str
+    role: Role = "measured"
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.role not in get_args(Role) or not 0 <= self.noise < math.inf:
+            raise UsageError(
+                f"{self.name!r} has role {self.role!r} and noise {self.noise!r}, expected one of "
+                f"{', '.join(get_args(Role))}, and a number from 0"
+            )
+        if self.noise and self.role != "measured":
+            raise UsageError(f"{self.name!r} is not measured ({self.role}): expected no noise")
+
+    @classmethod
+    def read(cls, row: Mapping[str, Any]) -> "Quantity":
+        """Return the quantity that a row of a manifest describes.
+
+        Parameters
+        ----------
+        row
+            What `row` returns; further keys are ignored.
+
+        Returns
+        -------
+        Quantity
+        """
+        return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """What files store: name, unit, and what differs from its default."""
+        defaults = {"role": "measured", "noise": 0.0}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {n: value for n, value in values.items() if value != defaults.get(n)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +96,8 @@ class EnvironmentInfo:
         Longest episode in transitions.
     paper_return
         Mean return of the paper's policy in its Table 2; NaN for a custom environment.
+    low, high
+        Ends of each action, in its unit; empty for -1 to 1, or where actions are discrete.
     """
 
     id: str
@@ -64,6 +109,8 @@ class EnvironmentInfo:
     actions: tuple[Quantity, ...]
     episode_cap: int
     paper_return: float = float("nan")
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
 
     @property
     def observation_dim(self) -> int:
@@ -74,6 +121,12 @@ class EnvironmentInfo:
     def action_dim(self) -> int:
         """Width of an action row: the number of actions where they are discrete."""
         return len(self.actions)
+
+    @property
+    def limits(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """The lowest and the highest value of each action, where they are not discrete."""
+        width = self.action_dim
+        return self.low or (-1.0,) * width, self.high or (1.0,) * width
 
     @property
     def policy(self) -> Literal["IQN", "TD3"]:
@@ -140,6 +193,8 @@ class SplitDefinition:
         SHA-256 of 128 random bits, from which NumPy's ``SeedSequence`` makes 128 bits for each
         episode, and which the split does not hold. Then the base is 0, and the rule of `seed_base`
         gives an episode's number. Empty where it gives the seed.
+    environments
+        Those of the split; empty for the seven of the benchmark.
     """
 
     name: str
@@ -153,6 +208,7 @@ class SplitDefinition:
     noise: float = 0.0
     strengths: Mapping[str, float] = field(default_factory=dict)
     drawn: str = ""
+    environments: tuple[str, ...] = ()
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -160,6 +216,8 @@ class SplitDefinition:
         recipe = {field.name: getattr(self, field.name) for field in fields(self)}
         # Older manifests lack these.
         later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}, "drawn": ""}
+        later["environments"] = []
+        recipe["environments"] = list(self.environments)  # as JSON has it
         return {n: value for n, value in recipe.items() if n not in later or value != later[n]}
 
 
@@ -223,6 +281,9 @@ class LogFacts:
     citation: str = ""
 
 
+WORLDS: Final = ("arm", "drone", "tank")
+"""Environments of the plug-in `oodd_worlds`, of which splits are published, too."""
+
 _SPLITS: Final = (
     # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
     SplitDefinition("mini", 40, 40, 10, 300, 4),
@@ -236,6 +297,9 @@ _SPLITS: Final = (
     SplitDefinition("reduced-paper", 500, 50, 20, None, 5, "paper", "reduced"),
     SplitDefinition("noisy-1", 40, 40, 10, 300, 7, noise=0.01),
     SplitDefinition("noisy-5", 40, 40, 10, 300, 8, noise=0.05),
+    # Of the plug-in oodd_worlds, at the strengths of its ladder.
+    SplitDefinition("worlds", 40, 40, 10, None, 9, "ladder", environments=WORLDS),
+    SplitDefinition("worlds-standard", 500, 200, 50, None, 9, "ladder", environments=WORLDS),
 )
 
 SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})

@@ -284,8 +284,8 @@ def write_environment(
     described = {"logs": dataclasses.asdict(logs)} if logs else {}
     paired = is_paired(described)
     names = {
-        "sensors": [dataclasses.asdict(q) for q in sensors],
-        "actions": [dataclasses.asdict(q) for q in actions],
+        "sensors": [quantity.row for quantity in sensors],
+        "actions": [quantity.row for quantity in actions],
     }
     entries: dict[str, dict[str, Any]] = {}
     with (

@@ -282,7 +282,7 @@ class EnvironmentData:
         self.train, self.calibration, self.twins = nominal
         self.anomalies = tuple(map(str, conditions_in(part for part in parts if part != NAMES)))
         self.sensors, self.actions = (
-            tuple(Quantity(row["name"], row["unit"]) for row in map(json.loads, names[:]))
+            tuple(map(Quantity.read, map(json.loads, names[:])))
             for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
         )
 

@@ -12,10 +12,10 @@ import functools
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
 
 from oodd_eval.data.facts import (
     ANOMALIES,
@@ -28,12 +28,19 @@ from oodd_eval.data.facts import (
 from oodd_eval.errors import PluginError
 from oodd_eval.names import check_known
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 
 class Attribute(NamedTuple):
     """A number of the dynamics: `get` reads it from an environment, `set` changes it there."""
 
     get: Callable[[Any], float]
     set: Callable[[Any, float], None]
+
+
+Task = Literal["return", "loss"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +53,19 @@ class EnvironmentSpec:
         Lower-case letters, digits and hyphens.
     make
         Called as ``make()`` for every episode; returns a Gymnasium environment with a Box of
-        observations of shape (D,), and either ``Discrete(n)`` actions or a Box of shape (A,) from
-        -1 to 1 (``gymnasium.wrappers.RescaleAction`` makes one of any other). What
-        ``reset(seed=...)`` is given decides the whole episode.
+        observations of shape (D,), and either ``Discrete(n)`` actions or a Box of shape (A,) with
+        finite ends, in the units of `actions`. What ``reset(seed=...)`` is given decides the whole
+        episode.
     policy
         Called as ``policy()``; returns a function of an observation row alone, float32 of shape
-        (D,), to an action: a whole number, or a row of shape (A,). Or the path of a policy file
-        such as ``oodd-eval policies train`` writes.
+        (D,), to an action: a whole number, or a row of shape (A,). Or an object with ``act(row)``
+        and ``reset()``: a controller with memory, which is reset before an episode and is handed
+        every row of it. Or the path of a policy file such as ``oodd-eval policies train`` and
+        ``oodd-eval policies import`` write.
     sensors, actions
-        Names and units of the columns of observations, and of actions.
+        Names and units of the columns of observations, and of actions. Those of observations say
+        which are measured, and with which noise: it is added to each row before the policy sees
+        it.
     episode_cap
         Longest episode in transitions.
     title
@@ -63,16 +74,120 @@ class EnvironmentSpec:
         Numbers of the dynamics that anomalies of the benchmark change: ``"gravity"`` (kind
         gravity), ``"body_mass"`` (mass) and ``"friction"`` (friction); where actions are discrete
         also ``"gain"`` and ``"bias"``. Kinds without their attribute cannot be recorded.
+    task
+        What a ladder's levels are: shares of the ``"return"`` that the policy keeps, or growth of
+        the ``"loss"``, which is 1 - reward a row, and 1 in rows after an early end; rewards lie in
+        [0, 1] then.
+    ladder
+        Path of the strengths that ``oodd-eval data calibrate`` found, which the suite ladder
+        records.
+    packages
+        Names of the distributions that simulate: their versions stand in a split's manifest.
+    description
+        What its page says of it, as Markdown: model, controller, where the numbers are from. Its
+        sections, from the first ``##`` on, follow the page's first table.
+    picture
+        Called as ``picture()``; returns the picture of its page: an SVG as text, or a PNG as bytes.
     """
 
     name: str
     make: Callable[[], Any]
-    policy: Callable[[], Callable[[Any], Any]] | str | Path
+    policy: Callable[[], Any] | str | Path
     sensors: tuple[Quantity, ...]
     actions: tuple[Quantity, ...]
     episode_cap: int
     title: str = ""
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    task: Task = "return"
+    ladder: Path | None = None
+    packages: tuple[str, ...] = ()
+    description: str = ""
+    picture: Callable[[], str | bytes] | None = None
+
+
+class Fault:
+    """One anomaly as drawn for one episode; it acts from the onset on.
+
+    A kind overrides what it needs. Strength 0 changes nothing.
+
+    Parameters
+    ----------
+    parameters
+        What was drawn, as plain JSON; stored with the episode. Corrupted sensors are listed under
+        ``"sensors"``, by number; only measured ones can be.
+
+    Attributes
+    ----------
+    share
+        The part of the strength that is in force, from 0 to 1, where a kind grows, ends or rests
+        (see `AnomalySpec`); else 1. It is set before every call of `command`. What `command`
+        changes is the fault's to weaken; rows that `observe` returns are mixed by it: at a share of
+        .3 they keep seven tenths of the values that came in.
+    """
+
+    share: float = 1.0
+
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        self.parameters = parameters
+
+    def begin(self, simulator: Any, rows: Sequence[NDArray[np.float32]]) -> None:
+        """Prepare, once, before the transition onto the onset; after a rest, again.
+
+        Parameters
+        ----------
+        simulator
+            The episode's; ``simulator.env`` is the environment.
+        rows
+            Observation rows seen until then.
+        """
+
+    def command(self, action: Any, simulator: Any) -> Any:
+        """Return what the simulator is given for an action; called before every transition.
+
+        Parameters
+        ----------
+        action
+            Command of the policy: the number of a discrete action, or a float32 row of shape (A,)
+            in the units of actions.
+        simulator
+            The episode's.
+
+        Returns
+        -------
+        int or float32 array of shape (A,)
+            Command for the simulator. What comes back while the fault rests is dropped.
+        """
+        return action
+
+    def observe(self, row: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+        """Return an observation row as the broken sensors report it.
+
+        It is also called while the fault rests, so that its draws go on; what it returns is dropped
+        then.
+
+        Parameters
+        ----------
+        row
+            Row of the simulator with its nominal noise, float32 of shape (D,).
+        step
+            Its number in the episode.
+
+        Returns
+        -------
+        float32 array of shape (D,)
+        """
+        return row
+
+    def end(self, simulator: Any) -> None:
+        """Put back what `begin` and `command` changed, before a transition without the fault.
+
+        Attributes that were changed by ``simulator.scale``, and wind, are put back besides.
+
+        Parameters
+        ----------
+        simulator
+            The episode's.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +207,9 @@ class AnomalySpec:
     bound
         Largest sensible strength; 0 is nothing at all.
     make
-        Called as ``make(strength, rng, simulator)`` at the onset; returns a `Fault` of
-        `oodd_recording.faults`. What it draws comes from the generator `rng` and does not
-        depend on the strength. ``simulator.env`` is the environment.
+        Called as ``make(strength, rng, simulator)`` at the onset; returns a `Fault`. What it draws
+        comes from the generator `rng` and does not depend on the strength. ``simulator.env`` is the
+        environment.
     environments
         Names of the environments that it can be recorded in; empty for any.
     units
@@ -103,6 +218,17 @@ class AnomalySpec:
     needs, needs_discrete
         Attributes that an environment must have, see `EnvironmentSpec`; the latter where its
         actions are discrete.
+    ramp
+        Number of rows over which the fault grows from nothing to its strength, as wear does: `k`
+        rows after the onset a share of ``(k + 1) / ramp`` is in force.
+    lasts
+        Number of rows after which the fault ends; 0 where it lasts to the end of the episode.
+    pulses
+        Rows for which the fault is on, then for which it is off, again and again; None where it
+        stays on.
+    intermittent
+        Whether there is another kind besides, its name followed by ``-intermittent``: on for 10
+        rows and off for 40.
     """
 
     name: str
@@ -115,6 +241,10 @@ class AnomalySpec:
     units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     needs: tuple[str, ...] = ()
     needs_discrete: tuple[str, ...] = ()
+    ramp: int = 0
+    lasts: int = 0
+    pulses: tuple[int, int] | None = None
+    intermittent: bool = False
 
     def scale(self, environment: EnvironmentInfo) -> tuple[str, float]:
         """Return unit and bound of the strength in an environment.
@@ -138,13 +268,30 @@ class AnomalySpec:
 
 Spec = EnvironmentSpec | AnomalySpec
 
+PULSES: Final = (10, 40)  # rows on and off of intermittent kinds
+
+
+def with_intermittent(specs: Iterable[Spec]) -> Iterator[Spec]:
+    """Yield each spec, and the intermittent kind beside one that has it."""
+    for spec in specs:
+        yield spec
+        if isinstance(spec, AnomalySpec) and spec.intermittent:
+            on, off = PULSES
+            yield replace(
+                spec,
+                name=f"{spec.name}-intermittent",
+                summary=f"as {spec.name}, on for {on} rows and off for {off}",
+                pulses=PULSES,
+                intermittent=False,
+            )
+
 
 _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
 
 
 def check_spec(spec: Spec) -> None:
-    """Raise `PluginError` for a spec with a wrong or taken name, or functions of no module."""
+    """Raise `PluginError` for a wrong or taken name, functions of no module, and wrong numbers."""
     kind = "environment" if isinstance(spec, EnvironmentSpec) else "anomaly"
     taken = {"nominal", *(ENVIRONMENTS if isinstance(spec, EnvironmentSpec) else ANOMALIES)}
     if spec.name in taken or not re.fullmatch(NAME_PATTERN, spec.name):
@@ -152,6 +299,8 @@ def check_spec(spec: Spec) -> None:
             f"{spec.name!r} cannot be the name of a custom {kind}, expected lower-case letters, "
             "digits and hyphens, and no name of the benchmark"
         )
+    if problem := _problem_of(spec):
+        raise PluginError(f"{kind} {spec.name!r} has {problem}")
     for function in functions_of(spec):
         inner = inner_of(function)
         name, home = getattr(inner, "__qualname__", ""), getattr(inner, "__module__", "")
@@ -164,6 +313,22 @@ def check_spec(spec: Spec) -> None:
                 f"{kind} {spec.name!r} names {inner!r:.80}, expected a function or class at the "
                 "top level of a module in a file, which other processes can import"
             )
+
+
+def _problem_of(spec: Spec) -> str:
+    """Return what is wrong with a task, or with the rows of a kind; empty if nothing is."""
+    if isinstance(spec, EnvironmentSpec):
+        tasks = get_args(Task)
+        known = spec.task in tasks
+        return "" if known else f"task {spec.task!r}, expected one of {', '.join(tasks)}"
+    pulses = (1, 1) if spec.pulses is None else tuple(spec.pulses)
+    if min(spec.ramp, spec.lasts) < 0:
+        return f"ramp {spec.ramp} and lasts {spec.lasts}, expected numbers of rows from 0"
+    if len(pulses) != 2 or min(pulses) < 1:
+        return f"pulses {spec.pulses}, expected two numbers of rows from 1: on, off"
+    if spec.intermittent and spec.pulses is not None:
+        return "pulses, so it is intermittent itself: expected intermittent=False"
+    return ""
 
 
 def register(specs: Iterable[Spec]) -> None:
@@ -211,4 +376,5 @@ def functions_of(spec: Spec) -> list[Callable[..., Any]]:
     if isinstance(spec, AnomalySpec):
         return [spec.make]
     accessors = [f for attribute in spec.attributes.values() for f in attribute]
-    return [spec.make, *([spec.policy] if callable(spec.policy) else []), *accessors]
+    further = [f for f in (spec.policy, spec.picture) if callable(f)]
+    return [spec.make, *further, *accessors]

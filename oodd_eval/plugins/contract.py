@@ -46,8 +46,21 @@ ROLLOUT_TOLERANCE: Final = 5e-3
 
 Scores: TypeAlias = "NDArray[np.float64]"
 
-Training = Literal["nominal", "simulation", "anomalies", "external"]
-"""Data that a detector learns from, see `DetectorSpec`."""
+Training = Literal["nominal", "simulation", "anomalies", "external", "oracle"]
+"""What a detector knows, see `DetectorSpec`."""
+
+
+def training_mark(training: Training) -> str:
+    """Return how lists and boards mark a detector by what it knows; empty for nominal data alone.
+
+    Examples
+    --------
+    >>> training_mark("nominal"), training_mark("external"), training_mark("oracle")
+    ('', 'trained on external', 'oracle')
+    """
+    if training == "nominal":
+        return ""
+    return training if training == "oracle" else f"trained on {training}"
 
 
 @runtime_checkable
@@ -192,8 +205,8 @@ class DetectorSpec:
     training
         What it learns from beyond parameters: ``"nominal"``, the trajectories given to `fit`, and
         nothing else; ``"simulation"``, nominal episodes of its own besides; ``"anomalies"``,
-        anomalous ones; ``"external"``, other data, such as pretrained weights. Boards rank the
-        first.
+        anomalous ones; ``"external"``, other data, such as pretrained weights; ``"oracle"``, it has
+        the true equations of the environment. Boards rank the first.
     alarm
         The statistic of the guaranteed alarms: the CUSUM of standardized scores, or the score
         itself, for a detector that accumulates by itself.

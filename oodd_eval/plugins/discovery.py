@@ -146,13 +146,19 @@ class Plugin:
 
     def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
-        from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, check_spec  # noqa: PLC0415
+        from oodd_eval.data.registry import (  # noqa: PLC0415
+            AnomalySpec,
+            EnvironmentSpec,
+            check_spec,
+            with_intermittent,
+        )
 
         specs: list[Spec] = []
         for returned in self.hook.oodd_environments():
             specs += _list_of(returned, EnvironmentSpec, f"oodd_environments of {self}")
         for returned in self.hook.oodd_anomalies():
             specs += _list_of(returned, AnomalySpec, f"oodd_anomalies of {self}")
+        specs = [*with_intermittent(specs)]
         for spec in specs:
             check_spec(spec)
         return specs

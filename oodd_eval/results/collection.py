@@ -27,7 +27,15 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
-from oodd_eval.results.strengths import DETECTION, NO_UNITS, Point, curve, threshold_rows
+from oodd_eval.results.strengths import (
+    COSTS,
+    DETECTION,
+    NO_UNITS,
+    Point,
+    Strengths,
+    curve,
+    threshold_rows,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -228,8 +236,8 @@ class Results(Sequence[Record]):
         list of dict
             Its ``threshold``, and ``low`` and ``high`` of the 95 % interval, are in the anomaly's
             unit: 0 where it is below the ``weakest`` strength, infinity where it is above the
-            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, NaN where
-            strengths are your own.
+            ``strongest``. ``kept99`` is the strength that costs 1 % of the return, or that
+            raises the task's loss by 1 % (``loss1``), NaN where strengths are your own.
         """
         return threshold_rows(self.records)
 
@@ -296,8 +304,8 @@ class Results(Sequence[Record]):
             nominal episodes have one; dotted is what false alarms alone give.
         environments, anomalies
             What is averaged over: comma lists and globs, as on the command line. Strengths are in
-            units of the strength that costs 1 % of the return, as each anomaly has its own unit;
-            strengths of your own are in the unit of the anomaly.
+            units of the strength that costs 1 % of the return or raises the task's loss by 1 %, as
+            each anomaly has its own unit; strengths of your own are in the unit of the anomaly.
 
         Returns
         -------
@@ -323,7 +331,8 @@ class Results(Sequence[Record]):
             raise ResultsError(
                 f"no results at several strengths with {metric}: run a split that has some"
             )
-        return plots.ladder(curves[0], curves[-1] if info.null else {}, info)
+        unit = COSTS.get(Strengths.of(chosen).base, "")
+        return plots.ladder(curves[0], curves[-1] if info.null else {}, info, unit)
 
     def _row(self, name: str) -> Setting:
         if name or len(self.rows) == 1:

@@ -146,13 +146,18 @@ def power(curves: Mapping[str, Sequence[ScoredEpisode]]) -> Figure:
 
 
 def ladder(
-    curves: Mapping[str, Sequence[Point]], nulls: Mapping[str, Sequence[Point]], metric: MetricInfo
+    curves: Mapping[str, Sequence[Point]],
+    nulls: Mapping[str, Sequence[Point]],
+    metric: MetricInfo,
+    unit: str,
 ) -> Figure:
     """Draw a metric against the strength and against the return that it costs, one line a detector.
 
-    What chance or false alarms alone give is dotted.
+    What chance or false alarms alone give is dotted. `unit` says what a strength of 1 does; it is
+    empty where strengths are in the units of their kinds of anomalies.
     """
     costs = any(not np.isnan(p.lost) for points in curves.values() for p in points)
+    one = f"strength (1: {unit})" if unit else "strength"
     figure, grid = _subplots(1, 3.6, columns=1 + costs)
     axes = np.atleast_1d(grid)
     left = axes[0]
@@ -165,8 +170,8 @@ def ladder(
                 known = ~np.isnan(x)
                 axis.plot(x[known], value[known], style, label=label, **look)
     left.set_xscale("log")
-    left.set_xlabel("strength (1: costs 1 % of the return)" if costs else "strength")
-    axes[-1].set_xlabel("return lost (%)" if costs else "strength")
+    left.set_xlabel(one)
+    axes[-1].set_xlabel("return lost (%)" if costs else one)
     left.set_ylabel(metric.title + (" (%)" if metric.unit == "percent" else ""))
     if metric.unit == "percent":
         left.set_ylim(0, 102)

@@ -13,7 +13,7 @@ from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import ALPHA, Lead, Position, Ranking, Row, leads, rank, win_rates
-from oodd_eval.plugins.contract import Training
+from oodd_eval.plugins.contract import Training, training_mark
 from oodd_eval.results.board import (
     Board,
     Conditions,
@@ -79,7 +79,7 @@ class Standing:
 
     @property
     def training(self) -> Training:
-        """The training data that its detector declares, see `DetectorSpec`."""
+        """What its detector knows, as it declares, see `DetectorSpec`."""
         return next((r.training for r in self.records if r.training != "nominal"), "nominal")
 
     @property
@@ -87,7 +87,8 @@ class Standing:
         """The marks printed behind a row's name: trivial, variant, clone, other training data."""
         marks = " (trivial)" * self.trivial + " (variant)" * (not self.primary)
         marks += f" (= {self.clone_of})" if self.clone_of else ""
-        return marks + (f" (trained on {self.training})" if self.training != "nominal" else "")
+        mark = training_mark(self.training)
+        return marks + (f" ({mark})" if mark else "")
 
 
 class RankedBoard(NamedTuple):
@@ -344,7 +345,7 @@ def _state(
     defined = sum(not math.isnan(value) for value in values)
     if undefined := sum(r.ok for r in records) - defined:
         reasons.append(f"undefined in {undefined} of {expected} cells")
-    reasons += sorted({f"trained on {r.training}" for r in records if r.training != "nominal"})
+    reasons += sorted({training_mark(r.training) for r in records} - {""})
     if primary and has_few_seeds(records):
         reasons.append(f"{seeds} of {SEEDS} detector seeds")
     return ", ".join(reasons)

@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from oodd_eval.data.condition import PAPER, RUNGS, Rung, rungs_of
-from oodd_eval.data.facts import title_of
+from oodd_eval.data.condition import GROWTH, PAPER, RUNGS, Rung, rungs_of
+from oodd_eval.data.facts import ENVIRONMENTS, title_of
 from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, UNDEFINED, metric_info
@@ -21,13 +21,13 @@ from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geome
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import Table, show_value
+from oodd_eval.results.tables import Table, show_value, unranked
 
 DETECTION: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 """The metric whose share decides: found within 100 rows, where 5 % of nominal episodes alarm."""
 
-UNIT: Final = "kept99"
-"""The rung whose strength is the unit where the ladder's strengths of pairs are put together."""
+UNITS: Final = ("kept99", "loss1")
+"""The rungs whose strength is the unit where the ladder's strengths of pairs are put together."""
 
 Pair = tuple[str, str]
 Thresholds = dict[Setting, dict[Pair, DetectionThreshold]]
@@ -45,8 +45,8 @@ class Strengths:
         Names of all strengths: rungs of the benchmark's ladder in its order, others by their mean
         number.
     calibrated
-        Whether all are rungs of the benchmark's ladder, which have a common unit: the strength that
-        costs 1 % of the return. Others are in the unit of their kind of anomaly.
+        Whether all are rungs of a ladder, which have a common unit, see `base`. Others are in the
+        unit of their kind of anomaly.
     """
 
     rungs: Mapping[Pair, Mapping[str, Rung]]
@@ -77,11 +77,19 @@ class Strengths:
         names = sorted(numbers, key=lambda name: (_position(name), float(np.mean(numbers[name]))))
         return cls(rungs, tuple(names), calibrated=all(name in RUNGS for name in names))
 
+    @property
+    def base(self) -> str:
+        """The rung whose strength is the unit, one of `UNITS`; empty where not `calibrated`."""
+        if not self.calibrated:
+            return ""
+        return UNITS[1] if any(name in GROWTH for name in self.names) else UNITS[0]
+
     def unit(self, pair: Pair) -> float:
         """Return the strength of a pair that is 1 where several pairs are put together."""
         if not self.calibrated:
             return 1.0
-        return {**_calibrated(*pair), **self.rungs[pair]}[UNIT].strength
+        rungs = {**_calibrated(*pair), **self.rungs[pair]}
+        return next((rungs[name].strength for name in UNITS if name in rungs), 1.0)
 
     def chosen(self, name: str) -> dict[Pair, str]:
         """Return the strength of each pair that counts in the column of a name.
@@ -93,7 +101,8 @@ class Strengths:
         """
         chosen = {}
         for pair, rungs in self.rungs.items():
-            weaker = [n for n in _calibrated(*pair) if _position(n) <= _position(name)]
+            ladder = _calibrated(*pair) or rungs
+            weaker = [n for n in ladder if _position(n) <= _position(name)]
             counted = weaker[-1] if name in RUNGS and weaker else name
             if counted in rungs:
                 chosen[pair] = counted
@@ -106,7 +115,12 @@ class Strengths:
 
 
 def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
-    """Return the rungs of the benchmark's ladder; none for what is not calibrated."""
+    """Return the rungs of the benchmark's ladder; none for what is not calibrated.
+
+    Those of other environments are known from records alone, whatever is installed.
+    """
+    if environment not in ENVIRONMENTS:
+        return {}
     try:
         return rungs_of(environment, anomaly)
     except (SplitError, UnknownNameError):
@@ -188,7 +202,7 @@ def threshold_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
             "high": threshold.interval[1],
             "weakest": threshold.weakest,
             "strongest": threshold.strongest,
-            UNIT: strengths.unit(pair) if strengths.calibrated else math.nan,
+            UNITS[0]: strengths.unit(pair) if strengths.calibrated else math.nan,
         }
         for setting, pairs in thresholds(records).items()
         for pair, threshold in pairs.items()
@@ -247,12 +261,17 @@ _SIDES: Final = (
     "What that hides is marked: the true mean is at most this (≤), more (>), or either (~)."
 )
 _COLUMNS: Final = {
-    True: "At keptN the policy keeps N % of its return; 4th, 16th and 64th are those parts of "
+    UNITS[0]: "At keptN the policy keeps N % of its return; 4th, 16th and 64th are those parts of "
     "kept99's strength. A ladder without a rung counts there with its next weaker one.",
-    False: "Columns are named by strengths; their means are over the environments and anomalies "
+    UNITS[1]: "At lossN the task's loss is N % higher. A ladder without a rung counts there with "
+    "its next weaker one.",
+    "": "Columns are named by strengths; their means are over the environments and anomalies "
     "that have the strength.",
-}  # of the benchmark's ladder, and of other strengths
-_COSTS: Final = "the strength that costs 1 % of the return"
+}  # by the unit of the strengths
+COSTS: Final = MappingProxyType(
+    {UNITS[0]: "costs 1 % of the return", UNITS[1]: "raises the task's loss by 1 %"}
+)
+"""What the strength of the unit does, by `Strengths.base`."""
 
 
 NO_UNITS: Final[Mapping[str, str]] = MappingProxyType({})
@@ -325,15 +344,17 @@ def overview(board: Board, by_row: Thresholds) -> Table:
             text = mean.text() + "*" * (mean.pairs < most)
             figures = [text, mean.pairs, mean.below, mean.above]
         rows.append([str(entry), *map(str, figures), *shares[entry]])
-    over = f"as a multiple of {_COSTS}" if strengths.calibrated else "in the units of the anomalies"
+    over = "in the units of the anomalies"
+    if strengths.calibrated:
+        over = f"as a multiple of the strength that {COSTS[strengths.base]}"
     if reference:
         over = f"as a multiple of {REFERENCE}'s"
     header = ["detector", "threshold", "pairs", "below", "above", *strengths.names]
     note = (
         f"{_RULE} Shown is its geometric mean {over}, over pairs of environment and "
         "anomaly, with its 95 % interval. In so many pairs it lies below or above the ladder, and "
-        f"counts as the end of the ladder. {_SIDES} {_COLUMNS[strengths.calibrated]}"
-    )
+        f"counts as the end of the ladder. {_SIDES} {_COLUMNS[strengths.base]} {unranked(board)}"
+    ).rstrip()
     title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
     return Table(title, header, rows, note=note)
 
@@ -342,7 +363,7 @@ def _separability(board: Board, order: list[Setting], strengths: Strengths) -> T
     """Return the metric that ranks by strength."""
     texts = _by_strength(board, order, strengths, board.ranking)
     rows = [[str(e), *texts[e]] for e in order]
-    header, note = ["detector", *strengths.names], _COLUMNS[strengths.calibrated]
+    header, note = ["detector", *strengths.names], _COLUMNS[strengths.base]
     title = metric_info(board.ranking).title
     return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
 
@@ -363,13 +384,15 @@ def _by_kind(
         means = (_mean(by_pair, {}, strengths) for by_pair in of_kind)
         texts = (mean.text(interval=intervals) if mean else "" for mean in means)
         rows.append([str(entry), *texts])
-    over = f"in units of {_COSTS}" if strengths.calibrated else "each in its own unit"
+    over = "each in its own unit"
+    if strengths.calibrated:
+        over = f"in units of the strength that {COSTS[strengths.base]}"
     title = f"Detection thresholds by anomaly, {over}"
     note = (
         f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts as "
         f"its end. {_SIDES}"
     )
-    # Calibrated thresholds are multiples of what costs 1 % of the return.
+    # Calibrated thresholds are multiples of the strength that is the unit.
     titles = kinds if strengths.calibrated else _with_units(kinds, units)
     return Table(title, ["detector", *titles], rows, note=note)
 

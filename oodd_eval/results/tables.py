@@ -13,6 +13,7 @@ from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.metrics.promise import enough_episodes
+from oodd_eval.plugins.contract import training_mark
 from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -152,7 +153,14 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
     rows = [[str(entry), *texts(board, entry, columns)] for entry in best_first(board)]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    return Table(title, ["detector", *(c.title for c in columns)], rows)
+    return Table(title, ["detector", *(c.title for c in columns)], rows, note=unranked(board))
+
+
+def unranked(board: Board) -> str:
+    """Return a note on the rows that no board ranks, for what they know; empty without one."""
+    marks = {str(r.setting): training_mark(r.training) for r in board.records}
+    known = [f"{row} ({mark})" if mark != row else row for row, mark in marks.items() if mark]
+    return f"Not ranked, for what they know: {', '.join(known)}." if known else ""
 
 
 def best_first(board: Board) -> list[Setting]:
@@ -473,8 +481,13 @@ def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
             "A row with = and another's name has that row's scores. It has the same rank, and "
             "pushes no other row down."
         )
-    if any(row.training != "nominal" for row in rows):
+    if any(row.training not in {"nominal", "oracle"} for row in rows):
         lines.append("Rows trained on more than nominal trajectories of the split are not ranked.")
+    if any(row.training == "oracle" for row in rows):
+        lines.append(
+            "An oracle has the true equations of the environment. It says how far the limit is, "
+            "and is not ranked."
+        )
     if any(row.below for row in rows):
         lines.append(
             "Ranked are rows that maintainers have run again on seeds of their own. The others "

@@ -9,10 +9,11 @@ from typing import Final
 import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES, TABLE1
+from oodd_eval.data.registry import Fault
 from oodd_eval.names import check_known
-from oodd_recording.environments import Simulator
-from oodd_recording.faults import MAKERS, Command, Dynamics, Fault, SensorFault, choose_attributes
+from oodd_recording.faults import MAKERS, Command, Dynamics, SensorFault, choose_attributes
 from oodd_recording.info import info_of
+from oodd_recording.simulator import Simulator
 from oodd_recording.values import VALUES, choose_sensors
 
 NOMINAL_MARGIN: Final = 0.02  # draws this near to the nominal value change next to nothing

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, AnomalyInfo, EnvironmentInfo
-from oodd_eval.data.registry import AnomalySpec, Attribute, EnvironmentSpec
+from oodd_eval.data.registry import PULSES, AnomalySpec, Attribute, EnvironmentSpec
 from oodd_eval.plugins import hookimpl
 
 FROZEN: Final = Path(__file__).with_name("frozen")
@@ -17,6 +17,12 @@ FROZEN: Final = Path(__file__).with_name("frozen")
 
 _ATTRIBUTES: Final = ("gravity", "body_mass", "friction")
 _DISCRETE: Final = ("gain", "bias", "wind")  # of environments with discrete actions
+_PACKAGES: Final = {
+    "bullet": ("pybullet", "pybullet-envs-gymnasium"),
+    "lunarlander": ("box2d",),
+    "acrobot": (),  # Gymnasium's own, whose version is in every manifest
+    "cartpole": (),
+}
 
 
 @hookimpl
@@ -33,6 +39,7 @@ def oodd_anomalies() -> list[AnomalySpec]:
         AnomalySpec(
             name=info.id,
             make=functools.partial(make_anomaly, info.id),
+            pulses=PULSES if info.id.endswith("-intermittent") else None,
             **{name: getattr(info, name) for name in shared},
         )
         for info in ANOMALIES.values()
@@ -55,14 +62,23 @@ def _environment(info: EnvironmentInfo) -> EnvironmentSpec:
             )
             for name in names
         },
+        packages=_PACKAGES["bullet" if info.family == "bullet" else info.id],
     )
 
 
 def make_environment(environment: str) -> Any:
-    """Return a fresh simulator of an environment."""
-    from oodd_recording.environments import SIMULATORS  # noqa: PLC0415  slow to import
+    """Return a fresh simulator of an environment; only that simulator's library is imported."""
+    if environment in {"acrobot", "cartpole"}:
+        from oodd_recording.classic import Acrobot, CartPole  # noqa: PLC0415  slow to import
 
-    return SIMULATORS[environment]()
+        return Acrobot() if environment == "acrobot" else CartPole()
+    if environment == "lunarlander":
+        from oodd_recording.lander import LunarLander  # noqa: PLC0415  slow to import
+
+        return LunarLander()
+    from oodd_recording.bullet import ROBOTS, Bullet  # noqa: PLC0415  slow to import
+
+    return Bullet(ROBOTS[environment])
 
 
 def make_anomaly(kind: str, strength: float, rng: Any, simulator: Any) -> Any:

@@ -16,7 +16,7 @@ import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
@@ -25,16 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import layout
-from oodd_eval.data.condition import Condition, conditions_of
+from oodd_eval.data.condition import Condition, conditions_of, ladder_of
 from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
 from oodd_eval.data.files import only_writer, remove_abandoned, replacing
 from oodd_eval.data.layout import Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import SimulationError, SplitError, UsageError
+from oodd_eval.errors import MissingExtraError, SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
-from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of
+from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of, packages_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
     GENERATOR_VERSION,
@@ -43,6 +43,7 @@ from oodd_recording.record import (
     measure,
     record_seed,
 )
+from oodd_recording.simulator import how_to_install
 from oodd_recording.values import bound_of, unit_of
 
 CHUNK: Final = {
@@ -53,7 +54,9 @@ CHUNK: Final = {
 WORK: Final = ".building"  # the work folder, gone when the split is whole
 MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
 
-PACKAGES: Final = ("oodd-eval", "numpy", "gymnasium", "pybullet", "pybullet-envs-gymnasium")
+PACKAGES: Final = ("oodd-eval", "numpy", "gymnasium")
+"""Distributions whose versions a manifest has, besides those of the simulators."""
+
 Progress = Callable[[int, int, str], None]
 """Called with chunks done, chunks in all, and the environment and part of the last one."""
 
@@ -111,8 +114,9 @@ def build_split(
 ) -> Path:
     """Build a split into a directory and return the directory; resume an earlier build.
 
-    Complete environments there are kept. By default there are all seven, the frozen policies act,
-    one worker process per core. `bits` are those of a definition whose seeds are drawn.
+    Complete environments there are kept. By default there are all seven, with their own policies,
+    and one worker process per core. `policies` are files of others, `bits` those of a definition
+    whose seeds are drawn.
     `UsageError` for a wrong size, or another split in the directory.
     """
     names = in_order(ENVIRONMENTS if environments is None else environments, ENVIRONMENTS)
@@ -134,6 +138,7 @@ def build_split(
         todo = {
             e: _chunks(definition, e, paths[e], digests[e], bits) for e in names if e not in entries
         }
+        versions = _versions(todo)
         further: dict[str, list[Chunk]] = todo
         while any(further.values()):
             chunks = [c for planned in todo.values() for c in planned]
@@ -147,10 +152,28 @@ def build_split(
         for environment, chunks in todo.items():
             entries[environment] = _write(definition, chunks, work, directory)
         ordered = {e: entries[e] for e in in_order(entries, ENVIRONMENTS)}
-        versions = {p: version(p) for p in PACKAGES} | {"python": platform.python_version()}
+        if len(ordered) > len(todo):  # an earlier call may have had other packages
+            versions = layout.read_manifest(directory)["versions"] | versions
         layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
         shutil.rmtree(work)
     return directory
+
+
+def _versions(environments: Iterable[str]) -> dict[str, str]:
+    """Return the versions of what records some environments; none where there are none."""
+    names = list(environments)
+    packages = [*PACKAGES, *packages_of(names)] if names else []
+    try:
+        versions = {package: version(package) for package in packages}
+    except PackageNotFoundError as error:
+        needing = [e for e in names if error.name in packages_of([e])] or names
+        extra = "bullet" if str(error.name).startswith("pybullet") else "sim"
+        ours = set(needing) <= set(ENVIRONMENTS)
+        raise MissingExtraError(
+            f"{error.name} is not installed, which is to record {', '.join(needing)}: "
+            f"{how_to_install(extra)}{'' if ours else ', or what the plug-in names in `packages`'}"
+        ) from error
+    return versions | ({"python": platform.python_version()} if names else {})
 
 
 def _write(
@@ -200,10 +223,12 @@ def _check_sizes(definition: SplitDefinition) -> None:
 
 def _check_strengths(definition: SplitDefinition, environment: str) -> None:
     """Raise `UsageError` for kinds that an environment cannot have, and beyond their bounds."""
-    if not definition.strengths and environment not in ENVIRONMENTS:
+    calibrated = definition.suite == "ladder" and ladder_of(environment)
+    if not definition.strengths and environment not in ENVIRONMENTS and not calibrated:
         raise UsageError(
             f"no strengths of anomalies are given for {environment!r}, an environment of one's own:"
-            f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}"
+            f" expected --strength KIND=NUMBER with one of {', '.join(kinds_of(environment))}, or "
+            "--suite ladder where its plug-in has one"
         )
     for condition, strength in definition.strengths.items():
         kind = Condition.parse(condition).anomaly
@@ -220,7 +245,7 @@ def _acting(definition: SplitDefinition, environment: str, path: str) -> str:
     """Return the digest of what acts in an environment: policy, and code of one's own."""
     policy = load_policy(environment, path or None)
     measure(environment, policy)
-    kinds = [Condition.parse(condition).anomaly for condition in definition.strengths]
+    kinds = dict.fromkeys(c.anomaly for c in _conditions(definition, environment))
     code = code_digest(environment, kinds)
     return hashlib.sha256(f"{policy.digest} {code}".encode()).hexdigest() if code else policy.digest
 

@@ -21,11 +21,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.condition import FRACTIONS, LEVELS, PAPER, ROBOTS_CAP, WHOLE
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, paper_tables
+from oodd_eval.data.condition import FRACTIONS, GROWTH, LEVELS, PAPER, ROBOTS_CAP, WHOLE
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, in_order, paper_tables
 from oodd_eval.data.files import write_text
+from oodd_eval.data.registry import environment_spec
+from oodd_eval.errors import SimulationError
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
+from oodd_recording.info import info_of, kinds_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
     GENERATOR_VERSION,
@@ -34,6 +37,7 @@ from oodd_recording.record import (
     record_anomalous,
     return_of,
 )
+from oodd_recording.record import measure as measure_sensors
 from oodd_recording.values import bound_of, unit_of
 
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies
@@ -43,6 +47,7 @@ MARGIN: Final = 0.02  # above all levels, where the first pass ends
 FINEST: Final = 1.1  # ratio of neighbours between which nothing is measured any more
 NEAR: Final = 0.1  # of the return that a level loses: so near to it a strength is the level's
 DRAWS: Final = 1000
+FIRST_JUDGED: Final = 60  # row from which on losses count: episodes begin with a transient
 
 Floats = NDArray[np.float64]
 Curve = dict[float, list[float]]
@@ -51,13 +56,33 @@ Curve = dict[float, list[float]]
 
 def setup_of(environment: str, *, whole: bool = False) -> Setup:
     """Return policy and cap with which returns are measured, `whole` without a cap."""
-    cap = None if whole or ENVIRONMENTS[environment].discrete else ROBOTS_CAP
-    return Setup(environment, load_policy(environment), cap)
+    robot = environment in ENVIRONMENTS and not ENVIRONMENTS[environment].discrete
+    policy = load_policy(environment)
+    measure_sensors(environment, policy)
+    return Setup(environment, policy, ROBOTS_CAP if robot and not whole else None)
 
 
 def episodes_of(environment: str) -> int:
     """Return the number of seeds: robots take a hundred times longer than the others."""
-    return 100 if ENVIRONMENTS[environment].discrete else 32
+    robot = environment in ENVIRONMENTS and not ENVIRONMENTS[environment].discrete
+    return 32 if robot else 100
+
+
+def has_loss(environment: str) -> bool:
+    """Tell whether an environment's levels are growth of a loss, not shares of a return."""
+    return environment_spec(environment).task == "loss"
+
+
+def loss_of(episode: RecordedEpisode, cap: int) -> float:
+    """Return the loss after an episode's onset, from row 60 on; 1 in each row after its end."""
+    start = max(episode.onset or 0, FIRST_JUDGED)
+    losses = 1.0 - episode.rewards[start:].astype(np.float64)
+    if losses.size and (losses.min() < 0 or losses.max() > 1):
+        raise SimulationError(
+            f"an episode of seed {episode.seed} has rewards from {1 - losses.max():g} to "
+            f"{1 - losses.min():g}, expected 0 to 1 where the task is a loss"
+        )
+    return float(losses.sum()) + max(0, cap - max(len(episode.rewards), start))
 
 
 @functools.cache
@@ -78,12 +103,14 @@ def measure(
     *,
     whole: bool = False,
 ) -> list[float]:
-    """Return the returns of the seeds under an anomaly of a strength."""
+    """Return the returns of the seeds under an anomaly of a strength, or their negative losses."""
     setup = setup_of(environment, whole=whole)
     episodes = (
         record_anomalous(setup, kind, strength, twin, redraws=0)
         for twin in twins_of(environment, first, count, whole=whole)
     )
+    if has_loss(environment):
+        return [-loss_of(episode, info_of(environment).episode_cap) for episode in episodes]
     return [return_of(episode) for episode in episodes]
 
 
@@ -130,10 +157,13 @@ def nearest(curve: Floats, level: float) -> int:
 def levels_of(environment: str, kind: str, *, whole: bool = False) -> dict[str, float]:
     """Return the shares to find, by rung; for a kind of the paper that of its Table 2, too.
 
-    On `whole` episodes it is the latter alone.
+    On `whole` episodes it is the latter alone. A loss that grows by a tenth keeps .9, as a return
+    does that falls by a tenth.
     """
+    if has_loss(environment):
+        return {name: 1 - growth for name, growth in GROWTH.items()}
     levels = {} if whole else dict(LEVELS)
-    if kind in TABLE1:
+    if kind in TABLE1 and environment in ENVIRONMENTS:
         table = paper_tables()["table2_policy_return"][environment]
         nominal, changed = float(table["nominal"]), float(table[kind])
         levels[WHOLE if whole else PAPER] = 1 - (nominal - changed) / abs(nominal)
@@ -211,12 +241,14 @@ def find_rungs(
     if whole:
         return {WHOLE: rung(levels[WHOLE])}
     rungs: dict[str, dict[str, Any]] = {}
-    for name in LEVELS:
+    for name in (name for name in levels if name != PAPER):
         candidate = rung(levels[name])
         if not rungs or candidate["strength"] > max(r["strength"] for r in rungs.values()):
             rungs[name] = candidate
     weak = {
-        n: {"strength": _rounded(f * rungs["kept99"]["strength"])} for n, f in FRACTIONS.items()
+        name: {"strength": _rounded(share * rungs["kept99"]["strength"])}
+        for name, share in FRACTIONS.items()
+        if "kept99" in rungs
     }
     entry = {"unit": unit_of(environment, kind), "bound": bound, "rungs": weak | rungs}
     return entry | ({PAPER: rung(levels[PAPER])} if PAPER in levels else {})
@@ -245,7 +277,8 @@ def calibrate(
         (e, kind)
         for e in environments
         for kind in kinds
-        if not whole or (kind in TABLE1 and not ENVIRONMENTS[e].discrete)
+        if kind in kinds_of(e)
+        and (not whole or (kind in TABLE1 and e in ENVIRONMENTS and not ENVIRONMENTS[e].discrete))
     ]
     measured, broken = _read_work(work)
     caps = [WHOLE] if whole else []
@@ -265,16 +298,25 @@ def calibrate(
         def curve(e: str, kind: str) -> Curve:
             return {i[3]: r for i, r in measured.items() if i[:3] == (str(key[e]), e, kind)}
 
+        def strong(e: str, kind: str) -> Curve:
+            return {strength: r for strength, r in curve(e, kind).items() if strength}
+
+        def base(e: str, kind: str) -> list[float]:
+            # Losses count from the onset, which differs by kind.
+            return curve(e, kind if has_loss(e) else "")[0.0]
+
         pending: dict[Future[list[float]], tuple[str, str, float]] = {}
 
         def go_on(e: str, kind: str) -> None:
-            nominal = curve(e, "")[0.0]
-            if strength := next_strength(e, kind, curve(e, kind), nominal, whole=whole):
+            nominal = base(e, kind)
+            if strength := next_strength(e, kind, strong(e, kind), nominal, whole=whole):
                 future = pool.submit(measure, e, kind, strength, whole=whole)
                 pending[future] = e, kind, strength
 
-        for e in dict.fromkeys(e for e, _ in pairs):
-            if not curve(e, ""):
+        for e, kind in pairs:
+            if has_loss(e) and not curve(e, kind):
+                keep(e, kind, 0.0, measure(e, kind, 0.0))
+            elif not has_loss(e) and not curve(e, ""):
                 keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e, whole=whole)])
         for pair in pairs:
             go_on(*pair)
@@ -288,9 +330,9 @@ def calibrate(
             go_on(e, kind)
         ladder = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
         for e, kind in pairs:
-            rungs = find_rungs(e, kind, curve(e, kind), curve(e, "")[0.0], whole=whole)
+            rungs = find_rungs(e, kind, strong(e, kind), base(e, kind), whole=whole)
             ladder[e] = ladder.get(e, {}) | {kind: ladder.get(e, {}).get(kind, {}) | rungs}
-    ordered = {e: ladder[e] for e in ENVIRONMENTS if e in ladder}
+    ordered = {e: ladder[e] for e in in_order(ladder, ENVIRONMENTS)}
     write_text(output, json.dumps(ordered, indent=1) + "\n")
     return ordered
 

@@ -1,18 +1,28 @@
 """Checks of custom environments and anomalies, before days of recording rest on them."""
 
+import copy
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.data.registry import AnomalySpec, Spec
+from oodd_eval.data.registry import AnomalySpec, Fault, Spec, anomaly_spec, environment_spec
 from oodd_eval.errors import OoddError, SimulationError
+from oodd_recording.faults import make_fault
 from oodd_recording.info import info_of
-from oodd_recording.policies import Policy, load_policy
-from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, Setup, measure, record_anomalous
+from oodd_recording.policies import CustomPolicy, Policy, load_policy
+from oodd_recording.record import (
+    SHORTEST_TWIN,
+    RecordedEpisode,
+    Setup,
+    measure,
+    record_anomalous,
+    record_attempt,
+)
+from oodd_recording.simulator import Row, Simulator
 from oodd_recording.values import bound_of
 
 SEEDS: Final = range(960_000_000, 960_000_008)  # outside every split and training
@@ -55,6 +65,74 @@ class Subject:
         strength = part * bound_of(self.environment, self.kind)
         return [record_anomalous(self.setup, self.kind, strength, t, redraws=0) for t in self.twins]
 
+    def driven(self, drive: Callable[[Fault], Fault], part: float = 1.0) -> list[RecordedEpisode]:
+        """Return an episode for each twin, in which `drive` decides when the kind's fault acts."""
+        strength = part * bound_of(self.environment, self.kind)
+
+        def maker(simulator: Simulator, rng: np.random.Generator) -> Fault:
+            return drive(anomaly_spec(self.kind).make(strength, rng, simulator))
+
+        return [record_attempt(self.setup, self.kind, twin, maker) for twin in self.twins]
+
+    def check_twins(self, episodes: Sequence[RecordedEpisode], when: str) -> None:
+        """Fail unless episodes are their twins, bit for bit."""
+        for episode, twin in zip(episodes, self.twins, strict=True):
+            if _content(episode) != _content(twin):
+                raise SimulationError(f"with seed {twin.seed} it differs from its twin {when}")
+
+
+class Blinking(Fault):
+    """A fault that begins and ends again before every transition."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.parameters)
+        self._fault = fault
+        self._rows: Sequence[Row] = ()
+
+    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
+        self._rows = rows
+
+    def command(self, action: Any, simulator: Any) -> Any:
+        self._fault.begin(simulator, self._rows)
+        self._fault.command(copy.copy(action), simulator)
+        self._fault.end(simulator)
+        simulator.restore()
+        return action
+
+
+class Shareless(Fault):
+    """A fault of which a share of 0 is in force; rows are mixed by it elsewhere."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.parameters)
+        self._fault, fault.share = fault, 0.0
+
+    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
+        self._fault.begin(simulator, rows)
+
+    def command(self, action: Any, simulator: Any) -> Any:
+        return self._fault.command(action, simulator)
+
+
+class Watched(Fault):
+    """A fault whose rows are compared: `corrupted` are the numbers of the columns that differ."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.parameters)
+        self._fault = fault
+        self.corrupted: set[int] = set()
+
+    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
+        self._fault.begin(simulator, rows)
+
+    def command(self, action: Any, simulator: Any) -> Any:
+        return self._fault.command(action, simulator)
+
+    def observe(self, row: Row, step: int) -> Row:
+        changed = self._fault.observe(row.copy(), step)
+        self.corrupted |= {int(i) for i in np.flatnonzero(changed != row)}
+        return changed
+
 
 def _content(episode: RecordedEpisode) -> bytes:
     arrays = episode.trajectory.observations, episode.trajectory.actions, episode.rewards
@@ -90,24 +168,50 @@ def check_seed(subject: Subject) -> None:
 
 
 def check_policy(subject: Subject) -> None:
-    """An action follows from the observation row alone."""
-    twin = subject.twins[0].trajectory
-    policy, discrete = load_policy(subject.environment), info_of(subject.environment).discrete
-    for t in reversed(range(twin.transitions)):
+    """Actions follow from the row alone, or from all rows since reset(); they are within limits."""
+    twin, info = subject.twins[0].trajectory, info_of(subject.environment)
+    policy, order = load_policy(subject.environment), list(range(twin.transitions))
+    if isinstance(policy, CustomPolicy) and policy.has_memory:
+        for row in subject.twins[-1].trajectory.observations:  # something to forget
+            policy.act(row)
+        policy.reset()
+        advice = "after reset(): let it forget all that act() remembers, and draw nothing at random"
+    else:
+        order.reverse()
+        advice = (
+            "when it is asked alone: it may not draw at random, and a controller that remembers "
+            "rows is an object with act(row) and reset()"
+        )
+    low, high = (np.array(ends, np.float32) for ends in info.limits)
+    for t in order:
         action = policy.act(twin.observations[t])
-        row = np.eye(twin.action_dim, dtype=np.float32)[action] if discrete else action
+        row = np.eye(twin.action_dim, dtype=np.float32)[action] if info.discrete else action
         if not np.array_equal(row, twin.actions[t]):
+            _fail(f"the policy gives another action for row {t} of seed {SEEDS[0]} {advice}")
+        if not info.discrete and not ((low <= row) & (row <= high)).all():
             _fail(
-                f"the policy gives another action for row {t} of seed {SEEDS[0]} when it is asked "
-                "alone: it may keep nothing between rows, nor draw at random"
+                f"the policy commands {np.array(row).tolist()} in row {t} of seed {SEEDS[0]}, "
+                f"expected {low.tolist()} to {high.tolist()}: let it keep to the limits, since "
+                "what it commands is stored"
+            )
+
+
+def check_rewards(subject: Subject) -> None:
+    """Where the task is a loss, rewards lie in [0, 1]."""
+    if environment_spec(subject.environment).task != "loss":
+        return
+    for episode in subject.anomalous(1.0) if subject.kind else subject.twins:
+        low, high = episode.rewards.min(), episode.rewards.max()
+        if not (low >= 0 and high <= 1):
+            _fail(
+                f"rewards of seed {episode.seed} are {low:g} to {high:g}, expected 0 to 1: the "
+                "task is a loss, 1 - reward a row"
             )
 
 
 def check_zero_strength(subject: Subject) -> None:
     """At strength 0 an episode is its twin, bit for bit."""
-    for episode, twin in zip(subject.anomalous(0.0), subject.twins, strict=True):
-        if _content(episode) != _content(twin):
-            _fail(f"with seed {twin.seed} it differs from its twin at strength 0")
+    subject.check_twins(subject.driven(lambda fault: fault, 0.0), "at strength 0")
 
 
 def check_onset(subject: Subject) -> None:
@@ -150,8 +254,67 @@ def check_strength(subject: Subject) -> None:
         _fail(f"the mean distance from the twins is {profile} of the bound, expected it to grow")
 
 
-_ENVIRONMENT: Final = (check_columns, check_seed, check_policy)
-_ANOMALY: Final = (check_zero_strength, check_onset, check_draws, check_strength)
+def check_sensors(subject: Subject) -> None:
+    """Only measured sensors are corrupted, and all that are stand in the fault's parameters."""
+    columns, strength = (
+        environment_spec(subject.environment).sensors,
+        bound_of(subject.environment, subject.kind),
+    )
+    for twin in subject.twins:
+        watched: list[Watched] = []
+
+        def maker(simulator: Simulator, rng: np.random.Generator) -> Fault:
+            watched.append(Watched(make_fault(subject.kind, strength, simulator, rng)))  # noqa: B023
+            return watched[0]  # noqa: B023
+
+        record_attempt(subject.setup, subject.kind, twin, maker)
+        named = watched[0].parameters.get("sensors", ())
+        for i in sorted(watched[0].corrupted):
+            if columns[i].role != "measured":
+                _fail(
+                    f"with seed {twin.seed} it corrupts {columns[i].name!r} ({columns[i].role}), "
+                    "expected sensors whose role is measured"
+                )
+            if i not in named:
+                _fail(
+                    f"with seed {twin.seed} it corrupts {columns[i].name!r}, number {i}, expected "
+                    f'it among the "sensors" of its parameters, {[*named]}'
+                )
+
+
+def check_end(subject: Subject) -> None:
+    """A fault that ended leaves nothing: it may end before every transition, and its twin stays."""
+    when = "though it ended before each transition: let end() put back what begin() and command() "
+    subject.check_twins(subject.driven(Blinking), when + "change")
+
+
+def check_share(subject: Subject) -> None:
+    """A fault that grows changes no command and no dynamics while its share is 0."""
+    when = "while its share is 0: let command() weaken what it does by self.share"
+    subject.check_twins(subject.driven(Shareless), when)
+
+
+_ENVIRONMENT: Final = (check_columns, check_seed, check_policy, check_rewards)
+_ANOMALY: Final = (
+    check_zero_strength,
+    check_onset,
+    check_draws,
+    check_strength,
+    check_sensors,
+    check_rewards,
+)
+
+
+def _checks_of(spec: Spec) -> Iterator[Callable[[Subject], None]]:
+    """Yield the checks of a spec: how a fault ends and grows matters where it does."""
+    if not isinstance(spec, AnomalySpec):
+        yield from _ENVIRONMENT
+        return
+    yield from _ANOMALY
+    if spec.lasts or spec.pulses or spec.intermittent:
+        yield check_end
+    if spec.ramp:
+        yield check_share
 
 
 def custom_checks(spec: Spec, environment: str) -> Iterator[tuple[str, Callable[[], str]]]:
@@ -161,7 +324,7 @@ def custom_checks(spec: Spec, environment: str) -> Iterator[tuple[str, Callable[
     """
     anomaly = isinstance(spec, AnomalySpec)
     subject = Subject(environment, spec.name if anomaly else "")
-    for check in _ANOMALY if anomaly else _ENVIRONMENT:
+    for check in _checks_of(spec):
         name = check.__name__.removeprefix("check_").replace("_", "-")
         yield name, functools.partial(_carried_out, check, subject)
 

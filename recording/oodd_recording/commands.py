@@ -1,10 +1,10 @@
-"""Commands of oodd-eval that record: ``data build`` and ``calibrate``, ``policies``.
+"""Commands of oodd-eval that record: ``data build``, ``calibrate`` and ``page``, ``policies``.
 
 The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -27,7 +27,8 @@ from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.terminal import make_console, register_custom
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ANOMALIES, CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
-from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
+from oodd_eval.data.files import temporary_directory
+from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, inner_of
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, select
@@ -35,10 +36,13 @@ from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks
+from oodd_recording.info import kinds_of
+from oodd_recording.page import Page, write_page
 from oodd_recording.policies import load_policy
 from oodd_recording.record import evaluate_policy
 from oodd_recording.train.train import train_policy
 
+TRIED: Final = 5  # episodes in which an imported policy is tried
 _SIZE: Final = click.types.IntParamType()
 _environment_argument: Final = click.argument("environment", type=Name("envs"))
 
@@ -61,6 +65,8 @@ def _strengths(text: str) -> list[tuple[str, float]]:
     "data build dev-ladder --base dev --suite ladder",
     "data build mine --env cartpole --train 40 --calibration 40 --test 10 --seed-base 42 "
     "--strength iid=0.1,0.3",
+    "data build other --env cartpole --policy cartpole.npz --train 40 --calibration 40 --test 10 "
+    "--seed-base 43",
     plugins=True,
 )
 @click.argument(
@@ -80,9 +86,7 @@ def _strengths(text: str) -> list[tuple[str, float]]:
 @click.option(
     "--base", type=Name("splits"), help="take training and calibration part, and test seeds"
 )
-@click.option(
-    "--suite", type=click.Choice(["ladder", "paper"]), help="strengths of anomalies; needs --base"
-)
+@click.option("--suite", type=click.Choice(["ladder", "paper"]), help="strengths of anomalies")
 @click.option(
     "--strength",
     multiple=True,
@@ -95,18 +99,23 @@ def _strengths(text: str) -> list[tuple[str, float]]:
     type=Names("envs"),
     help="environments, also of plug-ins (default: all of the benchmark)",
 )
+@click.option("--policy", type=FILE, help="policy file of the one --env (default: its own)")
 @jobs_option
 @click.option(
     "--output", type=DIRECTORY, help="directory of the split (default: where splits are found)"
 )
 def build(options: Options) -> int:
     """Record a split, which needs the extra sim; what an earlier call has recorded is kept."""
-    environments = list(ENVIRONMENTS)
-    if options.env != "all" or options.strength:
+    definition = _definition(options)
+    environments = list(definition.environments or ENVIRONMENTS)
+    if options.env != "all" or options.strength or definition.environments:
         custom = [s.name for s in register_custom(options) if isinstance(s, EnvironmentSpec)]
         if options.env != "all":
             environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
-    record_split(_definition(options), options, environments, options.output)
+    if options.policy and len(environments) != 1:
+        raise UsageError(f"--policy is for one --env, got {', '.join(environments)}")
+    policies = dict.fromkeys(environments, options.policy) if options.policy else {}
+    record_split(definition, options, environments, options.output, policies=policies)
     return 0
 
 
@@ -117,10 +126,11 @@ def record_split(
     output: Path | None = None,
     *,
     bits: int | None = None,
+    policies: Mapping[str, Path] | None = None,
 ) -> None:
     """Record a split, by default of all environments and where splits are found.
 
-    See `build_split` for the `bits`.
+    See `build_split` for the `bits` and `policies`.
     """
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
@@ -129,6 +139,7 @@ def record_split(
         directory,
         environments=environments,
         bits=bits,
+        policies=policies,
         jobs=options.jobs,
         progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"),
     )
@@ -167,10 +178,9 @@ def _definition(options: Options) -> SplitDefinition:
             raise UsageError(f"--base {options.base} was imported: expected a recorded split")
         changed = {"suite": options.suite or "table1", "strengths": strengths}
         return SplitDefinition(**{**taken, "name": name, "base": options.base, **changed})
-    if options.suite:
-        raise UsageError(f"--suite {options.suite} needs --base, a split to take training from")
     if missing := [f"--{n}" for n, size in sizes.items() if size is None]:
         known, todo = ", ".join(SPLITS), f"to define it, {', '.join(missing)} must be given"
+        todo += ", or --base with a split that has them" if options.suite else ""
         raise UsageError(f"split {name!r} is not a published one ({known}): {todo}")
     train, calibration, test, seed_base = sizes.values()
     if seed_base not in CUSTOM_SEED_BASES:
@@ -185,12 +195,13 @@ def _definition(options: Options) -> SplitDefinition:
         test,
         cap,
         seed_base,
+        suite=options.suite or "table1",
         noise=options.noise or 0.0,
         strengths=strengths,
     )
 
 
-@command("data calibrate --env cartpole --output ladder.json")
+@command("data calibrate --env cartpole --output ladder.json", plugins=True)
 @click.option("--env", default="all", type=Names("envs"), help="environments")
 @click.option("--anomaly", default="all", type=Names("anomalies"), help="kinds of anomalies")
 @click.option(
@@ -203,14 +214,23 @@ def _definition(options: Options) -> SplitDefinition:
 @click.option("--work", type=FILE, help="measured returns (default: OUTPUT.work)")
 @jobs_option
 def calibrate(options: Options) -> int:
-    """Find the strengths of the ladder; returns that an earlier call has measured are kept."""
+    """Find the strengths of a ladder; what an earlier call has measured is kept.
+
+    With --env, also in environments of plug-ins, and of kinds of theirs.
+    """
     notes = make_console(quiet=options.verbosity < 0)
+    specs = register_custom(options) if options.env != "all" else []
+    custom = [spec.name for spec in specs if isinstance(spec, EnvironmentSpec)]
+    kinds = [spec.name for spec in specs if isinstance(spec, AnomalySpec)]
+    environments = list(ENVIRONMENTS)
+    if options.env != "all":
+        environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
     work = options.work or options.output.with_name(options.output.name + ".work")
     strengths = find_strengths(
         options.output,
         work,
-        environments=select("environment", options.env, ENVIRONMENTS),
-        kinds=select("anomaly", options.anomaly, ANOMALIES),
+        environments=environments,
+        kinds=select("anomaly", options.anomaly, [*ANOMALIES, *kinds]),
         whole=options.whole,
         jobs=options.jobs,
         progress=notes.print,
@@ -219,6 +239,33 @@ def calibrate(options: Options) -> int:
     make_console().print(
         f"strengths of {count} kinds in {len(strengths)} environments: {options.output}"
     )
+    return 0
+
+
+@command(
+    "data page hopper --output pages", "data page cartpole --anomaly iid,gravity", plugins=True
+)
+@_environment_argument
+@click.option(
+    "--anomaly",
+    type=Names("anomalies"),
+    help="kinds of anomalies (default: those of the environment's ladder, and those of plug-ins "
+    "that can be recorded in it)",
+)
+@click.option("--output", default="pages", type=DIRECTORY, help="directory of the page")
+def page(options: Options) -> int:
+    """Write a page on an environment, as Markdown with pictures.
+
+    It has what the plug-in says of the environment, sensors, actions, kinds of anomalies with their
+    strengths, a frame or drawing, and for each kind an episode beside its twin.
+    """
+    _must_know(options)
+    environment, kinds = options.environment, []
+    if options.anomaly:
+        kinds = select("anomaly", options.anomaly, kinds_of(environment))
+    notes = make_console(quiet=options.verbosity < 0)
+    path = write_page(Page(environment, kinds), options.output, notes.print)
+    make_console().print(f"page of {environment}: {path}")
     return 0
 
 
@@ -239,6 +286,42 @@ def train(options: Options) -> int:
         progress=tell,
     )
     make_console().print(f"best policy in {best}")
+    return 0
+
+
+@command("policies import actor.onnx --env hopper --output hopper.npz", plugins=True)
+@click.argument("path", type=FILE, metavar="FILE.onnx")
+@click.option("--env", required=True, type=Name("envs"), help="environment in which it acts")
+@click.option("--output", required=True, type=FILE, help="policy file, .npz or .onnx")
+@click.option("--tensor", default="", help="the graph's output with actions (default: the first)")
+def import_policy(options: Options) -> int:
+    """Take a policy over from an ONNX file, and try it in its environment.
+
+    Layers in a row become arrays of the project's own format, which needs no further package. Any
+    other graph without memory is kept as it is, and runs in onnxruntime.
+    """
+    from oodd_recording.onnx_files import layers_of, write_policy  # noqa: PLC0415  of an extra
+
+    options.environment = options.env
+    _must_know(options)
+    arrays = layers_of(options.path, options.tensor)
+    suffix = ".onnx" if arrays is None else ".npz"
+    if options.output.suffix != suffix:
+        what = "more than layers in a row" if arrays is None else "layers in a row"
+        raise UsageError(
+            f"{options.path.name} is {what}: expected an --output that ends in {suffix}"
+        )
+    with temporary_directory() as directory:  # a policy that cannot act is not written
+        partial = directory / options.output.name
+        write_policy(options.path, options.tensor, arrays, partial)
+        returns = evaluate_policy(options.env, load_policy(options.env, partial), episodes=TRIED)
+    write_policy(options.path, options.tensor, arrays, options.output)
+    policy = load_policy(options.env, options.output)
+    steps = "onnxruntime" if arrays is None else f"{len(arrays['steps'])} operations"
+    make_console().print(
+        f"policy in {options.output}, {steps}, digest {policy.digest[:12]}: mean return "
+        f"{returns.mean():.1f} in {TRIED} episodes of {options.env}"
+    )
     return 0
 
 
@@ -272,13 +355,21 @@ def _must_know(options: Options) -> None:
         register_custom(options)
 
 
+def _package_of(spec: AnomalySpec | EnvironmentSpec) -> str:
+    return inner_of(spec.make).__module__.partition(".")[0]
+
+
 def check_custom(options: Options, selects: Predicate) -> int:
     """Check an environment or an anomaly of a plug-in; 1 when a check failed, 5 when none ran."""
     specs = {spec.name: spec for spec in register_custom(options)}
     spec, environment = specs[options.name], options.name
     if isinstance(spec, AnomalySpec):
-        others = (s.name for s in specs.values() if isinstance(s, EnvironmentSpec))
-        environment = options.env or next(iter([*spec.environments, *others, "cartpole"]))
+        beside = (
+            s.name
+            for s in specs.values()
+            if isinstance(s, EnvironmentSpec) and _package_of(s) == _package_of(spec)
+        )
+        environment = options.env or next(iter([*spec.environments, *beside, "cartpole"]))
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
     for name, check in custom_checks(spec, environment):

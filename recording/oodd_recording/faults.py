@@ -12,61 +12,51 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.registry import anomaly_spec
-from oodd_recording.environments import Row, Simulator
+from oodd_eval.data.registry import AnomalySpec, Fault, anomaly_spec, environment_spec
+from oodd_eval.errors import SimulationError
 from oodd_recording.info import info_of
+from oodd_recording.simulator import Row, Simulator
 from oodd_recording.values import VALUES, choose_sensors, spread_of
 
-ON, PERIOD = 10, 50  # an intermittent fault acts on 10 rows, then rests for 40
 AR: Final = 0.9  # coefficient of the correlated noise
 
 Command = Any
 """The number of a discrete action, or a float32 row of shape (A,)."""
 
 
-class Fault:
-    """One anomaly as drawn for one episode; it acts from the onset on.
+class SensorFault(Fault):
+    """A fault of some sensors.
 
     Parameters
     ----------
-    parameters
-        What was drawn, as plain JSON; stored with the episode. Corrupted sensors are listed under
-        ``"sensors"``.
+    sensors
+        Numbers of their columns, of shape (k,).
+    change
+        Called as ``change(values, step)`` on every row from the onset on; gets the values of these
+        sensors, float64 of shape (k,), and returns what they report.
+    drawn
+        What else was drawn, as plain JSON; stored with the episode.
     """
 
-    def __init__(self, parameters: dict[str, Any]) -> None:
-        self.parameters = parameters
+    def __init__(self, sensors: NDArray[np.intp], change: Callable[..., Any], **drawn: Any) -> None:
+        super().__init__({"sensors": [int(s) for s in sensors], **drawn})
+        self.sensors, self._change = sensors, change
+        self._before: Sequence[Row] = ()
 
     def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
-        """Prepare, once, before the transition onto the onset.
+        """Keep the rows until now: some faults repeat them.
 
         Parameters
         ----------
         simulator
-            The episode's; ``simulator.env`` is the environment.
+            The episode's.
         rows
             Observation rows seen until then.
         """
-
-    def command(self, action: Command, simulator: Simulator) -> Command:
-        """Return what the simulator is given for an action; called before every transition.
-
-        Parameters
-        ----------
-        action
-            Command of the policy.
-        simulator
-            The episode's.
-
-        Returns
-        -------
-        int or float32 array of shape (A,)
-            Command for the simulator.
-        """
-        return action
+        self._before = list(rows)
 
     def observe(self, row: Row, step: int) -> Row:
-        """Return an observation row as the broken sensors report it.
+        """Return the row with the values of the chosen sensors changed.
 
         Parameters
         ----------
@@ -79,57 +69,67 @@ class Fault:
         -------
         float32 array of shape (D,)
         """
-        return row
-
-
-class SensorFault(Fault):
-    """A fault of some sensors: `change` gets and returns their values, float64 of shape (k,)."""
-
-    def __init__(self, sensors: NDArray[np.intp], change: Callable[..., Any], **drawn: Any) -> None:
-        super().__init__({"sensors": [int(s) for s in sensors], **drawn})
-        self.sensors, self._change = sensors, change
-        self._before: Sequence[Row] = ()
-
-    def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
-        """Keep the rows until now: some faults repeat them."""
-        self._before = list(rows)
-
-    def observe(self, row: Row, step: int) -> Row:
-        """Return the row with the values of the chosen sensors changed."""
         values = row[self.sensors].astype(np.float64)
         changed = row.copy()
         changed[self.sensors] = np.asarray(self._change(values, step), dtype=np.float32)
         return changed
 
     def history(self) -> NDArray[np.float64]:
-        """Return what the chosen sensors measured before the onset, of shape (rows, k)."""
+        """Return what the chosen sensors measured before the onset.
+
+        Returns
+        -------
+        float64 array of shape (rows, k)
+        """
         return np.array([row[self.sensors] for row in self._before], dtype=np.float64)
 
 
-class Intermittent(Fault):
-    """Another fault, on for 10 rows and off for 40, beginning at the onset."""
+class Scheduled(Fault):
+    """Another fault, in force to the share that its kind says for each row from the onset on."""
 
-    def __init__(self, fault: Fault) -> None:
+    def __init__(self, fault: Fault, spec: AnomalySpec) -> None:
         super().__init__(fault.parameters)
-        self._fault, self._rows = fault, 0
+        self._fault, self._spec, self._count = fault, spec, 0
+        self._rows: Sequence[Row] = ()
+        self._on = True
+        fault.share = self._share()
+
+    def _share(self) -> float:
+        """Return the share in force for the transition onto the next row."""
+        spec, count = self._spec, self._count
+        on, off = spec.pulses or (1, 0)
+        if (spec.lasts and count >= spec.lasts) or count % (on + off) >= on:
+            return 0.0
+        return min(1.0, (count + 1) / spec.ramp) if spec.ramp else 1.0
 
     def begin(self, simulator: Simulator, rows: Sequence[Row]) -> None:
         """Prepare the fault."""
+        self._rows = rows
         self._fault.begin(simulator, rows)
 
     def command(self, action: Command, simulator: Simulator) -> Command:
         """Let the fault act on the command, or put the simulator back."""
+        self._fault.share = share = self._share()
+        if share and not self._on:
+            self._fault.begin(simulator, self._rows)
+        # A fault that rests is asked, too: its draws go on.
         changed = self._fault.command(action, simulator)
-        if self._rows % PERIOD < ON:
+        if not share and self._on:
+            self._fault.end(simulator)
+        self._on = share > 0
+        if self._on:
             return changed
         simulator.restore()
         return action
 
     def observe(self, row: Row, step: int) -> Row:
-        """Let the fault act on the row while it is on; draws go on while it is off."""
-        changed = self._fault.observe(row, step)
-        self._rows += 1
-        return changed if (self._rows - 1) % PERIOD < ON else row
+        """Let the fault act on the row by its share; draws go on while it rests."""
+        changed, share = self._fault.observe(row, step), self._share()
+        self._count += 1
+        if share in {0.0, 1.0}:
+            return changed if share else row
+        mixed = row + share * (changed.astype(np.float64) - row)
+        return np.asarray(mixed, dtype=np.float32)
 
 
 class Dynamics(Fault):
@@ -157,10 +157,22 @@ def make_fault(kind: str, strength: float, simulator: Simulator, rng: np.random.
         The episode's simulator, from which nominal values are read.
     rng
         Generator of this episode's draws.
+
+    Raises
+    ------
+    SimulationError
+        When the fault corrupts a column that is not measured.
     """
-    fault: Fault = anomaly_spec(kind).make(float(strength), rng, simulator)
+    spec, columns = anomaly_spec(kind), environment_spec(simulator.environment).sensors
+    fault: Fault = spec.make(float(strength), rng, simulator)
     fault.parameters["strength"] = float(strength)
-    return fault
+    corrupted = [columns[i] for i in fault.parameters.get("sensors", ())]
+    if others := [f"{q.name} ({q.role})" for q in corrupted if q.role != "measured"]:
+        raise SimulationError(
+            f"{kind} corrupts {', '.join(others)} in {simulator.environment}, expected sensors "
+            'whose role is "measured": no sensor can break that does not exist'
+        )
+    return Scheduled(fault, spec) if spec.ramp or spec.lasts or spec.pulses else fault
 
 
 _Maker = Callable[[str, float, Simulator, np.random.Generator], Fault]
@@ -344,7 +356,9 @@ def _bias(environment: str, strength: float, _: Simulator, rng: np.random.Genera
 
         return Dynamics(push, direction=sign)
     j = int(rng.integers(info_of(environment).action_dim))
-    act = lambda a, _: _replaced(a, j, np.clip(a[j] + sign * strength, -1, 1))  # noqa: E731
+    low, high, half = _limits(environment)
+    shift, ends = float(sign * strength * half[j]), (float(low[j]), float(high[j]))
+    act = lambda a, _: _replaced(a, j, np.clip(a[j] + shift, *ends))  # noqa: E731
     return Dynamics(act, actuator=j, direction=sign)
 
 
@@ -387,23 +401,23 @@ def _action_noise(environment: str, strength: float, _: Simulator, rng: Any) -> 
         if info.discrete:
             other, chance = int(rng.integers(info.action_dim)), rng.random()
             return other if chance < strength else action
-        noise = strength * rng.normal(size=info.action_dim)
-        return np.clip(action + noise, -1, 1).astype(np.float32) if strength else action
+        low, high, half = _limits(environment)
+        noise = strength * half * rng.normal(size=info.action_dim)
+        return np.clip(action + noise, low, high).astype(np.float32) if strength else action
 
     return Dynamics(act)
+
+
+def _limits(environment: str) -> tuple[NDArray[np.float64], ...]:
+    """Return the lowest and highest value of each action, and half of the way between them."""
+    low, high = map(np.array, info_of(environment).limits)
+    return low, high, (high - low) / 2
 
 
 def _replaced(action: Row, j: int, value: float) -> Row:
     changed = action.copy()
     changed[j] = value
     return changed
-
-
-def _intermittent(maker: _Maker) -> _Maker:
-    def make(environment: str, strength: float, simulator: Simulator, rng: Any) -> Fault:
-        return Intermittent(maker(environment, strength, simulator, rng))
-
-    return make
 
 
 MAKERS: Final[dict[str, _Maker]] = {
@@ -426,10 +440,10 @@ MAKERS: Final[dict[str, _Maker]] = {
     "action-noise": _action_noise,
     "mass": _mass,
     "friction": _friction,
-    "iid-intermittent": _intermittent(_noise),
-    "calibration-intermittent": _intermittent(_calibration),
-    "shutdown-intermittent": _intermittent(_shutdown),
-    "wind-intermittent": _intermittent(_wind(1)),
-    "gain-intermittent": _intermittent(_gain),
+    "iid-intermittent": _noise,
+    "calibration-intermittent": _calibration,
+    "shutdown-intermittent": _shutdown,
+    "wind-intermittent": _wind(1),
+    "gain-intermittent": _gain,
 }
 """Makers of the benchmark's faults by kind."""

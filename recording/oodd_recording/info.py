@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, EnvironmentInfo, in_order
 from oodd_eval.data.registry import (
     AnomalySpec,
@@ -64,16 +66,57 @@ def kinds_of(environment: str) -> list[str]:
 
 
 def code_digest(environment: str, kinds: Iterable[str]) -> str:
-    """Return the SHA-256 of the modules that custom specs name; empty without any.
+    """Return the SHA-256 of the packages that custom specs name; empty without any.
 
-    Arguments of a ``functools.partial`` count, too.
+    A package counts as a whole, with its data; of a module that is in none its file does.
+    Arguments of a ``functools.partial`` count, too. The environment's ladder does not: a split
+    names its strengths.
     """
-    specs: list[Spec] = [environment_spec(environment), *map(anomaly_spec, kinds)]
+    spec = environment_spec(environment)
+    specs: list[Spec] = [spec, *map(anomaly_spec, kinds)]
     functions = [f for spec in specs for f in functions_of(spec) if not _of_benchmark(f)]
     arguments = [repr((f.args, f.keywords)) for f in functions if isinstance(f, functools.partial)]
-    files = sorted({file_of(inner_of(f)) for f in functions})
-    digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
+    files: dict[str, Path] = {}
+    for code in dict.fromkeys(file_of(inner_of(f)) for f in functions):
+        files |= _package_of(Path(code))
+    digests = [
+        (name, hashlib.sha256(file.read_bytes()).hexdigest())
+        for name, file in sorted(files.items())
+        if not _is_ladder(file, spec)
+    ]
     return hashlib.sha256(repr((digests, arguments)).encode()).hexdigest() if files else ""
+
+
+def _package_of(file: Path) -> dict[str, Path]:
+    """Return the files of the outermost package that a file is in, by name, or the file alone.
+
+    Hidden ones and caches are left out.
+    """
+    package = file
+    while (package.parent / "__init__.py").exists():
+        package = package.parent
+    names = {p.relative_to(package.parent): p for p in (package, *package.rglob("*"))}
+    return {
+        name.as_posix(): path
+        for name, path in names.items()
+        if path.is_file() and not any(_is_hidden(part) for part in name.parts)
+    }
+
+
+def _is_hidden(part: str) -> bool:
+    return part.startswith(".") or part == "__pycache__"
+
+
+def _is_ladder(file: Path, spec: EnvironmentSpec) -> bool:
+    """Tell whether a file is the environment's ladder, or what its calibration has measured."""
+    ladder = spec.ladder
+    return ladder is not None and file.parent == ladder.parent and file.name.startswith(ladder.name)
+
+
+def packages_of(environments: Iterable[str]) -> list[str]:
+    """Return the distributions that simulate some environments, each once."""
+    specs = map(environment_spec, environments)
+    return list(dict.fromkeys(package for spec in specs for package in spec.packages))
 
 
 def _of_benchmark(function: Callable[..., Any]) -> bool:
@@ -88,15 +131,25 @@ def _inspected(spec: EnvironmentSpec) -> EnvironmentInfo:
     discrete = hasattr(actions, "n") and hasattr(actions, "start")
     widths = (getattr(rows, "shape", None), (int(actions.n),) if discrete else actions.shape)
     expected = (len(spec.sensors),), (len(spec.actions),)
-    unit = discrete or (bool((actions.low == -1).all()) and bool((actions.high == 1).all()))
-    if widths != expected or not unit or (discrete and actions.start != 0):
+    finite = discrete or bool(np.isfinite([actions.low, actions.high]).all())
+    if widths != expected or not finite or (discrete and actions.start != 0):
         raise UsageError(
             f"environment {spec.name!r} has observations {rows} and actions {actions}, expected a "
             f"Box of shape {expected[0]} as it names {len(spec.sensors)} sensors, and Discrete("
-            f"{len(spec.actions)}) or a Box of shape {expected[1]} from -1 to 1 as it names "
+            f"{len(spec.actions)}) or a Box of shape {expected[1]} with finite ends as it names "
             f"{len(spec.actions)} actions"
         )
     title, columns = spec.title or spec.name, (spec.sensors, spec.actions)
+    limits = () if discrete else (tuple(actions.low.tolist()), tuple(actions.high.tolist()))
+    low, high = limits or ((), ())
     return EnvironmentInfo(
-        spec.name, title, spec.name, "custom", discrete, *columns, spec.episode_cap
+        spec.name,
+        title,
+        spec.name,
+        "custom",
+        discrete,
+        *columns,
+        spec.episode_cap,
+        low=low,
+        high=high,
     )

@@ -5,6 +5,7 @@ would choose anyway, since the observations are the same. An episode that equals
 soon after its onset, is drawn again: onset and parameters.
 """
 
+import copy
 import functools
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,18 +17,20 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import FIRST_ONSET
+from oodd_eval.data.registry import Fault, environment_spec
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import SimulationError
 from oodd_eval.names import check_known
 from oodd_recording.anomalies import draw
-from oodd_recording.environments import Simulator, make
-from oodd_recording.faults import Fault, make_fault
+from oodd_recording.environments import make
+from oodd_recording.faults import make_fault
 from oodd_recording.info import MEASURED, Measured, info_of, kinds_of
-from oodd_recording.policies import Policy
+from oodd_recording.policies import CustomPolicy, Policy
+from oodd_recording.simulator import Simulator
 from oodd_recording.values import spread_of
 
 _Rows = NDArray[np.float32]
-_Maker = Callable[[Simulator, np.random.Generator], Fault]
+FaultMaker = Callable[[Simulator, np.random.Generator], Fault]
 
 GENERATOR_VERSION: Final = 2  # raised by every change that gives other bytes for the same seed
 
@@ -171,11 +174,14 @@ def measure(environment: str, policy: Policy) -> None:
     episodes = [setup.record(EVALUATION_SEED + i).trajectory for i in range(MEASURED_EPISODES)]
     rows = np.concatenate([episode.observations for episode in episodes]).astype(np.float64)
     moves = (rows != np.median(rows, axis=0)).mean(axis=0) >= 0.01
-    may_break = [i for i, x in enumerate(rows.T) if moves[i] and len(np.unique(x)) > 8]
+    measured = [sensor.role == "measured" for sensor in environment_spec(environment).sensors]
+    may_break = [
+        i for i, x in enumerate(rows.T) if measured[i] and moves[i] and len(np.unique(x)) > 8
+    ]
     if not may_break:
         raise SimulationError(
-            f"no sensor of {environment} varies under its policy, expected one with more than 8 "
-            "values in ten nominal episodes"
+            f"no sensor of {environment} varies under its policy, expected one that is measured "
+            "and has more than 8 values in ten nominal episodes"
         )
     MEASURED[environment] = Measured(tuple(rows.std(axis=0).tolist()), tuple(may_break))
 
@@ -204,31 +210,22 @@ def record_anomalous(
     After so many `redraws` the longest episode is taken.
     """
     environment = setup.environment
-    maker: _Maker = functools.partial(draw, environment, kind)
+    maker: FaultMaker = functools.partial(draw, environment, kind)
     if strength is not None:
         maker = functools.partial(make_fault, kind, strength)
-    commands = list(twin.trajectory.actions)
-    if info_of(environment).discrete:
-        commands = [int(row.argmax()) for row in commands]
-    last = int(LAST_ONSET_SHARE * len(commands))
     longest: RecordedEpisode | None = None
     tail = -1
     for attempt in range(redraws + 1):
-        rng = generator(environment, kind, twin.seed, attempt)
-        onset = int(rng.integers(FIRST_ONSET, last + 1))
-        rows, actions, rewards, over, parameters = _run(
-            setup, twin.seed, commands[: onset - 1], (maker, rng)
-        )
-        effect = first_difference(rows, twin.trajectory.observations)
-        if effect is None or len(rewards) - onset <= tail:
+        episode = record_attempt(setup, kind, twin, maker, attempt)
+        length = len(episode.rewards) - (episode.onset or 0)
+        if episode.effect is None or length <= tail:
             continue
-        tail, drawn = len(rewards) - onset, (onset, effect, parameters, attempt)
-        longest = RecordedEpisode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
+        tail, longest = length, episode
         if tail > SHORTEST_TAIL:
             return longest
     if longest is None and strength is not None:
         # Too weak to be felt: the episode stays, and counts from its onset on.
-        drawn = (onset, onset, parameters, redraws)
+        drawn = (episode.onset, episode.onset, episode.parameters, redraws)
         return RecordedEpisode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
     if longest is None:
         raise SimulationError(
@@ -236,6 +233,26 @@ def record_anomalous(
             f"in {redraws} redraws, expected one: the policy or the simulator ignores the anomaly"
         )
     return replace(longest, redraws=redraws)
+
+
+def record_attempt(
+    setup: Setup, kind: str, twin: RecordedEpisode, maker: FaultMaker, attempt: int = 0
+) -> RecordedEpisode:
+    """Record the episode of a twin's seed under what `maker` makes, whatever comes of it.
+
+    The attempt decides the onset and the generator that `maker` is given.
+    """
+    commands = list(twin.trajectory.actions)
+    if info_of(setup.environment).discrete:
+        commands = [int(row.argmax()) for row in commands]
+    rng = generator(setup.environment, kind, twin.seed, attempt)
+    onset = int(rng.integers(FIRST_ONSET, int(LAST_ONSET_SHARE * len(commands)) + 1))
+    rows, actions, rewards, over, parameters = _run(
+        setup, twin.seed, commands[: onset - 1], (maker, rng)
+    )
+    effect = first_difference(rows, twin.trajectory.observations)
+    drawn = (onset, effect, parameters, attempt)
+    return RecordedEpisode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
 
 
 def first_difference(rows: _Rows, twin: _Rows) -> int | None:
@@ -249,7 +266,7 @@ def _run(
     setup: Setup,
     seed: int,
     replayed: Sequence[Any] = (),
-    anomaly: tuple[_Maker, np.random.Generator] | None = None,
+    anomaly: tuple[FaultMaker, np.random.Generator] | None = None,
 ) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:
     """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
     environment, policy, fault = setup.environment, setup.policy, None
@@ -267,12 +284,25 @@ def _run(
                 "mend the environment's spec"
             )
         rows[0] = noisy(rows[0])
+        memory = isinstance(policy, CustomPolicy) and policy.has_memory
+        if isinstance(policy, CustomPolicy):
+            policy.reset()
         while not over and (step := len(rewards)) < cap:
-            actions.append(replayed[step] if step < len(replayed) else policy.act(rows[-1]))
+            replay = step < len(replayed)
+            # A controller with memory has to see the rows that others need not see again.
+            action = policy.act(rows[-1]) if memory or not replay else replayed[step]
+            if replay and not np.array_equal(action, replayed[step]):
+                raise SimulationError(
+                    f"the policy of {environment} gives {action} for row {step} of seed {seed}, "
+                    f"and gave {replayed[step]}: expected the same actions for the same rows; let "
+                    "reset() forget all that act() remembers, and draw nothing at random"
+                )
+            actions.append(action)
             if anomaly is not None and step == len(replayed):
                 fault = anomaly[0](simulator, anomaly[1])
                 fault.begin(simulator, rows)
-            command = actions[-1] if fault is None else fault.command(actions[-1], simulator)
+            # A copy: what the policy commanded is stored, whatever becomes of it.
+            command = action if fault is None else fault.command(copy.copy(action), simulator)
             row, reward, over = simulator.step(command)
             row = noisy(row)
             rows.append(row if fault is None else fault.observe(row, len(rows)))
@@ -287,7 +317,12 @@ def _run(
 
 def _noise(setup: Setup, seed: int) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     """Return what adds the noise of nominal operation to a row; a seed's draws are the same."""
-    if not setup.noise:
+    sensors = environment_spec(setup.environment).sensors
+    std = np.array([sensor.noise for sensor in sensors])
+    if setup.noise:
+        measured = np.array([sensor.role == "measured" for sensor in sensors])
+        std = np.hypot(std, setup.noise * spread_of(setup.environment) * measured)
+    if not std.any():
         return lambda row: row
-    std, rng = setup.noise * spread_of(setup.environment), generator(setup.environment, "", seed, 0)
+    rng = generator(setup.environment, "", seed, 0)
     return lambda row: (row + std * rng.normal(size=len(std))).astype(np.float32)

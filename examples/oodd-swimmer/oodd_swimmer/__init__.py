@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from oodd_eval import AnomalySpec, EnvironmentSpec, Quantity, hookimpl
+from oodd_eval import AnomalySpec, EnvironmentSpec, Fault, Quantity, hookimpl
 
 POLICY = Path(__file__).with_name("swimmer.npz")  # of `oodd-eval policies train swimmer`
 
@@ -26,26 +26,50 @@ def make():
     return gymnasium.make("Swimmer-v5", frame_skip=16, max_episode_steps=250)
 
 
+class Thicker(Fault):
+    """A fluid whose viscosity is multiplied by 1 + strength, as far as the fault is in force."""
+
+    def __init__(self, strength, options):
+        super().__init__({})
+        self.strength, self.options, self.nominal = strength, options, options.viscosity
+
+    def command(self, action, simulator):
+        self.options.viscosity = self.nominal * (1 + self.share * self.strength)
+        return action
+
+    def end(self, simulator):
+        self.options.viscosity = self.nominal
+
+
 def make_thicker(strength, rng, simulator):
     """Return a fault that multiplies the viscosity of the fluid by 1 + strength."""
-    from oodd_recording.faults import Fault
-
-    class Thicker(Fault):
-        def begin(self, simulator, rows):
-            simulator.env.unwrapped.model.opt.viscosity *= 1 + strength
-
-    return Thicker({})
+    return Thicker(strength, simulator.env.unwrapped.model.opt)
 
 
 @hookimpl
 def oodd_environments():
     """Offer the swimmer."""
-    return [EnvironmentSpec("swimmer", make, POLICY, SENSORS, ACTIONS, episode_cap=250)]
+    return [
+        EnvironmentSpec(
+            "swimmer", make, POLICY, SENSORS, ACTIONS, episode_cap=250, packages=("mujoco",)
+        )
+    ]
 
 
 @hookimpl
 def oodd_anomalies():
-    """Offer the thicker fluid."""
+    """Offer the thicker fluid, also in clouds of 10 decisions with 40 of clear water between."""
     summary = "the fluid gets thicker: its viscosity times 1 + strength"
     unit = "the viscosity of water"
-    return [AnomalySpec("viscosity", "dynamics", summary, unit, 4.0, make_thicker, ("swimmer",))]
+    return [
+        AnomalySpec(
+            "viscosity",
+            "dynamics",
+            summary,
+            unit,
+            4.0,
+            make_thicker,
+            ("swimmer",),
+            intermittent=True,
+        )
+    ]

@@ -227,8 +227,8 @@ def in_order(name: str) -> list[Any]:
 def quantity(text: str) -> Quantity:
     """Return the name and the unit of a column such as ``"pressure[bar]"``; no unit is 1.
 
-    >>> quantity("pressure[bar]"), quantity("switch")
-    (Quantity(name='pressure', unit='bar'), Quantity(name='switch', unit='1'))
+    >>> quantity("pressure[bar]").row, quantity("switch").row
+    ({'name': 'pressure', 'unit': 'bar'}, {'name': 'switch', 'unit': '1'})
     """
     match = re.fullmatch(r"\s*([^\[\]]*[^\[\]\s])\s*(?:\[([^\[\]]+)\])?\s*", text)
     if not match or not text.isprintable():

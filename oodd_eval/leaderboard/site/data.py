@@ -34,7 +34,7 @@ from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import Standing
-from oodd_eval.results.strengths import DETECTION, curve
+from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
 
 _COMPARED: Final = (
     "false_episodes",
@@ -134,6 +134,7 @@ def _power(section: SuiteSection) -> Json:
     metrics = [metric_info(name) for name in (DETECTION, RANKING)]
     return {
         **_fields(board, "split", "digest"),
+        "unit": COSTS.get(Strengths.of(board.records).base, ""),
         "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],
         "metrics": [_metric(info.name) | {"chance": info.name == RANKING} for info in metrics],
         "rows": [

@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from oodd_recording.environments import make
 from oodd_recording.info import info_of
-from oodd_recording.policies import LAYERS
+from oodd_recording.policies import LAYERS, scaled
 from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {
@@ -161,7 +161,7 @@ class TD3:
 
     def run(self, seed: int, start: int, steps: int) -> Iterator[int]:
         """Train from one step to another; yield the step whenever an evaluation is due."""
-        p = HYPER_PARAMETERS
+        p, info = HYPER_PARAMETERS, info_of(self.environment)
         rng = np.random.default_rng([seed, start])
         replay = Replay(p["replay"], 2 * self.observations + self.actions + 2)
         simulator, length = make(self.environment), 0
@@ -175,10 +175,10 @@ class TD3:
                     greedy = actor(self.networks["pi"], torch.from_numpy(row)[None])[0].numpy()
                 noise = rng.normal(0, p["exploration_noise"], self.actions)
                 action = np.clip(greedy + noise, -1, 1).astype(np.float32)
-            following, reward, over = simulator.step(action)
+            following, reward, over = simulator.step(scaled(action, info))
             replay.add(row, following, action, [reward, over])
             row, length = following, length + 1
-            if over or length >= info_of(self.environment).episode_cap:
+            if over or length >= info.episode_cap:
                 # The client is kept while training: a fresh one costs as much as a hundred steps.
                 row, length = simulator.reset(int(rng.integers(2**31))), 0
             if step >= max(start, p["warm_up"]):

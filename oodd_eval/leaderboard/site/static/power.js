@@ -3,7 +3,7 @@
 const power = { metric: 0, axis: "strength", hidden: new Set() };
 
 const POWER_AXES = {
-  strength: { title: "strength", place: 0, label: "strength (1: costs 1 % of the return)", bend: Math.log10 },
+  strength: { title: "strength", place: 0, bend: Math.log10 },
   lost: { title: "return lost", place: 1, label: "return lost (%)" },
 };
 
@@ -34,13 +34,15 @@ function powerPage() {
 
 /** Chart and tables of one split with graded strengths. */
 function powerOf(suite) {
-  const axis = POWER_AXES[power.axis];
+  // What strengths of a task's loss cost of a return is not known.
+  const costs = suite.rows.some((row) => row.points.some((points) => points.some((p) => isNumber(p[POWER_AXES.lost.place]))));
+  const axis = costs ? POWER_AXES[power.axis] : POWER_AXES.strength;
   const metric = suite.metrics[power.metric];
   const drawn = suite.rows.filter((row) => !power.hidden.has(row.label)).map((row) => ({ ...row, points: row.points[power.metric].filter((p) => isNumber(p[axis.place])) }));
   if (!drawn.length) return [element("p", { class: "note" }, "No row is chosen."), suite.tables.map(powerTable)].flat();
   const xs = drawn.flatMap((row) => row.points.map((p) => p[axis.place]));
   const x = axis.bend
-    ? { range: [Math.min(...xs) / 1.2, Math.max(...xs) * 1.2], ticks: [0.001, 0.01, 0.1, 1, 10, 100, 1000], label: axis.label, bend: axis.bend }
+    ? { range: [Math.min(...xs) / 1.2, Math.max(...xs) * 1.2], ticks: [0.001, 0.01, 0.1, 1, 10, 100, 1000], label: suite.unit ? `strength (1: ${suite.unit})` : "strength", bend: axis.bend }
     : { range: [0, 100 * Math.max(0.01, ...xs)], ticks: ticks(0, 100 * Math.max(0.01, ...xs)), label: axis.label };
   x.ticks = x.ticks.filter((t) => t >= x.range[0] && t <= x.range[1]);
   const low = metric.chance ? 40 : 0;

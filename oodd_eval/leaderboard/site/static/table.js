@@ -222,11 +222,17 @@ const TRUST = {
   "re-run": "Fitted and scored again",
 };
 
+/** True for a row that learns from more than nominal trajectories of the split. */
+function isTrainedOnMore(row) {
+  return !["nominal", "oracle"].includes(row.training);
+}
+
 function badges(row) {
   return [
     row.trivial && element("span", { class: "badge", title: "Knows nothing of the dynamics: what a detector has to beat" }, "trivial"),
     row.clone_of && element("span", { class: "badge", title: "Has the scores of that row, and pushes no other row down" }, `= ${row.clone_of}`),
-    row.training !== "nominal" && element("span", { class: "badge", title: "Learns from more than nominal trajectories of the split: not ranked" }, `trained on ${row.training}`),
+    isTrainedOnMore(row) && element("span", { class: "badge", title: "Learns from more than nominal trajectories of the split: not ranked" }, `trained on ${row.training}`),
+    row.training === "oracle" && element("span", { class: "badge", title: "Has the true equations of the environment: not ranked" }, "oracle"),
     " ", element("span", { class: `badge ${row.trust}`, title: TRUST[row.trust] ?? "" }, row.trust),
   ];
 }
@@ -286,8 +292,11 @@ function notesOf(board, rows) {
   if (rows.some((r) => r.clone_of)) {
     lines.push("A row with = and another’s name has that row’s scores. It has the same rank, and pushes no other row down.");
   }
-  if (rows.some((r) => r.training !== "nominal")) {
+  if (rows.some(isTrainedOnMore)) {
     lines.push("Rows trained on more than nominal trajectories of the split are not ranked.");
+  }
+  if (rows.some((r) => r.training === "oracle")) {
+    lines.push("An oracle has the true equations of the environment. It says how far the limit is, and is not ranked.");
   }
   if (isSummary(state) && rows.some((r) => r.lead)) {
     lines.push("Lead: in how many of the cases in which one environment is left out the row’s mean stays above that of the next rank.");
