@@ -1,38 +1,33 @@
 """Write the pages "Environments and anomalies": an overview, and a page for each environment.
 
-``python docs/figures/environments.py [DIRECTORY]`` writes them, here unless told otherwise. Numbers
-are those of the facts, of the frozen policies and of ``ladder.json``; the words that only a person
-can write are in ``environments.toml``. Texts need no simulation, so that a test can compare them.
+``python docs/figures/environments.py [DIRECTORY]`` writes them, here unless told otherwise. A page
+is what ``oodd-eval data page`` writes; those of the benchmark also say what the paper has, and what
+only a person can write, from ``environments.toml``.
 """
 
 import argparse
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from oodd_recording.benchmark import FROZEN
-from oodd_recording.values import SENSOR_SHARE, VALUES, bound_of, spread_of, unit_of
+from oodd_recording.page import INTERVALS, LEVELS, Page, table, write_page
+from oodd_recording.values import VALUES, spread_of
+from oodd_worlds import oodd_anomalies, oodd_environments
 
-from oodd_eval.data.condition import (
-    FRACTIONS,
-    PAPER,
-    ROBOTS_CAP,
-    WHOLE,
-    Rung,
-    all_rungs_of,
-    read_ladder,
-    rungs_of,
-)
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1
-from oodd_eval.data.files import write_bytes, write_text
+from oodd_eval.data.condition import PAPER, ROBOTS_CAP, RUNGS, WHOLE, ladder_of, rungs_of
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, WORLDS
+from oodd_eval.data.files import write_text
+from oodd_eval.data.registry import AnomalySpec, environment_spec, register, registered
 
 NAME: Final = "environments"
 COMMAND: Final = "python docs/figures/environments.py"
 OVERVIEW_RUNG: Final = "kept90"
-PICTURED: Final = "kept75"
-"""The rung of the plotted episodes, or the strongest where the bound costs less."""
+WORLDS_RUNG: Final = "loss10"
+LINKS: Final = f"""[All environments and kinds](../{NAME}.md) ·
+[how strengths are found](../data.md#anomalies-of-graded-strength)"""
 
 _WORDS: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _ATTRIBUTES: Final = {
@@ -51,40 +46,35 @@ _ATTRIBUTES: Final = {
 def write_pages(
     directory: Path,
     *,
-    environments: Iterable[str] = tuple(ENVIRONMENTS),
+    environments: Iterable[str] = (*ENVIRONMENTS, *WORLDS),
     progress: Callable[[str], None] = lambda _text: None,
 ) -> None:
     """Write the overview, ``environments.md``, and the pages with their pictures below it.
 
-    The same versions write the same bytes. The overview names all environments; `progress` is
-    called with the name of each when its files are written.
+    The overview names all environments; `progress` is called with the name of each when its files
+    are written.
     """
-    # Texts alone need no simulators.
-    from pictures import draw_pictures  # noqa: PLC0415
-
     write_text(directory / f"{NAME}.md", overview())
     for environment in environments:
-        write_text(directory / NAME / f"{environment}.md", environment_page(environment))
-        rungs = {kind: pictured(environment, kind) for kind in calibrated(environment)}
-        for name, content in draw_pictures(environment, rungs):
-            write_bytes(directory / NAME / name, content)
+        write_page(page_of(environment), directory / NAME)
         progress(environment)
 
 
-def calibrated(environment: str) -> list[str]:
-    """Return the kinds whose strengths are known in an environment."""
-    return [kind for kind in ANOMALIES if kind in read_ladder().get(environment, {})]
+def page_of(environment: str) -> Page:
+    """Return the page of an environment of the benchmark, or of a world."""
+    if environment in ENVIRONMENTS:
+        return BenchmarkPage(environment)
+    _register_worlds()
+    return Page(environment, links=LINKS)
 
 
-def pictured(environment: str, kind: str) -> tuple[str, float]:
-    """Return the rung, and its strength, of the episode that is plotted for a kind."""
-    rungs = rungs_of(environment, kind)
-    name = PICTURED if PICTURED in rungs else list(rungs)[-1]
-    return name, rungs[name].strength
+def _register_worlds() -> None:
+    register([*oodd_environments(), *oodd_anomalies()])
 
 
 def overview() -> str:
     """Return the text of ``environments.md``."""
+    _register_worlds()
     environments = [
         (
             f"[{e}]({NAME}/{e}.md)",
@@ -96,7 +86,9 @@ def overview() -> str:
         for e, i in ENVIRONMENTS.items()
     ]
     kinds = [(f"`{k}`", a.title, a.group, a.summary) for k, a in ANOMALIES.items()]
-    strengths = [(f"`{k}`", *(_overview_strength(e, k) for e in ENVIRONMENTS)) for k in ANOMALIES]
+    strengths = [
+        (f"`{k}`", *(_strength(e, k, OVERVIEW_RUNG) for e in ENVIRONMENTS)) for k in ANOMALIES
+    ]
     columns = ("environment", "", "return", "the paper's", "sensors", "actions")
     return f"""# Environments and anomalies
 
@@ -107,7 +99,7 @@ written by `{COMMAND}`.
 
 ## Environments
 
-{_table(environments, columns)}
+{table(environments, columns)}
 
 Returns are means over 100 episodes of the frozen policy, with their standard deviation; the
 paper's are those of its Table 2. Frames are half-way through an episode.
@@ -118,107 +110,92 @@ The first {len(TABLE1)} are the paper's. A sensor anomaly corrupts what sensors 
 acts on it; an anomaly of the dynamics changes what happens. Both begin at an onset and last to the
 end.
 
-{_table(kinds, ("kind", "name", "group", "what it does"))}
+{table(kinds, ("kind", "name", "group", "what it does"))}
 
 ## Strengths
 
 The strength at which the policy keeps 90 % of its return (`{OVERVIEW_RUNG}`), linked to all that is
-known of the kind there; `> 1` where the largest sensible strength, 1, costs less. Units differ
+known of the kind there; `> 1` where the largest sensible strength, 1, costs less. Where a ladder
+has no rung of that name, as the next weaker one costs more already, that one is shown. Units differ
 between kinds, and some between environments; they stand on the pages.
 
-{_table(strengths, ("kind", *ENVIRONMENTS))}
+{table(strengths, ("kind", *ENVIRONMENTS))}
+
+{_worlds()}"""
+
+
+def _worlds() -> str:
+    """Return the section on the worlds of the overview."""
+    specs = [environment_spec(world) for world in WORLDS]
+    worlds = [
+        (
+            f"[{s.name}]({NAME}/{s.name}.md)",
+            f'<img src="{NAME}/{s.name}.svg" alt="{s.title}: a drawing" width="160">',
+            sum(sensor.role == "measured" for sensor in s.sensors),
+            len(s.actions),
+        )
+        for s in specs
+    ]
+    kinds = [
+        (f"`{k.name}`", world, k.group, k.summary, _strength(world, k.name, WORLDS_RUNG))
+        for world in WORLDS
+        for k in registered()
+        if isinstance(k, AnomalySpec) and (k.environments == (world,) or k.name in ladder_of(world))
+    ]
+    return f"""## Worlds
+
+{len(WORLDS)} environments of the plug-in `oodd_worlds`, with classical controllers, noisy sensors
+and parameters that differ from episode to episode. The strength is that at which the task's loss
+grows by a tenth (`{WORLDS_RUNG}`).
+
+{table(worlds, ("world", "", "measured sensors", "actions"))}
+
+{table(kinds, ("kind", "world", "group", "what it does", "strength"))}
 """
 
 
-def environment_page(environment: str) -> str:
-    """Return the text of an environment's page."""
-    info = ENVIRONMENTS[environment]
-    ours, papers = _returns(environment)
-    spread, breakable = spread_of(environment), VALUES["sensors"][environment]
-    facts = [
-        ("simulator", f"`{info.simulator}`"),
-        ("longest episode", f"{info.episode_cap} steps"),
-        ("policy", info.policy),
-        ("its mean return over 100 episodes", ours),
-        ("that of the paper's policy", papers),
-    ]
-    sensors = [
-        (i, s.name, _unit(s.unit), f"{spread[i]:.3g}", "yes" if i in breakable else "")
-        for i, s in enumerate(info.sensors)
-    ]
-    actions = [(i, a.name, _unit(a.unit)) for i, a in enumerate(info.actions)]
-    count = max(1, int(SENSOR_SHARE * info.observation_dim))
-    kinds = "\n\n".join(_kind(environment, kind) for kind in ANOMALIES)
-    return f"""# {info.title}
+class BenchmarkPage(Page):
+    """The page of an environment of the benchmark, with what the paper says of it."""
 
-![{info.title}: a frame half-way through an episode]({environment}.png)
+    def __init__(self, environment: str) -> None:
+        super().__init__(environment, ANOMALIES, LINKS)
 
-{_WORDS["environment"][environment]}
+    def description(self) -> str:
+        """Return the task, the reward and the end of an episode."""
+        text: str = _WORDS["environment"][self.environment]
+        return text
 
-{_table(facts, ("", f"`{environment}`"))}
+    def facts(self) -> Iterator[Sequence[Any]]:
+        """Return the rows of the first table, with the policy's return and the paper's."""
+        ours, papers = _returns(self.environment)
+        yield "simulator", f"`{self.info.simulator}`"
+        yield "longest episode", f"{self.info.episode_cap} steps"
+        yield "policy", self.info.policy
+        yield "its mean return over 100 episodes", ours
+        yield "that of the paper's policy", papers
 
-[All environments and kinds](../{NAME}.md) ·
-[how strengths are found](../data.md#anomalies-of-graded-strength)
+    def headline(self, kind: str) -> str:
+        """Return what a kind means in this environment."""
+        info = ANOMALIES[kind]
+        title = f"**{info.title}**, {info.group}{', of the paper' if kind in TABLE1 else ''}."
+        return f"{title} {_meaning(self.environment, kind)}"
 
-## Sensors
+    def notes(self, kind: str) -> list[str]:
+        """Return what the paper's Table 1 says."""
+        if kind not in TABLE1:
+            return []
+        return [f"Table 1 of the paper: {table1_value(self.environment, kind)}."]
 
-{_table(sensors, ("", "sensor", "unit", "spread", "may break"))}
-
-The unit is what the number 1 means; the spread is the standard deviation in nominal operation. A
-sensor anomaly corrupts {count} of those that may break, drawn for each episode.
-
-## Actions
-
-{_table(actions, ("", "action", "unit"))}
-
-{_ACTIONS[info.discrete]}
-
-## Anomalies
-
-A rung is a strength at which the policy keeps that share of its return; `4th`, `16th` and `64th`
-are these parts of the strength of `kept99`, and cost nothing yet. At `{PAPER}` the policy loses
-what the paper's Table 2 says. Intervals are 95 %: of the strength at which the share is kept, and
-of the share that is kept at the strength.{_whole(environment)}
-
-A plot shows one sensor of an episode (orange) and of its nominal twin (grey) around the onset: of
-the sensors that may have changed, the one that differs most. A dot marks the end of the episode.
-
-{kinds}
-"""
-
-
-def _whole(environment: str) -> str:
-    """Return what a page says of the length of episodes."""
-    if ENVIRONMENTS[environment].discrete:
-        return ""
-    return (
-        f"\nThese strengths were measured in episodes of at most {ROBOTS_CAP} steps, that of "
-        f"`{WHOLE}` in whole episodes."
-    )
-
-
-_ACTIONS: Final = {
-    True: "One of them is chosen in each step; in trajectories it is a one-hot row.",
-    False: "All of them are commanded in each step, from -1 to 1.",
-}
-
-
-def _kind(environment: str, kind: str) -> str:
-    """Return the section of a kind of anomaly."""
-    info = ANOMALIES[kind]
-    title = f"**{info.title}**, {info.group}{', of the paper' if kind in TABLE1 else ''}."
-    parts = [f"### {kind}", f"{title} {_meaning(environment, kind)}"]
-    if kind in TABLE1:
-        parts.append(f"Table 1 of the paper: {table1_value(environment, kind)}.")
-    if kind not in calibrated(environment):
-        return "\n\n".join([*parts, "Not calibrated."])
-    unit, bound = unit_of(environment, kind), bound_of(environment, kind)
-    parts.append(f"Strength: {unit}; at most {bound:g}.")
-    rows = [_rung(name, rung) for name, rung in all_rungs_of(environment, kind).items()]
-    parts.append(_table(rows, ("rung", "strength", "return kept", "reached")))
-    name, strength = pictured(environment, kind)
-    about = f"One sensor of an episode under {kind} at {name} ({strength:g}), and of its twin"
-    return "\n\n".join([*parts, f"![{about}]({environment}/{kind}.svg)"])
+    def levels(self) -> str:
+        """Return what rungs are, those of the paper's losses among them."""
+        papers = f"At `{PAPER}` the policy loses\nwhat the paper's Table 2 says."
+        text = f"{LEVELS['return']} {papers} {INTERVALS['return']}"
+        if self.info.discrete:
+            return text
+        return (
+            f"{text}\nThese strengths were measured in episodes of at most {ROBOTS_CAP} steps, "
+            f"that of `{WHOLE}` in whole episodes."
+        )
 
 
 def _meaning(environment: str, kind: str) -> str:
@@ -229,21 +206,17 @@ def _meaning(environment: str, kind: str) -> str:
     return text if kind == base else f"{text} On for 10 rows, off for 40, from the onset on."
 
 
-def _rung(name: str, rung: Rung) -> Sequence[str]:
-    if name in FRACTIONS:
-        return f"`{name}`", f"{rung.strength:g}", "", ""
-    kept, low, high = (f"{100 * x:.0f}" for x in (rung.kept, rung.kept_low, rung.kept_high))
-    interval = f" ({rung.low:g} to {rung.high:g})" if rung.low < rung.high else ""
-    reached = "yes" if rung.reached else "no: this is the largest"
-    return f"`{name}`", f"{rung.strength:g}{interval}", f"{kept} % ({low} to {high})", reached
-
-
-def _overview_strength(environment: str, kind: str) -> str:
-    if kind not in calibrated(environment):
+def _strength(environment: str, kind: str, name: str) -> str:
+    """Return the strength of a rung, linked to all that is known of the kind."""
+    ladder = ladder_of(environment)
+    if kind not in ladder:
         return "not calibrated"
-    rung = rungs_of(environment, kind).get(OVERVIEW_RUNG)
-    reached = rung is not None and rung.reached
-    text = f"{rung.strength:.3g}" if rung and reached else f"> {bound_of(environment, kind):g}"
+    rungs, bound = rungs_of(environment, kind), ladder[kind]["bound"]
+    # Levels with the same strength share the rung of the first of them.
+    shared = [n for n in RUNGS[: RUNGS.index(name) + 1] if n in rungs][-1]
+    strength = rungs[shared].strength
+    reached = rungs[shared].reached and (shared == name or strength < bound)
+    text = f"{strength:.3g}" if reached else f"> {bound:g}"
     return f"[{text}]({NAME}/{environment}.md#{kind})"
 
 
@@ -288,15 +261,6 @@ def _returns(environment: str) -> tuple[str, str]:
     provenance: dict[str, Any] = json.loads((FROZEN / f"{environment}.json").read_text("utf-8"))
     ours = f"{provenance['mean_return']:.1f} ± {provenance['std_return']:.1f}"
     return ours, f"{ENVIRONMENTS[environment].paper_return:.1f}"
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
-
-
-def _table(rows: Iterable[Sequence[Any]], header: Sequence[str]) -> str:
-    lines = (header, ["---"] * len(header), *rows)
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
 if __name__ == "__main__":

@@ -142,13 +142,26 @@ def of_reproductions(table1: str, losses: str) -> Row:
     return row
 
 
-def of_ladder(name: str) -> str:
-    """Return a row of the overview on the ladder's page: threshold, and shares by rung."""
-    page = (BOARD / "suites" / "ladder" / "README.md").read_text(encoding="utf-8")
+def thresholds(suite: str, name: str) -> list[str]:
+    """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
+    page = (BOARD / "suites" / suite / "README.md").read_text(encoding="utf-8")
     table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
     (row,) = (row for row in rows if row[0] == name)
-    return " | ".join([row[1].replace("\\", ""), *row[5:]])
+    return [row[1].replace("\\", ""), *row[5:]]
+
+
+def of_ladder(name: str) -> str:
+    """Return a row of the overview on the ladder's page: threshold, and shares by rung."""
+    return " | ".join(thresholds("ladder", name))
+
+
+def in_worlds(name: str) -> str:
+    """Return matched AUC over all cells and by world, and shares found by the loss's growth."""
+    environments = board("worlds").environments
+    means = [mean("worlds", name, "auc_matched", environments=[e]) for e in environments]
+    aucs = cells([mean("worlds", name, "auc_matched"), *means])
+    return " | ".join([aucs, *thresholds("worlds", name)[1:]])
 
 
 @functools.cache
@@ -177,6 +190,7 @@ TABLES: dict[str, Row] = {
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
     "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
     "ladder": of_ladder,
+    "worlds": in_worlds,
     "claims": verdicts,
 }
 

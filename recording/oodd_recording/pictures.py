@@ -1,77 +1,71 @@
-"""Pictures of the page "Environments and anomalies": a frame, and an episode beside its twin.
+"""Pictures of an environment's page: a frame, and an episode beside its twin.
 
 Plots are SVG files of some kilobytes, with a white ground of their own. The same versions draw the
 same bytes on the same processor.
 """
 
 import struct
+import warnings
 import zlib
-from collections.abc import Iterator, Mapping
-from html import escape
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from oodd_recording.calibrate import setup_of
-from oodd_recording.environments import Bullet, Simulator, make, quiet_streams
-from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, record_anomalous
-from oodd_recording.values import VALUES, spread_of
 
-from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.errors import SimulationError
+from oodd_recording.environments import make
+from oodd_recording.info import MEASURED, info_of
+from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, Setup
+from oodd_recording.simulator import Image, quiet_streams
+from oodd_recording.svg import INK, label, svg
+from oodd_recording.values import spread_of
 
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
+TWINS: Final = 100  # seeds among which a twin is looked for
+WIDEST: Final = 400  # pixels of a frame
 BEFORE, AFTER = 30, 90  # rows of a plot before the onset and after the effect
 WIDTH, HEIGHT = 480, 190
 LEFT, RIGHT, TOP, BOTTOM = 60, 472, 44, 152  # of the plot's axes
-TWIN, CORRUPTED, INK, LINE = "#555555", "#d55e00", "#222222", "#bbbbbb"
-
-Image = NDArray[np.uint8]
+TWIN, CORRUPTED, LINE = "#555555", "#d55e00", "#bbbbbb"
 
 
-def draw_pictures(
-    environment: str, rungs: Mapping[str, tuple[str, float]]
-) -> Iterator[tuple[str, bytes]]:
-    """Draw the frame of an environment, and a plot for each kind at a rung and its strength.
-
-    Gives names, relative to the folder of the pages, and contents.
-    """
-    setup = setup_of(environment)
-    twins = (setup.record(FIRST_SEED + i) for i in range(100))
-    twin = next(t for t in twins if t.trajectory.transitions >= SHORTEST_TWIN)
-    yield f"{environment}.png", png(frame(environment, twin))
-    for kind, (rung, strength) in rungs.items():
-        episode = record_anomalous(setup, kind, strength, twin)
-        title = f"{kind} at {rung} ({strength:g})"
-        yield f"{environment}/{kind}.svg", plot(environment, title, episode, twin).encode()
+def pictured_twin(setup: Setup) -> RecordedEpisode:
+    """Return the nominal episode of all pictures: the first that is long enough for an onset."""
+    twins = (setup.record(FIRST_SEED + i) for i in range(TWINS))
+    for twin in twins:
+        if twin.trajectory.transitions >= SHORTEST_TWIN:
+            return twin
+    raise SimulationError(
+        f"none of {TWINS} nominal episodes of {setup.environment} has {SHORTEST_TWIN} transitions, "
+        "expected one, for an onset: a better policy is needed"
+    )
 
 
-def frame(environment: str, episode: RecordedEpisode) -> Image:
-    """Return the picture half-way through a nominal episode, of shape (height, width, 3)."""
+def frame(environment: str, episode: RecordedEpisode) -> bytes | None:
+    """Return a picture half-way through a nominal episode, as PNG; None where none can be drawn."""
     actions = episode.trajectory.actions[: episode.trajectory.transitions // 2]
     simulator = make(environment)
     try:
         simulator.reset(episode.seed)
         for row in actions:
-            simulator.step(int(row.argmax()) if ENVIRONMENTS[environment].discrete else row)
-        with quiet_streams():
-            return _look(simulator)
+            simulator.step(int(row.argmax()) if info_of(environment).discrete else row)
+        with quiet_streams(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            image = np.asarray(simulator.image())
+    except Exception:  # noqa: BLE001  many draw nothing, or not without a screen: a page goes without
+        return None
     finally:
         simulator.close()
+    if image.ndim != 3 or image.shape[-1] != 3 or image.dtype != np.uint8:
+        return None
+    while image.shape[1] > WIDEST:
+        image = _halved(image)
+    return png(image)
 
 
-def _look(simulator: Simulator) -> Image:
-    env = simulator.env
-    if isinstance(simulator, Bullet):
-        client = env._p  # noqa: SLF001  # the simulator's only handle
-        view = client.computeViewMatrixFromYawPitchRoll(env.robot.body_xyz, 2.8, 30, -25, 0, 2)
-        lens = client.computeProjectionMatrixFOV(45, 4 / 3, 0.1, 50)
-        width, height, pixels, _, _ = client.getCameraImage(
-            320, 240, view, lens, renderer=client.ER_TINY_RENDERER
-        )
-        return np.array(pixels, np.uint8).reshape(height, width, 4)[..., :3]
-    env.render_mode = "rgb_array"
-    large: NDArray[np.float64] = env.render().astype(np.float64)
-    blocks = large.reshape(large.shape[0] // 2, 2, large.shape[1] // 2, 2, 3)
+def _halved(image: Image) -> Image:
+    """Return an image of half the height and width; an odd last line is left out."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    blocks = image[: 2 * height, : 2 * width].astype(np.float64).reshape(height, 2, width, 2, 3)
     halved: Image = blocks.mean(axis=(1, 3)).round().astype(np.uint8)
     return halved
 
@@ -100,8 +94,9 @@ def telling_sensor(environment: str, episode: RecordedEpisode, twin: RecordedEpi
     effect = episode.effect or 0
     plotted = slice(effect, min(len(rows), len(others), effect + AFTER))
     gap = np.abs(rows[plotted] - others[plotted]).mean(axis=0)
-    among: list[int] = episode.parameters.get("sensors", VALUES["sensors"][environment])
-    return max(among, key=lambda i: float(gap[i] / spread_of(environment)[i]))
+    spread = spread_of(environment)
+    among = episode.parameters.get("sensors") or MEASURED[environment].sensors
+    return max(among, key=lambda i: float(gap[i] / (spread[i] or 1.0)))
 
 
 def plot(environment: str, title: str, episode: RecordedEpisode, twin: RecordedEpisode) -> str:
@@ -122,20 +117,19 @@ def plot(environment: str, title: str, episode: RecordedEpisode, twin: RecordedE
     def y(value: float) -> float:
         return BOTTOM - (BOTTOM - TOP) * (value - low) / ((high - low) or 1)
 
-    quantity = ENVIRONMENTS[environment].sensors[sensor]
+    quantity = info_of(environment).sensors[sensor]
     unit = "" if quantity.unit == "1" else f" ({quantity.unit})"
     shapes = [
-        _text(LEFT, 16, title, "start", "bold"),
-        _text(LEFT, 34, quantity.name + unit, "start"),
-        _text(x(onset), HEIGHT - 6, f"onset, step {onset}"),
+        label(LEFT, 16, title, "start", "bold"),
+        label(LEFT, 34, quantity.name + unit, "start"),
+        label(x(onset), HEIGHT - 6, f"onset, step {onset}"),
         f'<path d="M{x(onset):.1f} {TOP}V{BOTTOM + 6}" stroke="{INK}" stroke-dasharray="4 3"/>',
     ]
     for value in (low, high):
-        label = f"{float(f'{value:.2g}') + 0:g}"  # neither 1.2e+02 nor -0
-        shapes.append(_text(LEFT - 6, y(value) + 4, label, "end"))
+        shapes.append(label(LEFT - 6, y(value) + 4, _number(value, high - low), "end"))
         shapes.append(f'<path d="M{LEFT} {y(value):.1f}H{RIGHT}" stroke="{LINE}"/>')
     ends = (first, "start"), (last, "end")
-    shapes += [_text(x(step), BOTTOM + 16, f"{step}", anchor) for step, anchor in ends]
+    shapes += [label(x(step), BOTTOM + 16, f"{step}", anchor) for step, anchor in ends]
     for colour, line in lines.items():
         points = " ".join(f"{x(first + i):.1f},{y(value):.1f}" for i, value in enumerate(line))
         shapes.append(f'<polyline points="{points}" stroke="{colour}" stroke-width="1.5"/>')
@@ -144,13 +138,11 @@ def plot(environment: str, title: str, episode: RecordedEpisode, twin: RecordedE
             f'<circle cx="{x(end):.1f}" cy="{y(lines[CORRUPTED][-1]):.1f}" r="3.5" '
             f'fill="{CORRUPTED}"/>'
         )
-    size = f'width="{WIDTH}" height="{HEIGHT}"'
-    font = 'font-family="sans-serif" font-size="12"'
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" {size} {font}'
-    ground = f'<rect {size} fill="white"/>'
-    return "\n".join([f'{head} fill="none">', ground, *shapes, "</svg>\n"])
+    return svg(WIDTH, HEIGHT, shapes)
 
 
-def _text(x: float, y: float, text: str, anchor: str = "middle", weight: str = "normal") -> str:
-    anchoring = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-weight="{weight}"'
-    return f'<text {anchoring} fill="{INK}">{escape(text)}</text>'
+def _number(value: float, size: float) -> str:
+    """Return a number with as few digits as its axis, of a size, can do with."""
+    texts = (f"{float(f'{value:.{digits}g}') + 0:g}" for digits in range(2, 7))
+    near = (text for text in texts if abs(float(text) - value) <= size / 4)
+    return next(near, f"{value:g}")  # neither 1.2e+02 nor -0
