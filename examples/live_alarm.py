@@ -1,6 +1,6 @@
 """A watchdog beside a running controller: one reading per observation, an alarm as it happens.
 
-``python examples/live_alarm.py --plot alarm.png --gif alarm.gif`` (extras reference, sim, plots).
+``python examples/live_alarm.py --plot alarm.png --gif alarm.gif`` (extras reference, gym, plots).
 
 A trained policy balances Gymnasium's CartPole. At an onset the dynamics change: the pole gets
 heavier and longer. The detector is fitted on nominal trajectories of the mini split, and the

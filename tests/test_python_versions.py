@@ -1,61 +1,281 @@
-"""What needs no PyBullet runs under newer Pythons, with the same results."""
+"""What needs no PyBullet installs and runs under newer Pythons, with the same results.
 
+Under the newest other Python of this machine; with ``--long`` under all of them, every extra in an
+environment of its own. The table of docs/index.md says what is expected.
+"""
+
+import email
+import itertools
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
-from helpers_wheel import PIP
+from helpers_wheel import PIP, ROOT
+from packaging.requirements import Requirement
 
 pytestmark = pytest.mark.packaging
 
 NEWER = ("3.14", "3.13", "3.12")
-RUN = ["run", "--detector", "clock,comb,persistence,range,mahalanobis", "--env", "cartpole"]
+SIZES = "--train 4 --calibration 4 --test 1 --cap 60 --seed-base 41"
+RECORD = f"oodd_eval data build tiny --strength gain=0.2 {SIZES} --jobs 1 -q --env"
 
 
-def interpreter():
-    """Return the newest other Python of this machine that starts, or None."""
+def interpreter(version):
+    """Return a Python of this machine that has a version and starts, or None."""
     versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    for version in NEWER:
-        found = [shutil.which(f"python{version}"), *versions.glob(f"{version}*/bin/python")]
-        for path in filter(None, found):
-            shown = subprocess.run([path, "--version"], capture_output=True, check=False)
-            if shown.returncode == 0:
-                return path
+    for path in (shutil.which(f"python{version}"), *versions.glob(f"{version}*/bin/python")):
+        if path and not subprocess.run([path, "--version"], capture_output=True).returncode:  # noqa: PLW1510
+            return path
     return None
+
+
+NEWEST = next(filter(interpreter, NEWER), None)
+
+
+# The table
+
+
+def table():
+    """Return the versions of the table's columns, and its cells by extra; "" is no extra."""
+    lines = re.findall(r"^\| .*\|$", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    (begin,) = (i for i, row in enumerate(rows) if row[0] == "extra")
+    names = [row[0].strip("`") for row in rows[begin + 1 :]]
+    cells = {"" if n == "none" else n: row[2:] for n, row in zip(names, rows[begin + 1 :])}  # noqa: B905
+    return [cell.removeprefix("Python ") for cell in rows[begin][2:]], cells
+
+
+VERSIONS, TABLE = table()
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel):
+    """Metadata of the built wheel: pip reads them, not pyproject.toml."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        return email.message_from_bytes(archive.read(name))
+
+
+def required(metadata, extra, version):
+    """Return the names of what pip installs with an extra under a Python."""
+    requirements = map(Requirement, metadata.get_all("Requires-Dist"))
+    here = {"extra": extra, "python_version": version, "python_full_version": f"{version}.0"}
+    return {r.name for r in requirements if r.marker is None or r.marker.evaluate(here)}
+
+
+def test_the_table_has_every_extra_and_every_version_of_the_package(metadata):
+    assert set(TABLE) == {"", *metadata.get_all("Provides-Extra")}
+    classifiers = " ".join(metadata.get_all("Classifier"))
+    assert re.findall(r"Python :: (3\.\d+)", classifiers) == VERSIONS
+    assert metadata["Requires-Python"] == f">={VERSIONS[0]}"
+
+
+def test_the_table_says_where_pybullet_is_compiled_and_where_it_is_left_out(metadata):
+    for extra, cells in TABLE.items():
+        for version, cell in zip(VERSIONS, cells, strict=True):
+            names = required(metadata, extra, version)
+            expected = "yes"
+            if version != "3.11" and "pybullet" in names:
+                expected = "compiles"
+            elif missing := required(metadata, extra, "3.11") - names:
+                assert missing == {"pybullet", "pybullet-envs-gymnasium"}
+                expected = "no robots"
+            assert cell == expected, (extra, version)
+
+
+# Installed
+
+
+def environment(python, directory, what, options=("-c", ROOT / "constraints.txt")):
+    """Return the Python of a new environment with what pip installs of wheels, and its errors."""
+    subprocess.run([python, "-m", "venv", "--without-pip", directory], check=True)
+    inside = directory / "bin" / "python"
+    install = [*PIP, "--python", inside, "install", "--only-binary", ":all:", *options, what]
+    done = subprocess.run(install, capture_output=True, text=True, check=False)
+    return inside, done.stderr if done.returncode else ""
+
+
+def execute(python, directory, arguments, code=0, warnings="error"):
+    """Run `python -m` in a directory without a path to this checkout; return what it prints."""
+    done = subprocess.run(
+        [python, "-W", warnings, "-m", *arguments.split()],
+        cwd=directory, capture_output=True, text=True, check=False,
+        env={"PATH": "/usr/bin:/bin", "HOME": str(directory)},
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
 
 
 def records(directory):
     lines = (directory / "records.jsonl").read_text().splitlines()
-    found = [json.loads(line) for line in lines]
-    return {(r["detector"], r["anomaly"]): (r["status"], r["metrics"]) for r in found}
+    rows = [json.loads(line) for line in lines]
+    return {(r["detector"], r["anomaly"]): (r["status"], r["metrics"]) for r in rows}
 
 
-@pytest.mark.skipif(interpreter() is None, reason="no newer Python on this machine")
-def test_a_newer_python_gives_the_same_results(wheel, tmp_path):
-    environment = tmp_path / "venv"
-    subprocess.run([interpreter(), "-m", "venv", "--without-pip", environment], check=True)
-    python = environment / "bin" / "python"
-    install = [*PIP, "--python", python, "install", wheel]
-    done = subprocess.run(install, capture_output=True, text=True, check=False)
-    if done.returncode:
-        pytest.skip(f"its libraries cannot be installed: {done.stderr[-200:]}")
-    results = {}
-    for name, program in (("newer", python), ("here", sys.executable)):
-        output = tmp_path / name
-        subprocess.run(
-            [program, "-W", "error", "-m", "oodd_eval", *RUN, "--output", output],
-            cwd=tmp_path, capture_output=True, check=True,
-            env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
-        )  # fmt: skip
-        results[name] = records(output)
-    assert {status for status, _ in results["newer"].values()} == {"ok"}
-    assert len(results["newer"]) == 5 * 8
-    for cell, (_, metrics) in results["here"].items():
-        newer = results["newer"][cell][1]
-        for metric, found in metrics.items():
-            expected = found["value"] if found["value"] is None else pytest.approx(found["value"])
-            assert newer[metric]["value"] == expected, (cell, metric)
+def same_results(newer, here):
+    """Compare two results directories; return how many cells they have."""
+    results = records(newer)
+    assert {status for status, _ in results.values()} == {"ok"}
+    for cell, (_, metrics) in records(here).items():
+        for metric, entry in metrics.items():
+            expected = entry["value"] if entry["value"] is None else pytest.approx(entry["value"])
+            assert results[cell][1][metric]["value"] == expected, (cell, metric)
+    return len(results)
+
+
+def digests(split):
+    entries = json.loads((split / "manifest.json").read_text())["environments"]
+    return {
+        (name, part): group["sha256"]
+        for name, entry in entries.items()
+        for part, group in entry["groups"].items()
+    }
+
+
+@pytest.fixture(scope="module")
+def newer(wheel, tmp_path_factory):
+    """The newest other Python, in an environment with what records without PyBullet."""
+    if NEWEST is None:
+        pytest.skip("no newer Python on this machine")
+    directory = tmp_path_factory.mktemp("newer") / "venv"
+    python, errors = environment(interpreter(NEWEST), directory, f"{wheel}[gym,worlds]")
+    if errors:
+        pytest.skip(f"its libraries cannot be installed: {errors[-200:]}")
+    return python
+
+
+def test_a_newer_python_gives_the_same_results(newer, tmp_path):
+    run = "oodd_eval run --detector clock,comb,persistence,range,mewma-a --env cartpole --output"
+    for python, output in ((newer, "newer"), (sys.executable, "here")):
+        execute(python, tmp_path, f"{run} {output}")
+    assert same_results(tmp_path / "newer", tmp_path / "here") == 5 * 8
+
+
+def test_a_newer_python_records_the_same_split(newer, tmp_path):
+    build = f"{RECORD} cartpole,lunarlander,arm,tank"
+    run = "oodd_eval run --detector oracle,range --env tank --jobs 1"
+    for python, name in ((newer, "newer"), (sys.executable, "here")):
+        execute(python, tmp_path, f"{build} --output split-{name}")
+        execute(python, tmp_path, f"{run} --split split-{name} --output {name}")
+    assert digests(tmp_path / "split-newer") == digests(tmp_path / "split-here")
+    assert same_results(tmp_path / "newer", tmp_path / "here") == 2
+
+
+def test_a_newer_python_says_why_it_records_no_robot(newer, tmp_path):
+    output = execute(newer, tmp_path, f"{RECORD} hopper --output robot", code=4)
+    assert "PyBullet has no wheel for Python 3.1" in output
+    assert "use Python 3.11" in output
+
+
+# Every extra
+
+RUN = "oodd_eval run --env cartpole --anomaly iid,gravity --limit 5 --output results --detector"
+
+PROGRAMS = {
+    # One episode in each format of the extra that a few lines can write; the other readers load.
+    "write_logs": """
+import numpy, pyarrow, pyarrow.parquet
+import mcap_ros2.decoder, mcap.reader, pyulog, rosbags.highlevel, scipy.io
+speed = numpy.random.default_rng(0).normal(size=300)
+for i in range(6):
+    pyarrow.parquet.write_table(pyarrow.table({"t": numpy.arange(300) / 10, "speed": speed + i}),
+                                f"logs/{i}.parquet")
+""",
+    "write_csv": """
+import random
+for i in range(30):
+    rows = (f"{t / 10},{random.gauss(0, 1)}" for t in range(100))
+    open(f"logs/{i}.csv", "w").write("\\n".join(["t,speed", *rows]))
+""",
+    "cluster": """
+import subprocess, sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    options = dict(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    with LocalCluster(**options) as cluster:
+        executor = cluster.scheduler_address.replace("tcp", "dask")
+        sys.exit(subprocess.run([sys.executable, "-m", *sys.argv[1:], executor]).returncode)
+""",
+    "draw": """
+from oodd_eval import load_results
+load_results("results").plot_trajectory("cartpole", "iid", row="persistence").savefig("plot.png")
+""",
+    "make_actor": re.search(
+        r"```python\n(import numpy as np\nimport onnx\n.*?)```",
+        (ROOT / "docs" / "how-to" / "policies.md").read_text(),
+        re.DOTALL,
+    )[1],
+}
+"""Modules beside the commands below."""
+
+USES = {
+    "": [f"{RUN} mewma,persistence"],
+    "reference": [f"{RUN} rf,pe"],
+    "pyod": [f"{RUN} pyod:ECOD,sklearn:IsolationForest"],
+    "gym": [f"{RECORD} cartpole,lunarlander"],
+    "bullet": [f"{RECORD} hopper"],
+    "sim": [f"{RECORD} acrobot,lunarlander"],
+    "worlds": [f"{RECORD} arm,drone,tank"],
+    "train": ["oodd_eval policies train cartpole --steps 1500 --output policy"],
+    "onnx": [
+        "make_actor",
+        "oodd_eval policies import actor.onnx --env cartpole --output actor.npz",
+    ],
+    "mujoco": [f"{RECORD} swimmer"],
+    "dask": [f"cluster {RUN} mewma --executor"],
+    "logs": ["write_logs", "oodd_eval data inspect logs"],
+    "viewers": ["write_csv", "oodd_eval scan logs --rerun scan.rrd --mcap scan.mcap"],
+    "check": ["oodd_eval check persistence"],
+    "plots": [f"{RUN} persistence", "draw"],
+    "docs": [f"mkdocs build --quiet --strict --config-file {ROOT}/mkdocs.yml --site-dir site"],
+    "test": [f"pytest -n 0 -p no:cacheprovider --rootdir {ROOT} {ROOT}/tests/test_worlds.py"],
+    "dev": [f"mypy --cache-dir mypy --config-file {ROOT}/pyproject.toml", "build --version"],
+    "all": [f"{RUN} rf,pyod:ECOD", f"{RECORD} lunarlander,drone", "oodd_eval check mewma"],
+}
+"""Modules that show an extra at work, with their arguments."""
+
+WITH = {"onnx": "onnx,gym"}
+"""What an extra is installed with where it is of no use alone."""
+
+
+def pytest_generate_tests(metafunc):
+    """All extras on all Pythons take half an hour: only with --long."""
+    if "extra" in metafunc.fixturenames:
+        cases = itertools.product(VERSIONS, TABLE) if metafunc.config.getoption("--long") else ()
+        metafunc.parametrize(("version", "extra"), list(cases))
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A directory that goes with the test: an environment has up to a gigabyte."""
+    yield tmp_path
+    shutil.rmtree(tmp_path)
+
+
+def test_every_extra_works_as_the_table_says(version, extra, wheel, place):
+    base = interpreter(version)
+    if base is None:
+        pytest.skip(f"no Python {version} on this machine")
+    if TABLE[extra][VERSIONS.index(version)] == "compiles":
+        _, errors = environment(base, place / "venv", "pybullet", options=())
+        assert "No matching distribution found for pybullet" in errors
+        return
+    extras = WITH.get(extra, extra)
+    python, errors = environment(base, place / "venv", f"{wheel}[{extras}]" if extra else wheel)
+    assert not errors
+    for name, program in PROGRAMS.items():
+        (place / f"{name}.py").write_text(program)
+    (place / "logs").mkdir()
+    if extra == "mujoco":
+        library = place / "venv" / "lib" / f"python{version}" / "site-packages"
+        swimmer = ROOT / "examples" / "oodd-swimmer"
+        install = [*PIP, "install", "--no-deps", "--no-build-isolation", "--target", library]
+        subprocess.run([*install, swimmer], check=True)
+    for arguments in USES[extra]:
+        execute(python, place, arguments, warnings="default")  # of libraries, there are some

@@ -14,7 +14,7 @@ try:
     from gymnasium.utils import RecordConstructorArgs
     from gymnasium.vector import AutoresetMode
 except ImportError as error:
-    raise MissingExtraError(f"wrappers need {error.name}: pip install 'oodd-eval[sim]'") from error
+    raise MissingExtraError(f"wrappers need {error.name}: pip install 'oodd-eval[gym]'") from error
 
 KEY: Final = "oodd"
 """The key of a reading in the info of a step."""
