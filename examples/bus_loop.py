@@ -1,6 +1,6 @@
 """A watchdog in a 50 Hz loop whose sensors come by a bus, as on a robot with ROS.
 
-``python examples/bus_loop.py --fault stuck`` (extras reference and sim).
+``python examples/bus_loop.py --fault stuck`` (extras reference and gym).
 
 Every sensor of Gymnasium's CartPole publishes to a topic of its own. The loop wakes up 50 times a
 second, takes what has come since it last did, and hands that to the watchdog: a sensor from which

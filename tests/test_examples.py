@@ -16,7 +16,7 @@ from oodd_eval.live import Watchdog
 
 pytestmark = pytest.mark.slow
 
-pytest.importorskip("gymnasium", reason="needs the extra sim")
+pytest.importorskip("gymnasium", reason="needs the extra gym")
 EXAMPLE = Path(__file__).parents[1] / "examples" / "live_alarm.py"
 
 

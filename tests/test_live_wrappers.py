@@ -16,7 +16,7 @@ from oodd_eval import load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.live import Reading, TerminalMonitor, Watchdog
 
-gymnasium = pytest.importorskip("gymnasium", reason="needs the extra sim")
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="needs the extra sim")
+pytest.importorskip("gymnasium", reason="needs the extra gym")
 from helpers_own import BASIN, CISTERN, forget_own
 from helpers_plugins import install
 from oodd_recording.info import code_digest

@@ -189,6 +189,7 @@ for i in range(6):
 """,
     "write_csv": """
 import random
+random.seed(0)  # of unseeded ones, one scan in ten finds something odd
 for i in range(30):
     rows = (f"{t / 10},{random.gauss(0, 1)}" for t in range(100))
     open(f"logs/{i}.csv", "w").write("\\n".join(["t,speed", *rows]))
@@ -235,7 +236,10 @@ USES = {
     "plots": [f"{RUN} persistence", "draw"],
     "docs": [f"mkdocs build --quiet --strict --config-file {ROOT}/mkdocs.yml --site-dir site"],
     "test": [f"pytest -n 0 -p no:cacheprovider --rootdir {ROOT} {ROOT}/tests/test_worlds.py"],
-    "dev": [f"mypy --cache-dir mypy --config-file {ROOT}/pyproject.toml", "build --version"],
+    "dev": [
+        f"mypy --cache-dir mypy --follow-imports skip {ROOT}/oodd_eval/errors.py",
+        "build --version",
+    ],
     "all": [f"{RUN} rf,pyod:ECOD", f"{RECORD} lunarlander,drone", "oodd_eval check mewma"],
 }
 """Modules that show an extra at work, with their arguments."""
@@ -252,30 +256,30 @@ def pytest_generate_tests(metafunc):
 
 
 @pytest.fixture
-def place(tmp_path):
+def scratch(tmp_path):
     """A directory that goes with the test: an environment has up to a gigabyte."""
     yield tmp_path
     shutil.rmtree(tmp_path)
 
 
-def test_every_extra_works_as_the_table_says(version, extra, wheel, place):
+def test_every_extra_works_as_the_table_says(version, extra, wheel, scratch):
     base = interpreter(version)
     if base is None:
         pytest.skip(f"no Python {version} on this machine")
     if TABLE[extra][VERSIONS.index(version)] == "compiles":
-        _, errors = environment(base, place / "venv", "pybullet", options=())
+        _, errors = environment(base, scratch / "venv", "pybullet", options=())
         assert "No matching distribution found for pybullet" in errors
         return
     extras = WITH.get(extra, extra)
-    python, errors = environment(base, place / "venv", f"{wheel}[{extras}]" if extra else wheel)
+    python, errors = environment(base, scratch / "venv", f"{wheel}[{extras}]" if extra else wheel)
     assert not errors
     for name, program in PROGRAMS.items():
-        (place / f"{name}.py").write_text(program)
-    (place / "logs").mkdir()
+        (scratch / f"{name}.py").write_text(program)
+    (scratch / "logs").mkdir()
     if extra == "mujoco":
-        library = place / "venv" / "lib" / f"python{version}" / "site-packages"
+        library = scratch / "venv" / "lib" / f"python{version}" / "site-packages"
         swimmer = ROOT / "examples" / "oodd-swimmer"
         install = [*PIP, "install", "--no-deps", "--no-build-isolation", "--target", library]
         subprocess.run([*install, swimmer], check=True)
     for arguments in USES[extra]:
-        execute(python, place, arguments, warnings="default")  # of libraries, there are some
+        execute(python, scratch, arguments, warnings="default")  # of libraries, there are some

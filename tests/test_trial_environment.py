@@ -7,7 +7,7 @@ from helpers_docs import ROOT, Session, commands
 
 pytestmark = pytest.mark.slow
 
-pytest.importorskip("gymnasium", reason="needs the extra sim")
+pytest.importorskip("gymnasium", reason="needs the extra gym")
 PAGE = (ROOT / "docs" / "how-to" / "own-environment.md").read_text()
 
 
