@@ -5,6 +5,7 @@ they describe, such as the detectors' READMEs, become pages of the site. A link 
 no page leads into the repository, if pyproject.toml says where that is, or becomes its path in it.
 """
 
+import json
 import os
 import re
 from pathlib import Path, PurePosixPath
@@ -45,6 +46,8 @@ RESULTS = ("leaderboard/README.md", f"{BOARD}/index.html")
 FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 MATHS = re.compile(r"^\$\$(.+?)\$\$$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![^\s>-])(?=[^\s<-]*\d)[^\sA-Za-z<>-]+(?![^\s<-])")
+"""A word with digits and without letters, where the search splits its index."""
 COMMANDS = "<!-- help of every command -->"
 
 
@@ -84,6 +87,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, content in board().items():
         files.append(File.generated(config, path, content=content))
     return files
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Take numbers, half of all words, out of the search's index.
+
+    lunr writes a node of its tree as letters that are followed by numbers of other nodes, so that
+    words with digits may be taken for others, and then searches fail:
+    https://github.com/olivernn/lunr.js/issues/314 has the symptom.
+    """
+    path = Path(config.site_dir) / "search" / "search_index.json"
+    index = json.loads(path.read_text(encoding="utf-8"))
+    for entry in index["docs"]:
+        entry["text"] = NUMBER.sub(" ", entry["text"])
+    path.write_text(json.dumps(index, separators=(",", ":")), encoding="utf-8")
 
 
 def board() -> dict[str, str | bytes]:
