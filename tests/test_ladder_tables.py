@@ -19,6 +19,7 @@ from oodd_eval.results.collection import Results
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import DETECTION, Strengths, curve, thresholds
+from oodd_eval.results.tables import separability
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -96,6 +97,16 @@ def test_the_overview_has_multiples_of_riqns_thresholds_the_lowest_first():
     # Where no gravity costs half of the return, the largest counts: 0.75, 0.75 and 0.25.
     shares = [rows["rf"][name] for name in TIMES]
     assert shares == ["0.0", "0.0", "25.0", "58.3"]
+
+
+def test_rows_that_know_more_are_named_below_the_tables():
+    wise = [dataclasses.replace(r, detector="wise", training="external") for r in RECORDS[:4]]
+    oracle = [dataclasses.replace(r, detector="oracle", training="oracle") for r in RECORDS[:4]]
+    note = "Not ranked, for what they know: wise (trained on external), oracle."
+    for records, expected in ((RECORDS, False), ([*RECORDS, *wise, *oracle], True)):
+        shown = [table_of(records, "Detection thresholds, lower"), separability(Board(records))]
+        assert [note in (table.note or "") for table in shown] == [expected] * 2
+        assert expected or not any("Not ranked" in (table.note or "") for table in shown)
 
 
 def test_means_by_kind_say_on_which_side_censored_ones_are():

@@ -343,12 +343,16 @@ def test_a_ramp_that_ends_falls_to_nothing():
     assert inner.ends == [4]
 
 
-def test_dynamics_are_nominal_after_a_surge(cistern):
-    """The inflow of each row, from its levels and volts; noise off, to see it."""
+def setup_without_noise(cistern):
     (spec,) = cistern.oodd_environments()
     exact = tuple(Quantity(q.name, q.unit, q.role) for q in spec.sensors)
     register([EnvironmentSpec("cistern", spec.make, spec.policy, exact, spec.actions, 120)])
-    nominal = setup()
+    return setup()
+
+
+def test_dynamics_are_nominal_after_a_surge(cistern):
+    """The inflow of each row, from its levels and volts; noise off, to see it."""
+    nominal = setup_without_noise(cistern)
     episode = record_anomalous(nominal, "surge", 0.25, nominal.record(SEED))
     level = episode.trajectory.observations[:, 0].astype(np.float64)
     pumped = 0.1 * episode.trajectory.actions[:, 0].astype(np.float64)
@@ -359,10 +363,7 @@ def test_dynamics_are_nominal_after_a_surge(cistern):
 
 
 def test_a_ramp_wears_a_pump_row_by_row(cistern):
-    (spec,) = cistern.oodd_environments()
-    exact = tuple(Quantity(q.name, q.unit, q.role) for q in spec.sensors)
-    register([EnvironmentSpec("cistern", spec.make, spec.policy, exact, spec.actions, 120)])
-    nominal = setup()
+    nominal = setup_without_noise(cistern)
     episode = record_anomalous(nominal, "clog", 0.5, nominal.record(SEED))
     gain = episode.trajectory.observations[1:, 1] / episode.trajectory.actions[:, 0]
     rows = np.arange(1, len(gain) + 1) - episode.onset + 1  # from 1 at the onset

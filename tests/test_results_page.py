@@ -87,6 +87,19 @@ def gains(horizon, environments, names, sign=1):
         yield f"{sign * (other - one):.1f}"
 
 
+def hidden(*names):
+    """Cells at +1 and +5 % loss, all cells, and in how many of the former each row finds half."""
+    cells = {name: {} for name in names}
+    for r in tables.board("worlds").records:
+        if (name := str(r.setting)) in cells:
+            shares = cells[name].setdefault((r.environment, r.anomaly, r.strength), [])
+            shares.append(r.value("found_within_100_at_5pct"))
+    weak = {n: [np.mean(x) for c, x in by.items() if c[2] in ("loss1", "loss5")]
+            for n, by in cells.items()}  # fmt: skip
+    (first, *_) = names
+    return [len(weak[first]), len(cells[first]), *(sum(x >= 0.5 for x in weak[n]) for n in names)]
+
+
 STEPS = ("pe-step", "rf", "riqn-ms", "npn")
 ENDS = ("value", "low", "high")
 EASIER = "sensor-above-dynamics-models"
@@ -111,6 +124,9 @@ EASIER = "sensor-above-dynamics-models"
         ("RIQN by {} points", lambda: points("riqn-above-riqn-ms-10", factor=-100)),
         ("N-RIQN by {} points; at Δ = 1", lambda: points("memory-10-7")),
         ("one by {} points at Δ = 1", lambda: points("ensemble-1")),
+        ("{} of {} cells are `loss1` and `loss5`.", lambda: hidden("oracle")[:2]),
+        ("episodes are found by `oracle` in {} of them, by `mewma-a` in {} and by `pe-a` in {}.",
+         lambda: hidden("oracle", "mewma-a", "pe-a")[2:]),
     ],
 )  # fmt: skip
 def test_sentences_have_the_numbers_of_what_is_committed(phrase, numbers):

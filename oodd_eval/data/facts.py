@@ -72,7 +72,7 @@ class Quantity:
 
     @property
     def row(self) -> dict[str, Any]:
-        """What files store: name, unit, and what differs from its default."""
+        """Name, unit, and the fields that differ from their default, as files store them."""
         defaults = {"role": "measured", "noise": 0.0}
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {n: value for n, value in values.items() if value != defaults.get(n)}

@@ -47,7 +47,7 @@ ROLLOUT_TOLERANCE: Final = 5e-3
 Scores: TypeAlias = "NDArray[np.float64]"
 
 Training = Literal["nominal", "simulation", "anomalies", "external", "oracle"]
-"""What a detector knows, see `DetectorSpec`."""
+"""The knowledge that a detector declares, see `DetectorSpec`."""
 
 
 def training_mark(training: Training) -> str:

@@ -79,7 +79,7 @@ class Standing:
 
     @property
     def training(self) -> Training:
-        """What its detector knows, as it declares, see `DetectorSpec`."""
+        """The knowledge that its detector declares, see `DetectorSpec`."""
         return next((r.training for r in self.records if r.training != "nominal"), "nominal")
 
     @property

@@ -271,7 +271,7 @@ _COLUMNS: Final = {
 COSTS: Final = MappingProxyType(
     {UNITS[0]: "costs 1 % of the return", UNITS[1]: "raises the task's loss by 1 %"}
 )
-"""What the strength of the unit does, by `Strengths.base`."""
+"""The cost of a strength of 1, by `Strengths.base`."""
 
 
 NO_UNITS: Final[Mapping[str, str]] = MappingProxyType({})
