@@ -77,7 +77,7 @@ QUICKER = [
     Rule(r" --param updates=\d+", "the next rule says how many"),
     Rule(r"--detector (\S*(riqn|npn|\bpe\b)\S*)", "trains for minutes",
          r"--detector \1 --param updates=2 --param members=1"),
-    Rule(r"^(oodd-eval run .*(riqn|npn|\bpe\b|\brf\b|pyod:|sklearn:|forecast:).*)$",
+    Rule(r"^(oodd-eval run .*(riqn|npn|\bpe\b|\brf\b|pyod:|sklearn:|river:|forecast:).*)$",
          "quick enough on a few", r"\1 --limit 2"),
     Rule(r"--horizon [\d,]*\d\d\b[\d,]*", "long rollouts take long", "--horizon 2"),
     Rule(r"--param trees=\d+", "small forests are forests", "--param trees=2"),

@@ -5,6 +5,8 @@ import sys
 import numpy as np
 import pytest
 from oodd_adapters import windows as w
+from river import anomaly as river_anomaly
+from river import preprocessing
 from sklearn.ensemble import IsolationForest
 from sklearn.neighbors import KernelDensity
 
@@ -51,6 +53,20 @@ class Dice:
         self.drawn_ = np.random.random(y.shape[1]) + random.random()
     def predict(self, x):
         return np.tile(self.drawn_, (len(x), 1)) + np.random.random((len(x), 1))
+
+
+def pipeline(n_trees=7, seed=None):
+    from river import anomaly, preprocessing
+    return preprocessing.MinMaxScaler() | anomaly.HalfSpaceTrees(n_trees=n_trees, seed=seed)
+
+
+class Counter:
+    """Scores by the number of rows that it has scored."""
+    count = 0
+    def learn_one(self, x): ...
+    def score_one(self, x):
+        self.count += 1
+        return self.count
 
 
 class Needy:
@@ -175,6 +191,8 @@ def test_a_density_estimator_scores_by_minus_its_log_density():
     [
         "sklearn:LocalOutlierFactor", "sklearn:OneClassSVM", "sklearn:EllipticEnvelope",
         "sklearn:SGDOneClassSVM", "sklearn:GaussianMixture", "pyod:KNN", "pyod:ECOD", "pyod:PCA",
+        "river:LODA", "river:LocalOutlierFactor", "river:GaussianScorer",
+        "river:StandardAbsoluteDeviation",
     ],
 )  # fmt: skip
 def test_every_outlier_detector_gives_a_far_observation_a_higher_score(name):
@@ -194,6 +212,67 @@ def test_a_detector_that_ranks_rows_among_each_other_gets_them_one_at_a_time():
     detector.fit(noise(60, 60))
     assert detector.alone_
     np.testing.assert_array_equal(detector.score(x)[:5], detector.score(x[:5]))
+
+
+# Online detectors
+
+
+def test_half_space_trees_are_rivers_with_the_ranges_of_training_and_in_an_order_of_the_seed():
+    nominal, (x,) = noise(200, 250), noise(30, seed=1)
+    detector = make("river:HalfSpaceTrees", seed=3, window=2, n_trees=5)
+    detector.fit(nominal)
+    scale = FeatureScale.fit(nominal)
+    z = [scale(t).astype(float) for t in (*nominal, x)]
+    rows = [np.hstack([a, np.vstack([a[:1], a[:-1]])]) for a in z]
+    training = np.vstack(rows[:2])
+    limits = {i: (min(column), max(column)) for i, column in enumerate(training.T.tolist())}
+    trees = river_anomaly.HalfSpaceTrees(n_trees=5, limits=limits, seed=3)
+    for i in np.random.default_rng(3).permutation(450):
+        trees.learn_one(dict(enumerate(training[i].tolist())))
+    expected = [trees.score_one(dict(enumerate(row.tolist()))) for row in rows[2]]
+    assert len(set(expected)) > 5
+    np.testing.assert_array_equal(detector.score(x), expected)
+
+
+def test_a_detector_of_one_variable_judges_each_sensor_by_its_own_values():
+    nominal, (x,) = noise(300), noise(10, seed=1)
+    detector = make("river:StandardAbsoluteDeviation", window=3)
+    detector.fit(nominal)
+    seen, judged = (t.observations.astype(float) for t in (*nominal, x))
+    # Each sensor's distance from its mean in standard deviations (of a sample), averaged.
+    expected = (np.abs(judged - seen.mean(0)) / seen.std(0, ddof=1)).mean(axis=1)
+    np.testing.assert_allclose(detector.score(x), expected, rtol=1e-4)
+
+
+def test_no_episode_is_learnt_from():
+    nominal, (x, other) = noise(300), noise(40, 60, seed=1)
+    for name in ("river:HalfSpaceTrees", "river:LODA", "river:GaussianScorer"):
+        detector = make(name, window=2)
+        detector.fit(nominal)
+        before = detector.score(x)
+        detector.score(other)
+        np.testing.assert_array_equal(detector.score(x), before)
+        np.testing.assert_array_equal(detector.score(x)[:7], detector.score(x[:7]))
+
+
+def test_a_pipeline_of_a_user_is_a_detector(theirs):
+    spec = offer("river:their_models.pipeline").spec
+    detector = spec.factory(seed=5, horizon=1, window=1, n_trees=3)
+    nominal, (x,) = noise(600), noise(20, seed=1)
+    detector.fit(nominal)
+    scale = FeatureScale.fit(nominal)
+    model = preprocessing.MinMaxScaler() | river_anomaly.HalfSpaceTrees(n_trees=3, seed=5)
+    for i in np.random.default_rng(5).permutation(600):
+        model.learn_one(dict(enumerate(scale(nominal[0])[i].astype(float).tolist())))
+    expected = [model.score_one(dict(enumerate(r))) for r in scale(x).astype(float).tolist()]
+    np.testing.assert_array_equal(detector.score(x), expected)
+    assert parameters_of(spec.parameters)["n_trees"].default == 7
+
+
+def test_what_learns_from_the_rows_that_it_scores_is_refused(theirs):
+    detector = make("river:their_models.Counter")
+    with pytest.raises(ContractError, match=r"'river:their_models.Counter' learns from what it"):
+        detector.fit(noise(40))
 
 
 # Forecasters
@@ -260,6 +339,8 @@ def test_a_class_that_scores_something_else_than_rows_is_an_error():
         ("sklearn:ensemble.IsolationForest", "sklearn:IsolationForest"),
         ("sklearn:neighbors.LocalOutlierFactor", "sklearn:LocalOutlierFactor"),
         ("pyod:KNN", "pyod:KNN"),
+        ("river:LODA", "river:LODA"),
+        ("river:river.anomaly.LODA", "river:LODA"),
         ("forecast:sklearn.linear_model.Ridge", "forecast:sklearn.linear_model.Ridge"),
     ],
 )
@@ -296,6 +377,13 @@ def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
         ("pyod:os.system", UnknownNameError, "unknown detector of PyOD"),
         ("sklearn:linear_model.Ridge", UsageError, "neither an outlier detector nor"),
         ("sklearn:ensembl.IsolationForest", UnknownNameError, "did you mean 'ensemble'"),
+        ("river:HalfspaceTrees", UnknownNameError, "did you mean 'HalfSpaceTrees'"),
+        ("river:ADWIN", UsageError, "yes or no about a stream of one number"),
+        ("river:drift.KSWIN", UsageError, "yes or no about a stream of one number"),
+        ("river:QuantileFilter", UsageError, "name the detector itself"),
+        ("river:PredictiveAnomalyDetection", UsageError, "learns from what it scores"),
+        ("river:os.sep", UsageError, "expected a class or a function"),
+        ("river:os.PathLike", UsageError, "expected a class or a function"),
         ("forecast:Ridge", UsageError, "names no class"),
         ("forecast:sklearn.linear_model.Rige", UnknownNameError, "did you mean 'Ridge'"),
         ("forecast:sklearn.cluster.KMeans", UsageError, "is not a regressor"),
@@ -369,7 +457,8 @@ def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
 @pytest.mark.parametrize(
     "name",
     ["sklearn:IsolationForest", "pyod:ECOD", "forecast:sklearn.linear_model.Ridge",
-     "forecast:their_models.Dice", "forecast:their_models.Single"],
+     "river:HalfSpaceTrees", "river:LODA", "river:GaussianScorer", "forecast:their_models.Dice",
+     "forecast:their_models.Single"],
 )  # fmt: skip
 def test_a_state_is_the_rows_and_gives_the_same_scores(theirs, name):
     detector = make(name, window=2, rows=150)

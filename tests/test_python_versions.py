@@ -219,6 +219,7 @@ USES = {
     "": [f"{RUN} mewma,persistence"],
     "reference": [f"{RUN} rf,pe"],
     "pyod": [f"{RUN} pyod:ECOD,sklearn:IsolationForest"],
+    "river": [f"{RUN} river:HalfSpaceTrees"],
     "gym": [f"{RECORD} cartpole,lunarlander"],
     "bullet": [f"{RECORD} hopper"],
     "sim": [f"{RECORD} acrobot,lunarlander"],

@@ -55,7 +55,8 @@ class _Adapter(StorableWindowDetector):
     name, seed, horizon, lag
         See `WindowDetector`.
     make
-        Returns a new, unfitted object of the class; called once per fit, and perhaps once to try.
+        Returns a new, unfitted object of the class, with keyword arguments beside those of the
+        user; called once per fit, and perhaps once to try.
     parameters
         How to feed it.
     """
@@ -70,7 +71,7 @@ class _Adapter(StorableWindowDetector):
     def __init__(
         self,
         name: str,
-        make: Callable[[], Any],
+        make: Callable[..., Any],
         parameters: AdapterParameters,
         *,
         seed: int,
@@ -183,6 +184,95 @@ class OutlierDetector(_Adapter):
 
     def _scores(self, rows: Floats, now: NDArray[np.float32], *, alone: bool) -> Floats:  # noqa: ARG002  the newest part of the window
         return self.sign * row_by_row(self.function_, rows, alone=alone)
+
+
+class OnlineDetector(_Adapter):
+    r"""Score the window of the latest observations by an online detector that has stopped learning.
+
+    .. math:: s_t = f(o_t, o_{t-1}, \dots, o_{t-W+1})
+
+    with f the ``score_one`` of an object whose ``learn_one`` was given windows of nominal
+    trajectories one by one, in an order that the seed decides: what forgets keeps the latest rows,
+    which are then from all trajectories. Rows are mappings from the number of a column to its
+    value. Scoring teaches it nothing, so that no episode is remembered. Higher means more
+    anomalous; defined for all t, and the horizon changes nothing, as of `OutlierDetector`.
+
+    A detector of one variable gets an object per sensor, which learns and scores the sensor's
+    newest value; the score is their mean.
+
+    Parameters
+    ----------
+    arguments, more
+        Arguments of `_Adapter`.
+    limits
+        Whether the constructor takes the range of each column, which is that of training rows.
+    one_variable
+        Whether it is a detector of one variable, ``score_one(x, y)``.
+    """
+
+    ahead: ClassVar[int] = 0
+
+    def __init__(self, *arguments: Any, limits: bool, one_variable: bool, **more: Any) -> None:
+        super().__init__(*arguments, **more, lag=0)
+        self.limits, self.one_variable = limits, one_variable
+        self.alone_ = True  # There is no other way to score them.
+
+    def _fit_class(self, rows: Floats, later: Floats) -> None:
+        order = np.random.default_rng(self.seed).permutation(len(rows))
+        with seeded(self.seed):
+            if self.one_variable:
+                function = _score_each(
+                    [self._one_of(values) for values in later[order].T], later.shape[1]
+                )
+            else:
+                function = self._of_rows(rows[order])
+        self.function_: Function = self._seeded_call(function)
+        self._must_not_learn(rows)
+
+    def _of_rows(self, rows: Floats) -> Callable[[Floats], Floats]:
+        """Return the scores of windows by an object that has learnt these."""
+        more: dict[str, Any] = {}
+        if self.limits:
+            more["limits"] = dict(enumerate(zip(rows.min(0).tolist(), rows.max(0).tolist())))  # noqa: B905  columns both
+        model = self.make(**more)
+        for row in rows.tolist():
+            model.learn_one(dict(enumerate(row)))
+        return lambda rows: np.array([model.score_one(dict(enumerate(r))) for r in rows.tolist()])
+
+    def _one_of(self, values: NDArray[np.float64]) -> Any:
+        """Return an object that has learnt the values of one sensor."""
+        model = self.make()
+        for value in values.tolist():
+            model.learn_one(None, value)
+        return model
+
+    def _must_not_learn(self, rows: Floats) -> None:
+        """Raise `ContractError` where a score changes what later scores are."""
+        some = rows[np.linspace(0, len(rows) - 1, num=8).astype(int)]
+        some = np.concatenate([some, 3.0 * some])
+        first, again = (row_by_row(self.function_, some, alone=True) for _ in range(2))
+        if not np.array_equal(first, again, equal_nan=True):
+            raise ContractError(
+                f"detector {self.name!r} learns from what it scores: the same rows have other "
+                "scores the second time, so that it would remember the episodes that it is to "
+                "judge; name one that learns in learn_one alone"
+            )
+
+    def _scores(self, rows: Floats, now: NDArray[np.float32], *, alone: bool) -> Floats:  # noqa: ARG002  the newest part of the window
+        return row_by_row(self.function_, rows, alone=alone)
+
+
+def _score_each(models: Sequence[Any], sensors: int) -> Callable[[Floats], Floats]:
+    """Return the mean of the scores of each sensor's newest value, by a detector of each."""
+
+    def function(rows: Floats) -> Floats:
+        newest = rows[:, :sensors].tolist()
+        scores = np.array(
+            [[m.score_one(None, v) for m, v in zip(models, row, strict=True)] for row in newest]
+        )
+        return np.asarray(scores.mean(axis=1))
+
+    return function
 
 
 class ForecastDetector(_Adapter):

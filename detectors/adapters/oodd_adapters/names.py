@@ -7,7 +7,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -59,6 +59,54 @@ def sklearn_class(name: str) -> tuple[str, type]:
             f"scikit-learn are {', '.join(sorted(known))}"
         )
     return short if known.get(short) is candidate else name, candidate
+
+
+def river_factory(name: str) -> tuple[str, Callable[..., Any]]:
+    """Return what makes a detector of river, after its shortest name.
+
+    The name is that of a class of ``river.anomaly``, or the path to a class or function of one's
+    own that returns a detector or a pipeline which ends with one.
+
+    Raises
+    ------
+    UsageError
+        When it is none, or one that gives no scores of rows.
+    """
+    anomaly, drift = (importlib.import_module(f"river.{part}") for part in ("anomaly", "drift"))
+    known = {n: c for n in anomaly.__all__ if n not in _NO_SCORES and (c := getattr(anomaly, n))}
+    short = name.rpartition(".")[2]
+    spec = f"river:{name}"
+    if (reason := _NO_SCORES.get(short)) and name in (short, f"river.anomaly.{short}"):
+        raise UsageError(f"{spec!r} {reason}")
+    if short in drift.__all__ and name in (short, f"drift.{short}", f"river.drift.{short}"):
+        raise UsageError(
+            f"{spec!r} answers yes or no about a stream of one number and then begins anew: it has "
+            "no score of a row, and no threshold that nominal episodes could calibrate. Name a "
+            "detector that scores rows; its guaranteed alarm watches its scores for a change"
+        )
+    if name in known:
+        return name, known[name]
+    if short == name:
+        raise UnknownNameError("anomaly detector of river", name, known)
+    factory = imported(name, spec)
+    routine = inspect.isroutine(factory)
+    if not routine and not all(hasattr(factory, m) for m in ("learn_one", "score_one")):
+        raise UsageError(
+            f"{spec!r} is {factory!r:.60}, expected a class or a function that returns an anomaly "
+            "detector of river, or a pipeline that ends with one"
+        )
+    return short if known.get(short) is factory else name, factory
+
+
+_NO_SCORES: Final = {
+    "QuantileFilter": "is a threshold around an anomaly detector: name the detector itself; the "
+    "guaranteed alarm has a threshold of its own",
+    "ThresholdFilter": "is a threshold around an anomaly detector: name the detector itself; the "
+    "guaranteed alarm has a threshold of its own",
+    "PredictiveAnomalyDetection": "learns from what it scores: its threshold follows the episode "
+    "that it is to judge; name forecast:MODULE.CLASS for the error of a forecaster",
+}
+"""Classes of ``river.anomaly`` that cannot score an episode without remembering it, or at all."""
 
 
 def imported(path: str, spec: str) -> Any:
@@ -125,8 +173,8 @@ class Signature:
     others: tuple[str, ...] | None
 
     @classmethod
-    def of(cls, factory: type) -> Signature:
-        """Read the signature of a class."""
+    def of(cls, factory: Callable[..., Any]) -> Signature:
+        """Read the signature of a class, or of a function that makes objects."""
         every = inspect.signature(factory).parameters.values()
         anything = any(p.kind is p.VAR_KEYWORD for p in every)
         named = [p for p in every if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]

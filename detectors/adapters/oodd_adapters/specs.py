@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
-from oodd_adapters.detectors import AdapterParameters, ForecastDetector, OutlierDetector
-from oodd_adapters.names import Signature, forecaster_class, pyod_class, sklearn_class
+from oodd_adapters.detectors import (
+    AdapterParameters,
+    ForecastDetector,
+    OnlineDetector,
+    OutlierDetector,
+)
+from oodd_adapters.names import (
+    Signature,
+    forecaster_class,
+    pyod_class,
+    river_factory,
+    sklearn_class,
+)
 from oodd_eval import Detector, DetectorSpec
 from oodd_eval.plugins.parameters import checked, declared_by
 from oodd_eval.scoring.plan import source_digest
@@ -44,6 +57,20 @@ def sklearn(name: str) -> DetectorSpec:
     return recipe.spec(summary, _sklearn_version())
 
 
+def river(name: str) -> DetectorSpec:
+    """Return the spec of an online detector of river: its `score_one`, after training."""
+    if not _present("river"):
+        summary = f"river's {name} on a window of observations, learning in training alone"
+        return _absent(f"river:{name}", summary, "river", "oodd-eval[river]")
+    name, factory = river_factory(name)
+    top = name.partition(".")[0]
+    label = f"river.{version('river')}"
+    if top != name:  # code of one's own, whose digest tells when it changes
+        label = f"{label}.{top}.{source_digest(top)[:12]}"
+    summary = f"river's {name} on a window of observations, learning in training alone"
+    return _OnlineRecipe(factory, f"river:{name}", outlier=None).spec(summary, label)
+
+
 def forecast(path: str) -> DetectorSpec:
     """Return the spec of a forecaster: the error of its `predict`, fed with windows."""
     name = f"forecast:{path}"
@@ -64,19 +91,23 @@ class _Recipe:
     Attributes
     ----------
     library_class
-        The class.
+        The class, or a function that makes objects.
     name
         Of the detector.
     outlier
-        For outlier detectors, the method that scores and its sign; None for forecasters.
+        For outlier detectors of rows, the method that scores and its sign; None for others.
     fixed
         Parameters of the class that are not the user's to choose.
     """
 
-    library_class: type
+    library_class: Callable[..., Any]
     name: str
     outlier: tuple[str, int] | None
     fixed: Mapping[str, Any] = field(default_factory=dict)
+    seed_name: ClassVar[str] = "random_state"
+    """Parameter of the class that is the seed."""
+    decided: ClassVar[frozenset[str]] = frozenset({"random_state"})
+    """Parameters of the class that the adapter decides."""
 
     @property
     def signature(self) -> Signature:
@@ -86,7 +117,7 @@ class _Recipe:
     def spec(self, summary: str, label: str) -> DetectorSpec:
         """Return the spec; the label says which version of which library does the work."""
         signature = self.signature
-        hidden = {*self.fixed, *_WINDOW_PARAMETERS, "random_state"}
+        hidden = {*self.fixed, *_WINDOW_PARAMETERS, *self.decided}
         plain = {n: v for n, v in signature.plain.items() if n not in hidden}
         return DetectorSpec(
             name=self.name,
@@ -103,16 +134,44 @@ class _Recipe:
         signature = self.signature
         window_parameters = {n: parameters.pop(n) for n in _WINDOW_PARAMETERS & parameters.keys()}
         arguments = {**parameters, **self.fixed}
-        if "random_state" in signature:
-            arguments.setdefault("random_state", seed)
+        if self.seed_name in signature:
+            arguments.setdefault(self.seed_name, seed)
         signature.check(arguments, self.name)
-        make: Callable[[], Any] = lambda: self.library_class(**arguments)  # noqa: E731
+        make: Callable[..., Any] = lambda **more: self.library_class(**arguments, **more)  # noqa: E731
         windows = checked(AdapterParameters, self.name, window_parameters)
+        return self._detector(make, windows, seed, horizon)
+
+    def _detector(
+        self, make: Callable[..., Any], windows: AdapterParameters, seed: int, horizon: int
+    ) -> Detector:
+        """Return the detector that feeds the objects that `make` returns."""
         if self.outlier is None:
             return ForecastDetector(self.name, make, windows, seed=seed, horizon=horizon)
         method, sign = self.outlier
         return OutlierDetector(
             self.name, make, windows, seed=seed, horizon=horizon, method=method, sign=sign
+        )
+
+
+class _OnlineRecipe(_Recipe):
+    """Make detectors of what learns and scores one row at a time."""
+
+    seed_name: ClassVar[str] = "seed"
+    decided: ClassVar[frozenset[str]] = frozenset({"seed", "limits"})
+
+    def _detector(
+        self, make: Callable[..., Any], windows: AdapterParameters, seed: int, horizon: int
+    ) -> Detector:
+        base = importlib.import_module("river.base")
+        kind = self.library_class
+        return OnlineDetector(
+            self.name,
+            make,
+            windows,
+            seed=seed,
+            horizon=horizon,
+            limits="limits" in self.signature,
+            one_variable=inspect.isclass(kind) and issubclass(kind, base.SupervisedAnomalyDetector),
         )
 
 
