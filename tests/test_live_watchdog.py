@@ -239,7 +239,7 @@ def test_endless_operation_keeps_its_promise_within_the_interval(name, episodes,
         ({"hours": 1e-5, "rate": 50}, "promise more"),
         ({"sensors": ["x"]}, r"1 names of sensors \['x'\], expected 3"),
         ({"sensors": ["x", "x", "y"]}, "all unlike"),
-        ({"statistic": "sum"}, "expected 'cusum' or 'score'"),
+        ({"statistic": "sum"}, "expected one of 'cusum', 'score'"),
     ],
 )
 def test_what_cannot_be_promised_is_said_when_fitting(arguments, message):

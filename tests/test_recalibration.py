@@ -9,6 +9,7 @@ from helpers_records import make_record
 
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.accumulation import STATISTICS, Ranks
 from oodd_eval.metrics.alarms import (
     GuaranteedAlarm,
     guaranteed_contributions,
@@ -56,10 +57,11 @@ def naive_rules(draw, kind):
     again = [CALIBRATION[i] for i in chosen]
     paper = AlarmRule(Standardization.fit(again))
     standardization, judged, chosen_judged = None, CALIBRATION, chosen
-    if kind == "cusum":
-        standardization = Standardization.fit(again[0::2])
+    if kind != "score":
+        basis = Ranks if kind == "e-detector" else Standardization
+        standardization = basis.fit(again[0::2])
         judged, chosen_judged, spread = CALIBRATION[1::2], chosen[1::2] // 2, spread[1::2]
-    statistic = GuaranteedAlarm(standardization, math.inf)
+    statistic = GuaranteedAlarm(standardization, math.inf, kind)
     largest = [statistic.largest(scores) for scores in judged]
     m, ordered = len(judged), sorted(largest)
     levels = [
@@ -75,11 +77,11 @@ def naive_rules(draw, kind):
             threshold = ordered[-1] + (height - known[-1]) * excess
         else:
             threshold = float(np.interp(height, known, ordered))
-        rules[suffix] = GuaranteedAlarm(standardization, threshold)
+        rules[suffix] = GuaranteedAlarm(standardization, threshold, kind)
     return paper, rules
 
 
-@pytest.mark.parametrize("kind", ["score", "cusum"])
+@pytest.mark.parametrize("kind", STATISTICS)
 def test_draws_and_intervals_are_those_of_the_definition(kind):
     expected = {}
     for draw in range(DRAWS):

@@ -16,6 +16,7 @@ from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.data.split import imported_environments
 from oodd_eval.errors import UnknownNameError
+from oodd_eval.metrics.accumulation import NOUNS
 from oodd_eval.plugins.contract import Training
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -129,7 +130,8 @@ def _detector(offer: Offer) -> Lines:
         yield "unavailable", why
     yield "source", spec.reference or "not given"
     yield "looks at", spec.inputs.replace("+", " and ")
-    yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
+    sums = f"{NOUNS[spec.alarm].partition(' ')[2]} of the score"
+    yield "alarm", "the score itself" if spec.alarm == "score" else sums
     yield "trained on", _TRAINING[spec.training]
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
     for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):

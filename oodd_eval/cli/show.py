@@ -1,6 +1,7 @@
 """``oodd-eval show``: tables of earlier results, recomputed from their scores."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import click
@@ -20,6 +21,8 @@ from oodd_eval.cli import (
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split
+from oodd_eval.errors import UsageError
+from oodd_eval.metrics.accumulation import STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
@@ -41,6 +44,7 @@ _format_options: Final = together(
     "show oodd-results --intervals",
     "show oodd-results --detector rf --metric missed_at_5pct",
     "show oodd-results --env hopper -k 'not drift' --csv",
+    "show oodd-results --alarm ewma",
 )
 @click.argument("directory", type=DIRECTORY, help="results directory")
 @click.option("--split", type=Name("splits"), help="where the split is, if not at its usual place")
@@ -52,6 +56,11 @@ _format_options: Final = together(
 )
 @click.option("--metric", type=Name("metrics"), help="metric of that table")
 @click.option("--wide", is_flag=True, help="print all metrics, with nulls and all alarm levels")
+@click.option(
+    "--alarm",
+    type=click.Choice(STATISTICS),
+    help="watch this statistic of the scores instead of what each detector declares",
+)
 @_format_options
 @click.option("--env", default="all", type=Names("envs"), help="only these environments")
 @expression_option
@@ -60,6 +69,10 @@ def show(options: Options) -> int:
 
     The exit code is 1 when one of the cells failed.
     """
+    if options.alarm and options.stored:
+        raise UsageError(
+            f"--alarm {options.alarm} computes figures that --stored would not show: leave out one"
+        )
     if options.metric:
         check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
@@ -70,6 +83,8 @@ def show(options: Options) -> int:
     records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
     units: dict[str, str] = {}
     if not options.stored:
+        if options.alarm:
+            records = [replace(record, alarm=options.alarm) for record in records]
         splits = _splits(records, options.split)
         records = _recomputed(records, results, splits, rows=options.row_metrics)
         units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
-from oodd_eval.metrics.alarms import AlarmKind
+from oodd_eval.metrics.accumulation import STATISTICS, AlarmKind
 from oodd_eval.plugins.contract import Detector, StreamingDetector, make_detector
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.explanations import ExplainingDetector
@@ -46,9 +46,11 @@ class DetectorHandle:
         baseline: int = 0,
     ) -> Self:
         """Make the detector of that name, or take an instance, for so many baseline rows."""
-        if statistic not in {None, "cusum", "score"}:
-            raise UsageError(f"statistic={statistic!r}, expected 'cusum' or 'score'")
-        kind, name, actions, adapts = cast("AlarmKind | None", statistic), "", True, False
+        kind = next((one for one in STATISTICS if one == statistic), None)
+        if kind is None and statistic is not None:
+            expected = ", ".join(map(repr, STATISTICS))
+            raise UsageError(f"statistic={statistic!r}, expected one of {expected}")
+        name, actions, adapts = "", True, False
         if isinstance(detector, str):
             offer = discover().offer(detector)
             offer.require()

@@ -19,15 +19,8 @@ from oodd_eval.live.handle import DetectorHandle, streaming
 from oodd_eval.live.nominal import Episode, Nominal, NominalData
 from oodd_eval.live.reading import Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
-from oodd_eval.metrics.alarms import (
-    AlarmKind,
-    Calibration,
-    GuaranteedAlarm,
-    Monitor,
-    least_episodes,
-    too_few,
-)
-from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
+from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
 from oodd_eval.plugins.contract import Detector, StorableDetector
 from oodd_eval.plugins.state import pack, read_state, write_state
 
@@ -155,8 +148,8 @@ class Watchdog:
         hold_off
             Rows after the end of an alarm in which no new one is raised.
         statistic
-            ``"cusum"`` or ``"score"``: see `GuaranteedAlarm`. Default what a named detector
-            declares, else the CUSUM.
+            ``"cusum"``, ``"score"``, ``"ewma"``, ``"shiryaev-roberts"`` or ``"e-detector"``: see
+            `GuaranteedAlarm`. Default what a named detector declares, else the CUSUM.
         seed, horizon, parameters
             For the factory of a named detector.
 
@@ -216,8 +209,7 @@ class Watchdog:
             if any(faults):
                 notes.append(_faults_note(faults, nominal.sensors))
             return cls(handle, fitted, rule, limits, nominal, settings, None, notes)
-        cusum = Standardization.fit(scores) if handle.alarm == "cusum" else None
-        unbounded = GuaranteedAlarm(cusum, math.inf)
+        unbounded = GuaranteedAlarm(basis_of(handle.alarm, scores), math.inf, handle.alarm)
         # One after the other: what a sum has reached at the end of one goes on in the next.
         joined = unbounded.statistic(np.concatenate(scores))
         ends = np.cumsum([len(s) for s in scores])
@@ -459,7 +451,7 @@ class Watchdog:
             "made": self._handle.state,
             "sensors": self.sensors,
             "threshold": self.rule.threshold,
-            "standardization": scale and [scale.mean, scale.std],
+            "standardization": scale and scale.numbers,
             "calibration": known
             and {
                 # JSON has no infinities, of which there are two: as texts.
@@ -525,7 +517,7 @@ class Watchdog:
         scale, known, length = (
             values[name] for name in ("standardization", "calibration", "run_length")
         )
-        standardization = scale and Standardization(*map(_finite, scale))
+        standardization = scale and basis_from(handle.alarm, [_finite(x) for x in scale])
         calibration = known and Calibration(
             handle.alarm,
             standardization,
@@ -541,7 +533,7 @@ class Watchdog:
             latch=bool(chosen["latch"]),
             hold_off=int(chosen["hold_off"]),
         )
-        rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
+        rule = GuaranteedAlarm(standardization, _finite(values["threshold"]), handle.alarm)
         run_length = length and RunLength(*map(_finite, length))
         arrays = {
             name.removeprefix(DETECTOR): array

@@ -9,12 +9,20 @@ scores and however they depend on one another within an episode.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import UsageError
+from oodd_eval.metrics.accumulation import (
+    NOUNS,
+    Accumulation,
+    AlarmKind,
+    Ranks,
+    accumulated,
+    basis_of,
+)
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
@@ -22,10 +30,8 @@ from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
 Floats = NDArray[np.float64]
 
-AlarmKind = Literal["cusum", "score"]
-"""Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself."""
-
-STATISTICS: Final[tuple[AlarmKind, ...]] = get_args(AlarmKind)
+USUAL: Final[tuple[AlarmKind, ...]] = ("cusum", "score")
+"""Statistics that the detectors of the board declare, for sentences about both."""
 
 _ROUNDING: Final = 1e-9  # share of an episode that levels may be off: (n + 1) x 0.05 is whole
 
@@ -37,9 +43,12 @@ class GuaranteedAlarm:
     Parameters
     ----------
     standardization
-        Of the scores, for the CUSUM; None where the score itself is the statistic.
+        Of the scores, for the CUSUM and other sums; their ranks, for the e-detector; None where the
+        score itself is the statistic.
     threshold
         An episode alarms at the first row whose statistic is larger.
+    kind
+        The statistic, where the score itself is not.
 
     Examples
     --------
@@ -49,8 +58,9 @@ class GuaranteedAlarm:
     (19.0, 2, None)
     """
 
-    standardization: Standardization | None
+    standardization: Standardization | Ranks | None
     threshold: float
+    kind: AlarmKind = "cusum"
 
     @classmethod
     def fit(
@@ -72,6 +82,8 @@ class GuaranteedAlarm:
             ``"cusum"``: the CUSUM, without a new start after an alarm, of scores that the episodes
             number 0, 2, 4, ... standardize; the threshold is from the others. ``"score"``: the
             score itself, for a detector that accumulates by itself; the threshold is from all.
+            ``"ewma"``, ``"shiryaev-roberts"``, ``"e-detector"``: as the CUSUM, with another sum
+            (`oodd_eval.metrics.accumulation`).
         confidence
             See `quantile_rank`.
 
@@ -103,7 +115,10 @@ class GuaranteedAlarm:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
         if self.standardization is None:
             return np.where(np.isnan(scores), -np.inf, scores)
-        return cusum(self.standardization(scores), threshold=math.inf)[0]
+        x = self.standardization(scores)
+        if self.kind == "cusum":
+            return cusum(x, threshold=math.inf)[0]
+        return accumulated(self.kind, x)
 
     def largest(self, scores: Floats) -> float:
         """Return the largest statistic of an episode."""
@@ -124,7 +139,7 @@ class Calibration:
     kind
         The statistic.
     standardization
-        Of the scores, for the CUSUM: from the first calibration, whatever joins it later.
+        As that of `GuaranteedAlarm`: from the first calibration, whatever joins it later.
     largest
         Largest statistic of each of the n episodes that the quantile is of, as recorded.
     episodes
@@ -140,7 +155,7 @@ class Calibration:
     """
 
     kind: AlarmKind
-    standardization: Standardization | None
+    standardization: Standardization | Ranks | None
     largest: tuple[float, ...]
     episodes: int
     rolling: bool = False
@@ -160,17 +175,17 @@ class Calibration:
         -------
         Calibration
         """
-        standardization, episodes = None, scores
-        if kind == "cusum":
-            standardization, episodes = Standardization.fit(scores[0::2]), scores[1::2]
-        unbounded = GuaranteedAlarm(standardization, math.inf)
+        standardization, episodes = basis_of(kind, scores[0::2]), scores
+        if standardization is not None:
+            episodes = scores[1::2]
+        unbounded = GuaranteedAlarm(standardization, math.inf, kind)
         largest = tuple(unbounded.largest(one) for one in episodes)
         return cls(kind, standardization, largest, len(scores))
 
     @property
     def unbounded(self) -> GuaranteedAlarm:
         """The statistic, with a threshold that nothing exceeds."""
-        return GuaranteedAlarm(self.standardization, math.inf)
+        return GuaranteedAlarm(self.standardization, math.inf, self.kind)
 
     def joined(self, largest: float) -> "Calibration":
         """Return a rolling calibration with a further nominal episode.
@@ -233,7 +248,7 @@ class Calibration:
         """
         threshold = self.threshold(level, confidence)
         if not math.isinf(threshold):
-            return GuaranteedAlarm(self.standardization, threshold)
+            return GuaranteedAlarm(self.standardization, threshold, self.kind)
         subject = f"at most {100 * level:.3g} % of nominal episodes with an alarm"
         if len(self.largest) < (n := least_rolling(level)) and self.rolling:
             needed = f"takes {n}" if math.isfinite(n) else "is more than any number can promise"
@@ -275,14 +290,13 @@ def too_few(
     >>> too_few("alpha=0.05", 30, 0.05, "cusum").partition(":")[0]
     'alpha=0.05 takes 38 calibration episodes, got 30'
     """
-    needed = {one: least_episodes(level, one, confidence) for one in STATISTICS}
-    names = {
-        "cusum": "a CUSUM of the scores, which half of them standardize",
-        "score": "the detector's own score as the statistic",
-    }
+    halved, whole = (least_episodes(level, one, confidence) for one in USUAL)
+    of_halves = NOUNS["cusum" if kind == "score" else kind]
     return (
-        f"{subject} takes {needed[kind]} calibration episodes, got {episodes}: "
-        f"{needed['cusum']} for {names['cusum']}, {needed['score']} for {names['score']}; "
+        f"{subject} takes {whole if kind == 'score' else halved} calibration episodes, got "
+        f"{episodes}: {halved} for {of_halves} of the scores, which half of them standardize, "
+        f"{whole} for the detector's own score as the "
+        "statistic; "
         "record more, or promise less"
     )
 
@@ -353,7 +367,7 @@ def least_episodes(level: float, kind: AlarmKind, confidence: float | None = Non
         n = math.ceil(1 / level - _ROUNDING) - 1
     else:
         n = math.ceil(math.log(1 - confidence) / math.log(1 - level) - _ROUNDING)
-    return 2 * n if kind == "cusum" else n
+    return n if kind == "score" else 2 * n
 
 
 def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
@@ -364,7 +378,7 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     episodes
         All of them, those that standardize the scores included.
     kind
-        The statistic: with the CUSUM half of them standardize the scores.
+        The statistic: with all but the score itself half of them standardize the scores.
 
     Returns
     -------
@@ -378,7 +392,7 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     >>> list(offered_levels(18, "cusum")), list(offered_levels(19, "score"))
     (['at_10pct'], ['at_10pct', 'at_5pct'])
     """
-    n = episodes // 2 if kind == "cusum" else episodes
+    n = episodes if kind == "score" else episodes // 2
     return {suffix: level for suffix, level in LEVELS.items() if quantile_rank(n, level) <= n}
 
 
@@ -547,6 +561,9 @@ class Monitor:
     def reset(self) -> None:
         """Begin a new episode."""
         self._carried = 0.0
+        self._sums: Accumulation | None = None
+        if isinstance(self.rule, GuaranteedAlarm) and self.rule.kind not in USUAL:
+            self._sums = Accumulation(self.rule.kind)
         # A score that has not come yet is below every threshold.
         self.statistic = -math.inf if self.rule.standardization is None else 0.0
 
@@ -555,6 +572,10 @@ class Monitor:
         rule = self.rule
         if rule.standardization is None:
             self.statistic = -math.inf if math.isnan(score) else float(score)
+            return self.statistic > rule.threshold
+        if self._sums is not None:
+            x = float(rule.standardization(np.array([score]))[0])
+            self.statistic = self._sums.update(x)
             return self.statistic > rule.threshold
         drift = rule.drift if isinstance(rule, AlarmRule) else DRIFT
         x = float(rule.standardization(np.array([score]))[0]) - drift

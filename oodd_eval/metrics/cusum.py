@@ -60,6 +60,11 @@ class Standardization:
         std = unit * math.sqrt(math.fsum((far / unit) ** 2) / pooled.size)
         return cls(mean, std)
 
+    @property
+    def numbers(self) -> list[float]:
+        """Mean and standard deviation, for files."""
+        return [self.mean, self.std]
+
     def __call__(self, scores: Floats) -> Floats:
         """Return ``x_t = 0.01 (s_t - mean) / std``; NaN stays NaN.
 

@@ -12,21 +12,14 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.alarms import (
-    STATISTICS,
-    AlarmKind,
-    Calibration,
-    least_episodes,
-    offered_levels,
-)
+from oodd_eval.metrics.accumulation import NOUNS, AlarmKind
+from oodd_eval.metrics.alarms import USUAL, Calibration, least_episodes, offered_levels
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS
 from oodd_eval.metrics.drift import SIGNIFICANT, PermutationTest, drift_test, two_sample_test
 
 Floats = NDArray[np.float64]
 
 Subject = Literal["episodes", "drift", "difference", "length", "achieved"]
-
-_NAMES: Final = {"cusum": "a CUSUM of the scores", "score": "a detector's own score"}
 
 _REMEDY: Final = (
     "more episodes than promised may alarm; baseline rows, a rolling calibration, or calibration "
@@ -90,7 +83,7 @@ def promises(
     *,
     sensors: Sequence[str] = (),
     recorded: bool = True,
-    kinds: Sequence[AlarmKind] = STATISTICS,
+    kinds: Sequence[AlarmKind] = USUAL,
 ) -> list[PromiseFinding]:
     """Return what speaks for and against promises that are calibrated with these episodes.
 
@@ -122,7 +115,7 @@ def promises(
     return findings
 
 
-def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseFinding:
+def enough_episodes(n: int, kinds: Sequence[AlarmKind] = USUAL) -> PromiseFinding:
     """Tell which levels a number of calibration episodes is enough for.
 
     Parameters
@@ -148,10 +141,16 @@ own score
     text = f"{n} calibration episodes: enough for all levels"
     if missing is not None:
         level = LEVELS[missing]
-        needed = [f"{least_episodes(level, kind)} {{}}for {_NAMES[kind]}" for kind in kinds]
+        needed = [f"{least_episodes(level, kind)} {{}}for {_name(kind)}" for kind in kinds]
         listed = ", ".join(needed).replace("{}", "are needed ", 1).replace("{}", "")
         text = f"{n} calibration episodes: at {100 * level:g} % {listed}"
     return PromiseFinding("episodes", text, not all(HEADLINE in levels for levels in offered))
+
+
+def _name(kind: AlarmKind) -> str:
+    if kind == "score":
+        return "a detector's own score"
+    return f"{NOUNS[kind]} of the scores"
 
 
 def achieved_share(

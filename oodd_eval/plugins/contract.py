@@ -46,6 +46,9 @@ ROLLOUT_TOLERANCE: Final = 5e-3
 
 Scores: TypeAlias = "NDArray[np.float64]"
 
+Alarm = Literal["cusum", "score", "ewma", "shiryaev-roberts", "e-detector"]
+"""Statistic of a detector's guaranteed alarms, see `oodd_eval.metrics.alarms.GuaranteedAlarm`."""
+
 Training = Literal["nominal", "simulation", "anomalies", "external", "oracle"]
 """The knowledge that a detector declares, see `DetectorSpec`."""
 
@@ -208,8 +211,10 @@ class DetectorSpec:
         anomalous ones; ``"external"``, other data, such as pretrained weights; ``"oracle"``, it has
         the true equations of the environment. Boards rank the first.
     alarm
-        The statistic of the guaranteed alarms: the CUSUM of standardized scores, or the score
-        itself, for a detector that accumulates by itself.
+        The statistic of the guaranteed alarms: ``"cusum"`` of standardized scores, or ``"score"``,
+        the score itself, for a detector that accumulates by itself. ``"ewma"`` forgets: it comes
+        down when a fault ends. ``"shiryaev-roberts"`` and ``"e-detector"`` are other sums
+        (`oodd_eval.metrics.accumulation`).
     adapts
         ``"baseline"`` for a detector that learns from the first rows of each episode by itself,
         where these are declared nominal. Its factory is then called with their number, too, as
@@ -241,7 +246,7 @@ class DetectorSpec:
     inputs: Literal["observations", "observations+actions"] = "observations"
     deterministic: bool = False
     training: Training = "nominal"
-    alarm: Literal["cusum", "score"] = "cusum"
+    alarm: Alarm = "cusum"
     adapts: Literal["", "baseline"] = ""
     parameters: type | None = None
     other_parameters: bool = False

@@ -15,7 +15,7 @@ from typing import Any, Final, get_args
 
 from oodd_eval.errors import PluginError
 from oodd_eval.names import PARAMETER_NAME, SPEC_NAME
-from oodd_eval.plugins.contract import Detector, DetectorSpec, Training
+from oodd_eval.plugins.contract import Alarm, Detector, DetectorSpec, Training
 from oodd_eval.plugins.parameters import Decides, ParameterInfo, parameter, parameters_of
 
 MOST_SPECS: Final = 1000  # that one hook may return
@@ -187,7 +187,7 @@ _FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("summary reference extra fit_name", "a printable line of at most 1000 characters", is_line),
     ("inputs", " or ".join(_INPUTS), _one_of(*_INPUTS)),
     ("training", " or ".join(get_args(Training)), _one_of(*get_args(Training))),
-    ("alarm", "cusum or score", _one_of("cusum", "score")),
+    ("alarm", " or ".join(get_args(Alarm)), _one_of(*get_args(Alarm))),
     ("adapts", "'' or baseline", _one_of("", "baseline")),
     ("deterministic other_parameters horizon_decides_fit", "True or False", _is_truth),
     ("requires", "names of modules", _are_lines),

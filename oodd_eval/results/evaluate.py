@@ -21,7 +21,8 @@ from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, ResultsError, UsageError
 from oodd_eval.metrics import alarms, recalibration, unpaired
-from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
+from oodd_eval.metrics.accumulation import AlarmKind
+from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
@@ -67,7 +68,7 @@ class Rules:
         known = Calibration.fit(calibration, alarm)
         # A run goes on with a threshold that nothing exceeds, and counts what it misses.
         guaranteed = {
-            suffix: GuaranteedAlarm(known.standardization, known.threshold(level))
+            suffix: replace(known.unbounded, threshold=known.threshold(level))
             for suffix, level in levels.items()
         }
         paper = AlarmRule(Standardization.fit(calibration))

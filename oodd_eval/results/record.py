@@ -32,7 +32,7 @@ from oodd_eval._version import __version__
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.plugins.contract import Training
+from oodd_eval.plugins.contract import Alarm, Training
 from oodd_eval.results.draws import CodedDraws, Draws
 from oodd_eval.results.identity import Cell, Setting
 
@@ -95,8 +95,8 @@ class Record:
     inputs
         ``"observations"`` or ``"observations+actions"``.
     alarm
-        Statistic of its guaranteed alarms: ``"cusum"``, or ``"score"`` for a detector that
-        accumulates by itself.
+        Statistic of its guaranteed alarms: ``"cusum"`` or another sum, or ``"score"`` for a
+        detector that accumulates by itself.
     deterministic
         Whether its seed changes nothing.
     training
@@ -156,7 +156,7 @@ class Record:
     plugin_source: str = ""
     overrides: dict[str, Any] = field(default_factory=dict)
     inputs: str = ""
-    alarm: Literal["cusum", "score"] = "cusum"
+    alarm: Alarm = "cusum"
     deterministic: bool = False
     training: Training = "nominal"
     strength: str = ""

@@ -21,7 +21,7 @@ from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
-from oodd_eval.plugins.contract import CONTRACT, Training
+from oodd_eval.plugins.contract import CONTRACT, Alarm, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
 from oodd_eval.results.identity import Cell, Setting
@@ -52,7 +52,7 @@ class Unit:
     version: str
     source: str = ""
     inputs: str = ""
-    alarm: Literal["cusum", "score"] = "cusum"
+    alarm: Alarm = "cusum"
     adapts: Literal["", "baseline"] = ""
     deterministic: bool = False
     training: Training = "nominal"
