@@ -143,10 +143,28 @@ def make_oracle(*, seed: int = 0, horizon: int = 1) -> Detector:
     return OracleDetector("oracle", seed=seed, horizon=horizon)
 
 
+def make_gym_oracle(*, seed: int = 0, horizon: int = 1) -> Detector:
+    """Return an unfitted oracle of Acrobot, CartPole and LunarLander."""
+    from oodd_worlds.gym import GymOracle  # noqa: PLC0415  keeps the listing quick
+
+    return GymOracle("oracle-gym", seed=seed, horizon=horizon)
+
+
 @hookimpl
 def oodd_detectors() -> list[DetectorSpec]:
-    """Offer the oracle of the worlds."""
+    """Offer the oracles of the worlds and of three of the benchmark's environments."""
     return [
+        DetectorSpec(
+            name="oracle-gym",
+            factory=make_gym_oracle,
+            summary="the equations of Acrobot, CartPole and LunarLander",
+            reference="Sutton (1996), Barto et al. (1983); charts of innovations, Mehra & Peschon "
+            "(1971)",
+            inputs="observations+actions",
+            deterministic=True,
+            training="oracle",
+            alarm="score",
+        ),
         DetectorSpec(
             name="oracle",
             factory=make_oracle,
@@ -158,5 +176,5 @@ def oodd_detectors() -> list[DetectorSpec]:
             alarm="score",
             requires=("gymnasium", "mujoco"),
             extra="oodd-eval[worlds]",
-        )
+        ),
     ]

@@ -349,11 +349,31 @@ def worlds() -> dict[tuple[int, int], str]:
     return {(len(world.sensors), len(world.actions)): name for name, world in facts.items()}
 
 
-class InnovationCharts:
-    """A filter's innovations over one episode, accumulated with several memories.
+class WhiteCharts:
+    """Whitened innovations of one episode, accumulated with several memories.
 
     Two charts a weight, both with the same spread in all rows of nominal operation: the length of
     the weighted innovations, and the weighted squared lengths less their mean.
+
+    Parameters
+    ----------
+    measured
+        Length of an innovation.
+    """
+
+    def __init__(self, measured: int) -> None:
+        self._signed, self._sizes = Smoother(WEIGHTS, measured), Smoother(WEIGHTS, 1)
+
+    def update(self, white: Floats) -> Floats:
+        """Return the charts after an innovation, of shape (2 W,)."""
+        counted, k = np.clip(white, -LIMIT, LIMIT), len(white)
+        lengths = np.sqrt((self._signed(counted[None])[:, 0] ** 2).sum(axis=1))
+        size = ((counted**2).sum() - k) / math.sqrt(2 * k)
+        return np.concatenate([lengths, self._sizes(np.full((1, 1), size))[:, 0, 0]])
+
+
+class InnovationCharts:
+    """The `WhiteCharts` of a filter's innovations over one episode.
 
     Parameters
     ----------
@@ -369,15 +389,13 @@ class InnovationCharts:
         model = MODELS[world]()
         noise = read_world(world).noise()
         self._filter = Filter(model, noise, row.astype(np.float64), drawn)
-        self._signed, self._sizes = Smoother(WEIGHTS, model.measured), Smoother(WEIGHTS, 1)
+        self._charts = WhiteCharts(model.measured)
 
     def update(self, row: NDArray[np.float32], action: NDArray[np.float32]) -> Floats:
         """Return the charts after a row and the action before it, of shape (2 W,)."""
-        white = self._filter.update(row.astype(np.float64), action.astype(np.float64))
-        counted, k = np.clip(white, -LIMIT, LIMIT), len(white)
-        lengths = np.sqrt((self._signed(counted[None])[:, 0] ** 2).sum(axis=1))
-        size = ((counted**2).sum() - k) / math.sqrt(2 * k)
-        return np.concatenate([lengths, self._sizes(np.full((1, 1), size))[:, 0, 0]])
+        return self._charts.update(
+            self._filter.update(row.astype(np.float64), action.astype(np.float64))
+        )
 
 
 def charts_of(world: str, trajectory: Trajectory, drawn: Floats | None = None) -> Floats:
