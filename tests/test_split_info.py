@@ -157,7 +157,7 @@ def test_imported_environments_are_listed_and_described(logs, capsys, monkeypatc
     page = capsys.readouterr().out
     for text in ("q0 (rad)", "CC BY 4.0", "40 episodes", "data info arm"):
         assert text in page
-    assert main(["info", "arn"]) == 4
+    assert main(["info", "aarm"]) == 4
     assert "did you mean 'arm'" in capsys.readouterr().err
 
 

@@ -84,7 +84,9 @@ def run_rows(detector, split, output=None, *, streamed=True, sandboxed=False, **
     [
         *((name, {}) for name in ("mewma", "mahalanobis", "range", "persistence", "clock", "comb")),
         ("random", {}), ("rf", {"trees": 3}),
-        *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn")),
+        *((name, {}) for name in ("pca", "knn", "deedee")),
+        *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "rnd", "paano")),
+        *((name, {"updates": 3}) for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")),
     ],
 )  # fmt: skip
 def test_scores_row_by_row_are_those_of_batches(tiny_split, tmp_path, detector, parameters):

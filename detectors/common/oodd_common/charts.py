@@ -77,16 +77,18 @@ def distance(rows: Floats, root: Floats) -> Floats:
     return lengths
 
 
-def product(rows: Floats, matrix: Floats) -> Floats:
+def product(rows: Floats, matrix: Floats, block: int = BLOCK) -> Floats:
     """Return ``rows @ matrix`` such that the bits of a row do not depend on how many follow it.
 
     A matrix product picks its order of summation by the shapes. Blocks of one fixed shape, the last
-    one filled up with zeros, make the scores of a prefix the prefix of the scores exactly.
+    one filled up with zeros, make the scores of a prefix the prefix of the scores exactly. A single
+    row costs as much as a `block` of them: a small one is for large matrices and for streams.
 
     From (N, K) and (K, M) to (N, M).
     """
-    n = len(rows)
-    blocks = np.zeros((-(-n // BLOCK), BLOCK, rows.shape[1]))
-    blocks.reshape(-1, rows.shape[1])[:n] = rows
-    multiplied: Floats = np.matmul(blocks, matrix).reshape(-1, matrix.shape[1])[:n]
-    return multiplied
+    (n, k), (_, m) = rows.shape, matrix.shape
+    count = -(-n // block)
+    filled = np.zeros((count * block, k))
+    filled[:n] = rows
+    multiplied: Floats = np.matmul(filled.reshape(count, block, k), matrix)
+    return multiplied.reshape(count * block, m)[:n]
