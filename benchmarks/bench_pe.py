@@ -59,7 +59,7 @@ def measured(split, environment, updates):
     train, twins = list(data.train), list(data.twins)
     whole = PeParameters().updates
     start, rates = time.perf_counter(), [peak(torch.float32)]
-    detector = make_pe("pe-a", seed=0, updates=updates).fit(train)
+    detector = make_pe("pe-a", seed=0, updates=updates, forecaster="ensemble").fit(train)
     fit = (time.perf_counter() - start) * whole / updates
     rates.append(peak(torch.float32))
     start = time.perf_counter()
@@ -77,7 +77,7 @@ def measured(split, environment, updates):
             detector.update(observation, action)
             waits.append(time.perf_counter() - start)
     stream = 1e6 * float(np.median(waits))
-    of_row, of_update = flops(detector.ensemble_.arrays, PeParameters().batch)
+    of_row, of_update = flops(detector.forecaster.chosen.ensemble_.arrays, PeParameters().batch)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     at_fit = of_update * whole / fit / np.mean(rates)
     at_batch = of_row / (batch * 1e-6) / double

@@ -16,8 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from oodd_pe import detector as module
-from oodd_pe import make_pe, statistic
+from oodd_pe import density, make_pe, rare, statistic
 from oodd_pe.statistic import deviance
 from tabulate import tabulate
 
@@ -34,6 +33,8 @@ VARIANTS = {
     "steps at rest count fully": {"MOVEMENT": 0.0},
     "one scale for all tails": {"BINS": 1},
     "no energy": {"ENERGY": 0.0},
+    "no rare events": {"rare": []},
+    "sums without limit": {"RETURN": 2000},
     "scales wider than in training": {"wide": True},
     "8 degrees of freedom everywhere": {"BINS": 1, "nu": 8.0},
 }
@@ -41,7 +42,7 @@ VARIANTS = {
 
 def fitted(environment, split, fits):
     """Return `pe-a` fitted, restored where there is a fit and kept where fits are."""
-    detector = make_pe("pe-a", seed=0)
+    detector = make_pe("pe-a", seed=0, forecaster="ensemble")
     place = fits and fits / f"{environment}.npz"
     if place and place.exists():
         detector.restore(read_state(place).state())
@@ -60,10 +61,11 @@ def spec(detector, change):
             pass
 
         def fit(self, nominal):
-            order = np.random.default_rng([0, 0]).permutation(len(nominal))
-            held_out = order[: max(1, round(0.15 * len(nominal)))]
-            detector.charts_ = statistic.Charts(change.get("memories", [0.3, 0.1, 0.03, 0.01]))
-            detector.charts_.fit([detector._evidence(nominal[i]) for i in held_out])
+            memories = change.get("memories", [0.3, 0.1, 0.03, 0.01])
+            detector.charts_ = statistic.Charts(memories)
+            detector.events_ = rare.RareEvents(change.get("rare", memories))
+            pieces, folds = detector.pieces(nominal)
+            detector.chart(pieces, detector.forecaster.chosen.out_of_fold(pieces, folds))
 
         def score(self, trajectory):
             return detector.score(trajectory)
@@ -80,10 +82,11 @@ def measured(detector, change, split, environment):
             stack.enter_context(patch.object(statistic, name, change[name]))
         if nu := change.get("nu"):
             stack.enter_context(
-                patch.object(module, "deviance", lambda e, t: deviance(e, t * 0 + math.log(nu)))
+                patch.object(density, "deviance", lambda e, t: deviance(e, t * 0 + math.log(nu)))
             )
         if change.get("wide"):
-            stack.enter_context(patch.object(detector.ensemble_, "_floor", -math.inf))
+            ensemble = detector.forecaster.chosen.ensemble_
+            stack.enter_context(patch.object(ensemble, "_floor", -math.inf))
         records = evaluate(spec(detector, change), split, environments=environment)
     return [
         np.mean([r.metrics[m].value for r in records if r.group == group])

@@ -27,6 +27,11 @@ class PeParameters:
         high=1,
         help="weights of the newest residual in the accumulated sums",
     )
+    forecaster: str = parameter(
+        "auto",
+        choices=("auto", "ensemble"),
+        help="ensemble, or auto: what makes held-out episodes likeliest",
+    )
     device: str = parameter(
         "cpu",
         choices=("auto", "cpu", "cuda"),
@@ -71,7 +76,7 @@ def _spec(*, name: str, summary: str) -> DetectorSpec:
         inputs="observations+actions" if actions else "observations",
         alarm="cusum" if "step" in name else "score",
         parameters=PeParameters,
-        requires=("torch",),
+        requires=("torch", "sklearn"),
         extra="oodd-eval[reference]",
         fit_name="pe-a" if actions else "pe",
     )

@@ -1,13 +1,13 @@
 """Fit and score of the probabilistic ensemble.
 
-A linear forecast is the base; an ensemble of networks forecasts the distribution of its errors; the
-residuals, each on the scale that was forecast for it, enter charts of several memories.
+A forecaster judges observations by the distributions that it forecast for them; its residuals enter
+charts of several memories.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,31 +20,19 @@ from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
-from oodd_pe.ensemble import DensityEnsemble
-from oodd_pe.network import DensityNetworks, train
-from oodd_pe.statistic import Charts, Evidence, Onsets, Running, deviance
+from oodd_pe.choice import ChosenForecaster
+from oodd_pe.forecaster import Assessment, EpisodeForecaster, Judge, Known, Transitions, Units
+from oodd_pe.rare import RareEvents
+from oodd_pe.statistic import Charts, Evidence, Onsets, Running
 
-HELD_OUT: Final = 0.15
-"""Share of the nominal trajectories from which the charts are learnt; at least one."""
+CHARTED: Final = 65_536
+"""Steps from which charts are learnt, but for the rest of an episode: bounds time and memory."""
 
-RIDGE: Final = 1e-6
-"""Penalty of the linear forecast, relative to the mean squared change of standardized sensors."""
+TIMES: Final = 100
+"""Steps from the beginning of an episode that are told apart where rare events are looked up."""
 
-LIMIT: Final = 10.0
-"""Inputs are clipped at this many standard deviations. No network is trained on larger ones."""
-
-
-class _Known(NamedTuple):
-    """The latest observations, actions and times from which N forecasts are made."""
-
-    window: NDArray[np.float32]  # (N, W, D), newest first
-    actions: Floats | None  # (N, W, A), NaN before the beginning
-    steps: NDArray[np.int64]  # (N,), times of the newest observations
-
-    def rows(self, index: NDArray[np.int64]) -> _Known:
-        """Return what some of the forecasts start from."""
-        actions = None if self.actions is None else self.actions[index]
-        return _Known(self.window[index], actions, self.steps[index])
+FOLDS: Final = 3
+"""Parts of the nominal episodes; what judges one of them has learnt from the others."""
 
 
 class ProbabilisticEnsemble(StorableWindowDetector):
@@ -80,7 +68,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
     Rigdon, "A multivariate exponentially weighted moving average control chart" (1992).
     """
 
-    kind: ClassVar[str] = "pe/2"
+    kind: ClassVar[str] = "pe/3"
 
     def __init__(
         self,
@@ -96,19 +84,22 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             name, seed=seed, horizon=horizon, window=parameters.window, actions=actions
         )
         self.parameters, self.accumulate = parameters, accumulate
-        self.device = resolved_device(name, parameters.device)
+        self.forecaster: EpisodeForecaster = ChosenForecaster(
+            parameters, seed=seed, horizon=horizon, device=resolved_device(name, parameters.device)
+        )
+        self.units_: Units
         self.charts_ = Charts(parameters.memories)
-        self.ensemble_: DensityEnsemble
+        self.events_ = RareEvents(parameters.memories)
 
     def score(self, trajectory: Trajectory) -> Floats:
         """Return one score per observation, NaN for t < horizon."""
         self._must_fit(trajectory)
         scores = np.full(len(trajectory), np.nan)
         if trajectory.transitions >= self.horizon:
-            running = Running(self.charts_, accumulate=self.accumulate)
-            evidence = self._evidence(trajectory)
-            smoothed = running(self.charts_.columns(evidence), evidence.movement)
-            scores[self.horizon :] = self.charts_.statistic(smoothed).max(axis=0)
+            steps = self._transitions(trajectory)
+            evidence = self._evidence(steps, self.forecaster.begin()(steps))
+            columns = self.charts_.columns(evidence)
+            scores[self.horizon :] = _Sums(self)(steps, evidence, columns)
         return scores
 
     def explain(self, trajectory: Trajectory) -> Explanation:
@@ -122,20 +113,20 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         shares = np.full(trajectory.observations.shape, np.nan)
         onsets = np.full(len(trajectory), -1)
         if trajectory.transitions >= self.horizon:
-            first_rows = Onsets(self.charts_)(self.charts_.columns(self._evidence(trajectory)))
+            steps = self._transitions(trajectory)
+            judged = self.forecaster.begin()(steps)
+            first_rows = Onsets(self.charts_)(self.charts_.columns(self._evidence(steps, judged)))
             rows, of_row = np.unique(first_rows, return_inverse=True)
-            known, now = self._known(trajectory), trajectory.observations[self.horizon :]
-            shares[self.horizon :] = self._shares(known.rows(rows), now[rows])[of_row]
+            shares[self.horizon :] = self._shares(steps.rows(rows), judged.rows(rows))[of_row]
             onsets[self.horizon :] = first_rows + self.horizon
         return Explanation(shares, onsets)
 
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
-        self._running: Running | None = None
-        self._onsets: Onsets | None = None
+        self._judging: tuple[Judge, _Sums, Onsets] | None = None
         self._onset = -1
-        self._suspect: tuple[_Known, NDArray[np.float32]] | None = None
+        self._suspect: tuple[Transitions, Assessment] | None = None
 
     def explain_last(self) -> tuple[Floats, int]:
         """Return the row of `explain` for the latest `update`: shares (sensors,), and the onset."""
@@ -150,21 +141,23 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         return super()._command(action).copy()
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
-        if self._running is None or self._onsets is None:
-            self._running = Running(self.charts_, accumulate=self.accumulate)
-            self._onsets = Onsets(self.charts_)
+        if self._judging is None:
+            self._judging = self.forecaster.begin(), _Sums(self), Onsets(self.charts_)
+        judge, sums, onsets = self._judging
         actions = None
         if self.actions:
             commands = list(self._commands)[self.lag - 1 :]
-            actions = np.full((1, self.window, len(self.action_scale_.mean)), np.nan)
+            actions = np.full((1, self.window, len(self.action_scale_.mean)), np.nan, np.float32)
             actions[0, : len(commands)] = commands
-        known = _Known(window[None], actions, np.array([t - self.lag]))
-        evidence = self._judged(known, now[None], self._rows[1][None])
+        known = Known(window[None], actions, np.array([t - self.lag]))
+        steps = Transitions(known, now[None], self._rows[1][None])
+        judged = judge(steps)
+        evidence = self._evidence(steps, judged)
         columns = self.charts_.columns(evidence)
-        self._onset = int(self._onsets(columns)[0]) + self.horizon
+        self._onset = int(onsets(columns)[0]) + self.horizon
         if self._onset == t:
-            self._suspect = known, now[None]
-        return float(self.charts_.statistic(self._running(columns, evidence.movement)).max())
+            self._suspect = steps, judged
+        return float(sums(steps, evidence, columns)[0])
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         usable = [x for x in nominal if x.transitions >= self.horizon]
@@ -178,141 +171,103 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             )
         scale = FeatureScale.fit(usable)
         rows = np.concatenate([x.observations for x in usable])
-        self.varying_ = np.flatnonzero(rows.std(axis=0, dtype=np.float64) >= CONSTANT)
-        self.observation_scale_ = scale
-        if self.actions:
-            commands = np.concatenate([x.actions for x in usable]).astype(np.float64)
-            spread = commands.std(axis=0)
-            self.action_scale_ = FeatureScale(
-                commands.mean(axis=0), np.where(spread < CONSTANT, 1.0, spread)
-            )
-        order = np.random.default_rng([self.seed, 0]).permutation(len(usable))
-        held = max(1, round(HELD_OUT * len(usable)))
-        held_out = [usable[i] for i in order[:held]]
-        # A single episode has no others, and judges itself.
-        training = [usable[i] for i in order[held:]] or held_out
-
-        inputs, outcomes = self._examples(training)
-        p, d = self.parameters, outcomes.shape[1]
-        network = DensityNetworks(p.members, inputs.shape[1], d, p.width, self.seed)
-        if d:
-            train(
-                network,
-                inputs,
-                outcomes,
-                updates=p.updates,
-                batch=p.batch,
-                seed=self.seed,
-                device=self.device,
-            )
-        self.ensemble_ = DensityEnsemble(network.arrays())
-        self.charts_.fit([self._evidence(t) for t in held_out])
+        commands = np.concatenate([x.actions for x in usable]) if self.actions else None
+        self._take(Units.fit(scale, rows, commands, self.window))
+        self.largest_change_ = float(np.sqrt(2.0 * np.log1p(len(usable))))
+        pieces, folds = self.pieces(usable)
+        self.chart(pieces, self.forecaster.fit(self.units_, pieces, folds))
         return scale
 
-    def _examples(
-        self, training: Sequence[Trajectory]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Fit the linear forecast; return inputs, (N, I), and outcomes, (N, D), of networks."""
-        # Twice over the episodes, since all their inputs in double precision need gigabytes.
-        moments = []
-        for t in training:
-            ones = np.pad(self._inputs(self._known(t)), ((0, 0), (0, 1)), constant_values=1.0)
-            moments.append((ones.T @ ones, ones.T @ self._changes(*self._seen(t))))
-        gram, cross = (np.sum(m, axis=0) for m in zip(*moments, strict=True))
-        n = int(gram[-1, -1])
-        self.ridge_ = np.linalg.solve(gram + RIDGE * n * np.eye(len(gram)), cross)
-        variance = np.diag(gram)[:-1] / n - (gram[-1, :-1] / n) ** 2
-        self.input_scale_ = np.sqrt(np.maximum(variance, CONSTANT**2))
+    def chart(self, pieces: Sequence[Transitions], judged: Sequence[Assessment | None]) -> None:
+        """Learn the charts from what the forecaster's `fit` returned for pieces.
 
-        inputs = np.empty((n, len(variance)), np.float32)
-        errors = np.empty((n, cross.shape[1]))
-        done = 0
-        for t in training:
-            x = self._inputs(self._known(t))
-            rows = slice(done, done := done + len(x))
-            inputs[rows] = self._scaled(x)
-            errors[rows] = self._errors(x, self._changes(*self._seen(t)))
-        self.error_scale_ = np.maximum(np.sqrt((errors**2).mean(axis=0)), CONSTANT)
-        errors /= self.error_scale_
-        return inputs, errors.astype(np.float32)
+        `nominal_statistics_` are then the statistics of their steps, (N,), of residuals that were
+        made out of fold.
+        """
+        known = [(p, j) for p, j in zip(pieces, judged, strict=True) if j is not None]
+        evidence = [self._evidence(*pair) for pair in known]
+        self.charts_.fit(evidence)
+        self.events_.fit(
+            [self._surroundings(p) for p, _ in known],
+            [j.residuals for _, j in known],
+            [self.charts_.share(e.movement) for e in evidence],
+        )
+        statistics = [
+            _Sums(self)(p, e, self.charts_.columns(e))
+            for (p, _), e in zip(known, evidence, strict=True)
+        ]
+        self.nominal_statistics_ = np.concatenate(statistics)
 
-    def _known(self, x: Trajectory) -> _Known:
+    def pieces(self, usable: Sequence[Trajectory]) -> tuple[list[Transitions], list[int]]:
+        """Return pieces of episodes in random order, and the fold of each.
+
+        They are whole episodes where there are enough. Those beyond `CHARTED` are in no fold, -1.
+        """
+        order = np.random.default_rng([self.seed, 0]).permutation(len(usable))
+        pieces = [self._transitions(usable[i]) for i in order]
+        if len(pieces) < FOLDS:
+            blocks = [np.array_split(np.arange(len(p.now)), FOLDS) for p in pieces]
+            pieces = [
+                p.rows(b) for p, of_piece in zip(pieces, blocks, strict=True) for b in of_piece
+            ]
+        before = np.cumsum([0, *(len(p.now) for p in pieces)])[:-1]
+        folds = [n % FOLDS if n < FOLDS or before[n] < CHARTED else -1 for n in range(len(pieces))]
+        # An episode of fewer steps than folds leaves some empty.
+        filled = [(p, fold) for p, fold in zip(pieces, folds, strict=True) if len(p.now)]
+        return [p for p, _ in filled], [fold for _, fold in filled]
+
+    def _take(self, units: Units) -> None:
+        self.units_ = units
+        if units.commands is not None:
+            self.action_scale_ = units.commands
+
+    def _transitions(self, x: Trajectory) -> Transitions:
         steps = np.arange(len(x) - self.horizon)
         actions = None
         if self.actions:
             index = steps[:, None] - np.arange(self.window)
             actions = np.where(index[..., None] >= 0, x.actions[np.maximum(index, 0)], np.nan)
-        return _Known(windows(x.observations, steps, self.window), actions, steps)
+        known = Known(windows(x.observations, steps, self.window), actions, steps)
+        return Transitions(
+            known, x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
+        )
 
-    def _seen(self, x: Trajectory) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the observations that are judged and those that forecasts start from."""
-        return x.observations[self.horizon :], x.observations[: len(x) - self.horizon]
+    def _changed(self, now: NDArray[np.float32]) -> Floats:
+        """Return the evidence of sensors that were constant in training, (N, constant).
 
-    def _inputs(self, known: _Known) -> Floats:
-        """Return what forecasts use: newest observation, differences, actions, and the start."""
-        window, actions, steps = known
-        scale, n = self.observation_scale_, len(window)
-        z = np.clip((window - scale.mean) / scale.std, -LIMIT, LIMIT)[:, :, self.varying_]
-        parts = [z[:, 0], (z[:, :-1] - z[:, 1:]).reshape(n, -1)]
-        if actions is not None:
-            a = (actions - self.action_scale_.mean) / self.action_scale_.std
-            parts.append(np.where(np.isnan(a), 0.0, a).reshape(n, -1))
-        # Whether the window reaches beyond the beginning.
-        parts.append((steps[:, None] < self.window - 1).astype(np.float64))
-        return np.concatenate(parts, axis=1)
+        That a sensor was constant in n episodes does not make a change impossible. In the next one
+        it has a chance of about 1 / (n + 1), and no deviation of a standard normal that is less
+        likely is evidence of more.
+        """
+        moved = (now - self.units_.sensors.mean)[:, self.units_.constant()] / CONSTANT
+        size = np.minimum(np.sqrt(2.0 * np.log1p(moved**2)), self.largest_change_)
+        changed: Floats = np.sign(moved) * size
+        return changed
 
-    def _changes(self, now: NDArray[np.float32], before: NDArray[np.float32]) -> Floats:
-        """Return changes of varying sensors, in standard deviations: (N, D)."""
-        change = (now.astype(np.float64) - before) / self.observation_scale_.std
-        varying: Floats = change[:, self.varying_]
-        return varying
+    def counts(self, steps: Transitions, evidence: Evidence) -> Floats:
+        """Return how improbable steps are, as they count: see `oodd_pe.rare.RareEvents`, (N,)."""
+        residuals = evidence.residuals[:, : evidence.log_tails.shape[1]]
+        share = self.charts_.share(evidence.movement)
+        return self.events_.counts(self._surroundings(steps), residuals, share)
 
-    def _scaled(self, x: Floats) -> Floats:
-        scaled: Floats = np.clip(x / self.input_scale_, -LIMIT, LIMIT)
-        return scaled
+    def _surroundings(self, steps: Transitions) -> Floats:
+        """Return where rare events are looked up: inputs of forecasts, and the time, (N, I + 1)."""
+        time = np.minimum(steps.known.steps, TIMES)[:, None]
+        return np.concatenate([self.units_.inputs(steps.known), time], axis=1)
 
-    def _errors(self, x: Floats, y: Floats) -> Floats:
-        """Return what the linear forecast leaves of changes."""
-        left: Floats = y - x @ self.ridge_[:-1] - self.ridge_[-1]
-        return left
-
-    def _evidence(self, x: Trajectory) -> Evidence:
-        now, before = x.observations[self.horizon :], x.observations[self.horizon - 1 : -1]
-        return self._judged(self._known(x), now, before)
-
-    def _posed(self, known: _Known, now: NDArray[np.float32]) -> tuple[Floats, Floats]:
-        """Return what networks are given, (N, inputs), and what they are to forecast, (N, D)."""
-        x = self._inputs(known)
-        errors = self._errors(x, self._changes(now, known.window[:, 0]))
-        return self._scaled(x), errors / self.error_scale_
-
-    def _moved(self, now: NDArray[np.float32]) -> tuple[NDArray[np.bool_], Floats]:
-        """Return which sensors were constant in training, and how far they are from that."""
-        constant = np.ones(now.shape[1], dtype=bool)
-        constant[self.varying_] = False
-        moved: Floats = (now - self.observation_scale_.mean)[:, constant] / CONSTANT
-        return constant, moved
-
-    def _judged(
-        self, known: _Known, now: NDArray[np.float32], before: NDArray[np.float32]
-    ) -> Evidence:
-        """Judge observations ``now`` (N, D); ``before`` are those of the step before."""
-        residual, log_tail = self.ensemble_(*self._posed(known, now))
-        moved = self._moved(now)[1]
-        changed = np.sign(moved) * np.sqrt(2.0 * np.log1p(moved**2))
-        movement = self._changes(now, before)
+    def _evidence(self, steps: Transitions, judged: Assessment) -> Evidence:
+        movement = self.units_.changes(steps.now, steps.before)
         return Evidence(
-            np.concatenate([deviance(residual, log_tail), changed], axis=1),
-            log_tail,
+            np.concatenate([judged.residuals, self._changed(steps.now)], axis=1),
+            judged.log_tails,
             np.sqrt((movement**2).sum(axis=1) / max(1, movement.shape[1])),
         )
 
-    def _shares(self, known: _Known, now: NDArray[np.float32]) -> Floats:
+    def _shares(self, steps: Transitions, judged: Assessment) -> Floats:
         """Return each sensor's share in the evidence of single steps, (N, sensors)."""
-        explained = np.empty(now.shape)
-        explained[:, self.varying_] = self.ensemble_.of_sensors(*self._posed(known, now))
-        constant, moved = self._moved(now)
-        explained[:, constant] = moved**2
+        explained = np.empty(steps.now.shape)
+        explained[:, self.units_.varying] = self.forecaster.explained(steps, judged)
+        explained[:, self.units_.constant()] = self._changed(steps.now) ** 2
         explained = np.maximum(explained, CONSTANT)
         shares: Floats = explained / explained.sum(axis=1, keepdims=True)
         return shares
@@ -329,29 +284,37 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         }
 
     def _arrays(self) -> Arrays:
-        scale = self.action_scale_ if self.actions else FeatureScale(np.zeros(0), np.ones(0))
         return {
-            "action_scale": np.stack([scale.mean, scale.std]),
-            "varying": self.varying_,
-            "ridge": self.ridge_,
-            "error_scale": self.error_scale_,
-            "input_scale": self.input_scale_,
-            **self.ensemble_.arrays,
+            "largest_change": np.array(self.largest_change_),
+            **self.units_.arrays(),
+            **self.forecaster.arrays(),
             **self.charts_.arrays(),
+            **self.events_.arrays(),
         }
 
     def _restore(self, arrays: Arrays, sensors: int) -> None:
-        self.observation_scale_ = FeatureScale.of(arrays)
-        self.action_scale_ = FeatureScale.of(arrays, "action_scale")
-        self.varying_ = take(arrays, "varying", (None,), "i")
-        d = len(self.varying_)
-        commands = len(self.action_scale_.mean)
-        inputs = self.window * (d + commands) + 1
-        self.ridge_ = take(arrays, "ridge", (inputs + 1, d))
-        self.error_scale_ = take(arrays, "error_scale", (d,), "+")
-        self.input_scale_ = take(arrays, "input_scale", (inputs,), "+")
-        p = self.parameters
-        self.ensemble_ = DensityEnsemble.restored(
-            arrays, DensityNetworks(p.members, inputs, d, p.width)
-        )
+        self._take(Units.restored(arrays, actions=self.actions, window=self.window))
+        self.largest_change_ = float(take(arrays, "largest_change", (), "+"))
+        self.forecaster.restore(self.units_, arrays)
+        d = len(self.units_.varying)
         self.charts_.restore(arrays, d, sensors - d)
+        self.events_.restore(arrays, self.units_.width + 1, d)
+
+
+class _Sums:
+    """The sums of an episode so far: each call continues where the last one ended."""
+
+    def __init__(self, detector: ProbabilisticEnsemble) -> None:
+        self._detector, self._charts = detector, detector.charts_
+        self._running = Running(self._charts, accumulate=detector.accumulate)
+        self._events = detector.events_.running() if detector.accumulate else None
+
+    def __call__(self, steps: Transitions, evidence: Evidence, columns: Floats) -> Floats:
+        """Return the statistic of the next N steps, (N,): the largest of all charts."""
+        lengths = self._running(columns, evidence.movement)
+        statistics = self._charts.statistic(lengths)
+        if self._events is not None:
+            counts = self._detector.counts(steps, evidence)
+            statistics = np.concatenate([statistics, self._events(counts)])
+        largest: Floats = statistics.max(axis=0)
+        return largest

@@ -6,9 +6,11 @@ row is a call of its own.
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple, Self
 
 import numpy as np
+import torch
 from oodd_common.charts import Floats
 
 from oodd_eval.plugins.state import Arrays, take
@@ -61,15 +63,38 @@ class DensityEnsemble:
     def __call__(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return whitened residuals and log degrees of freedom, means over the members.
 
-        From inputs (N, I) and outcomes (N, D) to two arrays (N, D).
+        From inputs (N, I) and outcomes of each member (M, N, D) to two arrays (N, D).
         """
-        residual, log_tail = np.empty_like(y), np.empty_like(y)
+        residual, log_tail = np.empty(y.shape[1:]), np.empty(y.shape[1:])
         for start in range(0, len(x), BLOCK):
             rows = slice(start, start + BLOCK)
-            forecast = self._forecast(x[rows], y[rows])
+            forecast = self._forecast(x[rows], y[:, rows])
             residual[rows] = forecast.residual.mean(axis=0).T
             log_tail[rows] = forecast.log_tail.mean(axis=0).T
         return residual, log_tail
+
+    def each(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return what a call returns the means of, two arrays (M, N, D)."""
+        residual, log_tail = np.empty_like(y), np.empty_like(y)
+        for start in range(0, len(x), BLOCK):
+            rows = slice(start, start + BLOCK)
+            forecast = self._forecast(x[rows], y[:, rows])
+            residual[:, rows] = forecast.residual.mT
+            log_tail[:, rows] = forecast.log_tail.mT
+        return residual, log_tail
+
+    def log_densities(self, x: Floats, y: Floats) -> Floats:
+        """Return the members' log densities of outcomes (M, N, D), given inputs (N, I): (M, N)."""
+        densities = []
+        for start in range(0, len(x), BLOCK):
+            rows = slice(start, start + BLOCK)
+            residual, scale, log_tail, _ = self._forecast(x[rows], y[..., rows, :])
+            nu = torch.from_numpy(np.exp(log_tail))
+            constant = (torch.lgamma((nu + 1) / 2) - torch.lgamma(nu / 2)).numpy()
+            each = constant - 0.5 * (log_tail + math.log(math.pi)) + np.log(scale)
+            each -= (np.exp(log_tail) + 1) / 2 * np.log1p(residual**2 / np.exp(log_tail))
+            densities.append(each.sum(axis=1))
+        return np.concatenate(densities, axis=1)
 
     def of_sensors(self, x: Floats, y: Floats) -> Floats:
         r"""Return what an error of one sensor alone would explain: (N, D).
@@ -78,10 +103,10 @@ class DensityEnsemble:
         it is the square of :math:`(\Lambda (y - \mu))_d / \sqrt{\Lambda_{dd}}`: by how much their
         squared length would fall if the reading of sensor d were free. Means over the members.
         """
-        explained = np.empty_like(y)
+        explained = np.empty(y.shape[1:])
         for start in range(0, len(x), BLOCK):
             rows = slice(start, start + BLOCK)
-            residual, scale, _, dependence = self._forecast(x[rows], y[rows])
+            residual, scale, _, dependence = self._forecast(x[rows], y[:, rows])
             slope, squares = scale * residual, scale**2
             entries, row = dependence[:, self._by_column], self._row[self._by_column]
             below = np.add.reduceat(entries * slope[:, row], self._columns, axis=1)
@@ -92,7 +117,7 @@ class DensityEnsemble:
         return explained
 
     def _forecast(self, x: Floats, y: Floats) -> _Forecast:
-        """Judge outcomes (N, D) by inputs (N, I), as `DensityNetworks` does."""
+        """Judge outcomes (M, N, D) by inputs (N, I), as `DensityNetworks` does."""
         (weights, bias), *deeper, (out, out_bias) = self._layers
         hidden = _silu(weights @ x.T + bias)
         for weights, bias in deeper:
@@ -100,7 +125,7 @@ class DensityEnsemble:
         outputs, d = out @ hidden + out_bias, self._sensors
         mean, scale, tail, dependence = np.split(outputs, [d, 2 * d, 3 * d], axis=1)
         scale = np.exp(np.maximum(LOG_SCALE * np.tanh(scale / LOG_SCALE), self._floor))
-        residual = y.T - mean
+        residual = y.mT - mean
         known = dependence * residual[:, self._column]
         residual[:, 1:] += np.add.reduceat(known, self._rows, axis=1)
         residual *= scale

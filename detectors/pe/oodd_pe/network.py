@@ -7,6 +7,7 @@ means, scales, a triangular matrix of dependences, and how heavy each tail is, a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -138,11 +139,15 @@ class DensityNetworks(torch.nn.Module):
 
     @torch.no_grad()
     def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return each member's and sensor's least log scale for training rows, (M, 1, D)."""
+        """Return each member's and sensor's least log scale for training rows, (M, 1, D).
+
+        From inputs (N, I) and outcomes (M, N, D).
+        """
         step = -(-len(x) // SURVEYED)
-        x, y = x[::step], y[::step]
-        parts = zip(torch.split(x, CHUNK), torch.split(y, CHUNK), strict=True)
-        log_scales = [self(*(v.expand(self.members, -1, -1) for v in p)).log_scale for p in parts]
+        parts = zip(
+            torch.split(x[::step], CHUNK), torch.split(y[:, ::step], CHUNK, dim=1), strict=True
+        )
+        log_scales = [self(i.expand(self.members, -1, -1), o).log_scale for i, o in parts]
         scales = torch.cat(log_scales, dim=1).cpu().numpy()
         least = round(LEAST_SCALES * scales.shape[1])
         lowest = np.partition(scales, least, axis=1)[:, least : least + 1]
@@ -162,16 +167,34 @@ def train(
     network: DensityNetworks,
     x: NDArray[np.float32],
     y: NDArray[np.float32],
+    rows: Sequence[NDArray[np.int64]],
     *,
     updates: int,
     batch: int,
     seed: int,
     device: str,
 ) -> None:
-    """Maximize the likelihood of outcomes y, (N, D), given inputs x, (N, I), in place.
+    """Maximize the likelihood of outcomes given inputs, in place.
 
     Every member draws batches of its own. The weights are averaged over the last updates. Networks
     are trained in single precision.
+
+    Parameters
+    ----------
+    network
+        M networks.
+    x
+        Inputs, (N, I).
+    y
+        Outcomes, (M, N, D).
+    rows
+        Indices of the rows that each member is trained on.
+    updates, batch
+        Gradient steps, and rows of one.
+    seed
+        Decides the batches.
+    device
+        Where torch computes.
     """
     random = np.random.default_rng([seed, 1])
     network.to(device)
@@ -180,11 +203,12 @@ def train(
     hidden, others = Muon(network.weights), Adam(rest)
     average = Average(network.parameters(), DECAY)
     one = torch.ones(network.members, device=device)
+    members = torch.arange(network.members, device=device)[:, None]
     for update in range(updates):
-        drawn = random.integers(0, len(x), (network.members, batch))
-        rows = torch.from_numpy(drawn).to(device)
-        target = outcomes[rows]
-        forecast = network(inputs[rows], target)
+        drawn = np.stack([r[random.integers(0, len(r), batch)] for r in rows])
+        index = torch.from_numpy(drawn).to(device)
+        target = outcomes[members, index]
+        forecast = network(inputs[index], target)
         loss = forecast.surprise().mean(1).sum() / network.sensors
         if update < MEAN_FIRST * updates:
             errors = smooth_l1_loss(forecast.mean, target, beta=0.3, reduction="none")

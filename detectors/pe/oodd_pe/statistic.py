@@ -31,6 +31,8 @@ MOVEMENT: Final = 0.7
 """Share of the median movement; where sensors move less, a step counts less in the sums."""
 REFERENCE: Final = 2.0
 """Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
+RETURN: Final = 60
+"""Steps after the end of a fault in which sums are to come down."""
 SHRINKAGE: Final = 0.02
 """Least share of the identity in a correlation matrix."""
 
@@ -52,7 +54,7 @@ class Evidence(NamedTuple):
     Attributes
     ----------
     residuals
-        Signed deviance residuals of the members' mean, (N, D); then one column a constant sensor.
+        Signed deviance residuals of the varying sensors, (N, D); then one column a constant sensor.
     log_tails
         Logarithms of the degrees of freedom that were forecast, (N, D).
     movement
@@ -103,13 +105,13 @@ class Charts:
         self.centre_, self.energy_ = columns[:, :-1].mean(axis=0), columns[:, -1].mean()
         self.spread_ = columns[:, -1].std()
 
-        smoothed = [Running(self)(self.columns(e), e.movement) for e in episodes]
-        pooled = np.concatenate(smoothed, axis=1)
         weights = [1.0, *self.memories]
+        sums = [Smoother(weights, columns.shape[1])(x) for x in self._weighed(episodes)]
+        pooled = np.concatenate(sums, axis=1)
         self.roots_ = np.stack([_root(z, w) for z, w in zip(pooled, weights, strict=True)])
-        distances = [self._distances(z) for z in smoothed]
-        largest = np.stack([x.max(axis=1) for x in distances], axis=1)
-        median = np.median(np.concatenate(distances, axis=1), axis=1)
+        lengths = [_lengths(z @ self.roots_) for z in sums]
+        largest = np.stack([x.max(axis=1) for x in lengths], axis=1)
+        median = np.median(np.concatenate(lengths, axis=1), axis=1)
         reach = largest.mean(axis=1) + largest.std(axis=1) - median
         self.median_ = median[:, None]
         self.reach_ = np.where(reach < CONSTANT, 1.0, reach)[:, None]
@@ -127,7 +129,6 @@ class Charts:
         scales = self.scales_[:, 0] + (self._slopes * np.maximum(passed, 0.0)).sum(axis=2)
         scaled: Floats = evidence.residuals.copy()
         scaled[:, :d] /= scales
-        scaled[:, d:] /= SMALLEST
         return scaled
 
     def columns(self, evidence: Evidence) -> Floats:
@@ -136,15 +137,34 @@ class Charts:
         energy = np.minimum(u**2, ENERGY).mean(axis=1, keepdims=True)
         return np.concatenate([u, energy - self.energy_], axis=1)
 
-    def _distances(self, smoothed: Floats) -> Floats:
-        whitened = smoothed @ self.roots_[: len(smoothed)]
-        lengths: Floats = np.sqrt((whitened * whitened).sum(axis=2))
-        return lengths
+    def share(self, movement: Floats) -> Floats:
+        """Return how much steps count in the sums, (N,).
 
-    def statistic(self, smoothed: Floats) -> Floats:
-        """Return the distances of smoothed columns on their common scale: (W, N, C) to (W, N)."""
-        w = len(smoothed)
-        scaled: Floats = (self._distances(smoothed) - self.median_[:w]) / self.reach_[:w]
+        While a robot stands still, the forecast repeats one error. Its residuals are then not
+        independent evidence, and count less.
+        """
+        share: Floats = np.minimum(1.0, movement / max(float(self.still_), CONSTANT))
+        return share
+
+    def _weighed(self, episodes: Sequence[Evidence]) -> list[Floats]:
+        return [self.columns(e) * self.share(e.movement)[:, None] for e in episodes]
+
+    def limits(self) -> Floats:
+        """Return the lengths that sums are kept below, one for each memory.
+
+        A sum that nothing is added to any more falls from its limit to what is usual for the
+        largest of an episode in `RETURN` steps. Without a limit, one of long memory would go on
+        for hundreds of steps after a fault has ended.
+        """
+        median, usual = self.median_[1:, 0], (self.median_ + self.reach_)[1:, 0]
+        kept = (1.0 - np.asarray(self.memories)) ** RETURN
+        limits: Floats = np.sqrt(median**2 + (usual**2 - median**2) / np.maximum(kept, 1e-9) ** 2)
+        return limits
+
+    def statistic(self, lengths: Floats) -> Floats:
+        """Return what `Running` returns on the charts' common scale, (W, N)."""
+        w = len(lengths)
+        scaled: Floats = (lengths - self.median_[:w]) / self.reach_[:w]
         return scaled
 
     def arrays(self) -> Arrays:
@@ -180,17 +200,43 @@ class Running:
     """The sums of an episode so far: each call continues where the last one ended."""
 
     def __init__(self, charts: Charts, *, accumulate: bool = True) -> None:
-        self._still = max(float(charts.still_), CONSTANT)
-        self._smoother = Smoother(charts.memories, len(charts.centre_) + 1) if accumulate else None
+        self._charts = charts
+        self._weight = np.array(charts.memories if accumulate else [])[:, None]
+        self._limits = charts.limits()
+        self._sums = np.zeros((len(self._weight), len(charts.centre_) + 1))
+        self._forgotten = np.ones((len(self._weight), 1))
 
     def __call__(self, columns: Floats, movement: Floats) -> Floats:
-        """Return the columns of the next N steps, and their sums: (W, N, C)."""
-        if self._smoother is None:
-            return columns[None]
-        # While a robot stands still, the forecast repeats one error. Its residuals are then not
-        # independent evidence, and count less.
-        share = np.minimum(1.0, movement / self._still)
-        return np.concatenate([columns[None], self._smoother(columns * share[:, None])])
+        """Return the Mahalanobis lengths of the next N steps and of their sums: (W, N).
+
+        Sums are scaled to the variance of a single step, as `oodd_common.charts.smooth` does.
+        """
+        roots = self._charts.roots_
+        newest = _lengths(columns @ roots[:1])
+        if not len(self._weight):
+            return newest
+        whitened = (columns * self._charts.share(movement)[:, None]) @ roots[1:]
+        weight, keep = self._weight, 1.0 - self._weight
+        # A running product, not a power: its first n factors are the same however many follow.
+        factors = np.broadcast_to(keep**2, (len(keep), len(columns)))
+        forgotten = self._forgotten * np.cumprod(factors, axis=1)
+        self._forgotten = forgotten[:, -1:]
+        deviations = np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
+        limits = self._limits[:, None] * deviations
+        lengths = np.empty_like(deviations)
+        added = weight[..., None] * whitened
+        for t in range(len(columns)):
+            sums = keep * self._sums + added[:, t]
+            length = np.sqrt(np.einsum("wc,wc->w", sums, sums))
+            lengths[:, t] = np.minimum(length, limits[:, t])
+            self._sums = sums * (lengths[:, t] / np.maximum(length, CONSTANT))[:, None]
+        return np.concatenate([newest, lengths / deviations])
+
+
+def _lengths(whitened: Floats) -> Floats:
+    """Return the lengths of rows of columns, from (W, N, C) to (W, N)."""
+    lengths: Floats = np.sqrt((whitened * whitened).sum(axis=2))
+    return lengths
 
 
 class Onsets:
