@@ -14,7 +14,7 @@ from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.live.logs import read_logs
-from oodd_eval.live.scan import Scan, ScannedEpisode, scan_episodes
+from oodd_eval.live.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
 from oodd_eval.live.scan_page import NUMBERS, cells, page, summary, titles
 from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
@@ -44,7 +44,7 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
     "--read", multiple=True, type=PARAMETER, help="an option of the format; V is JSON or text"
 )
 @click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
-@click.option("--detector", default="mewma", type=Name("detectors"), help="that judges")
+@click.option("--detector", default=SCANNER, type=Name("detectors"), help="that judges")
 @click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text")
 @click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
 @click.option(

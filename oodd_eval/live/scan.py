@@ -30,7 +30,8 @@ from oodd_eval.live.episode_faults import (
 from oodd_eval.live.handle import DetectorHandle
 from oodd_eval.live.nominal import sensor_names
 from oodd_eval.live.watchdog import Watchdog
-from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
+from oodd_eval.metrics.accumulation import AlarmKind, Ranks
+from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.outliers import (
     ENOUGH,
@@ -211,6 +212,10 @@ class Scan:
         }
 
 
+SCANNER: Final = "panel"
+"""Detector that scans where none is named."""
+_QUICK: Final = {"forecast": "linear"}  # of it: networks would be fitted 20 times
+
 Outcome = tuple[Floats, Explanation | None]
 """Answer of a detector about one episode: scores, and an explanation if it gives any."""
 
@@ -219,7 +224,7 @@ def scan_episodes(
     episodes: Sequence[Episode | ArrayLike],
     *,
     sensors: Sequence[Any] | None = None,
-    detector: str | Detector = "mewma",
+    detector: str | Detector = SCANNER,
     watchdog: Watchdog | None = None,
     fdr: float = 0.1,
     window: int | None = None,
@@ -255,7 +260,8 @@ def scan_episodes(
         Number of rows at the start of every episode that are nominal. They are not judged, and
         each sensor's mean and spread over them are brought to those of the other episodes.
     seed, horizon, parameters
-        For the factory of a named detector.
+        For the factory of a named detector. Of `panel`, which is the default, ``forecast`` is
+        ``"linear"`` unless it is given: networks would be fitted 20 times.
     jobs
         Fits at a time, in processes of their own where more than 1.
 
@@ -303,7 +309,8 @@ def scan_episodes(
         )
     cleaned, spread = clean(usable)
     faults = stream_faults(usable, cleaned, spread, names, fdr)
-    fit = _Fit(detector, seed, horizon, dict(parameters or {}), baseline)
+    defaults = _QUICK if detector == SCANNER else {}
+    fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline)
     handle = fit.handle()
     trajectories = [one.trajectory for one in cleaned]
     folds = [list(range(k, len(usable), FITS)) for k in range(min(FITS, len(usable)))]
@@ -593,15 +600,18 @@ def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
     """Return the statistic of an episode's scores.
 
-    A CUSUM standardizes them with the median of its peers' means and of their deviations, which no
-    odd episode among them spoils.
+    A CUSUM and other sums standardize them with the median of its peers' means and of their
+    deviations, which no odd episode among them spoils; an e-detector ranks them among all of its
+    peers' scores.
     """
-    standardization = None
-    if kind == "cusum":
+    standardization: Standardization | Ranks | None = None
+    if kind == "e-detector":
+        standardization = Ranks.fit(scores[j] for j in peers)
+    elif kind != "score":
         known = (Standardization.fit([scores[j]]) for j in peers)
         mean, std = np.nanmedian([[one.mean, one.std] for one in known], axis=0)
         standardization = Standardization(float(mean), float(std))
-    return GuaranteedAlarm(standardization, math.inf).statistic(scores[i])
+    return GuaranteedAlarm(standardization, math.inf, kind).statistic(scores[i])
 
 
 def _too_few(count: int, terms: _Terms) -> str:

@@ -1,0 +1,345 @@
+"""Members of the panel: distances of what an episode shows from what nominal operation shows.
+
+Each is the length of some features, less a centre, times a matrix. They see different things: a
+pattern of sensors that was never seen, forecast errors of one sign, a combination of errors that
+was never seen, errors that grow, and a level that is off.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Final, NamedTuple
+
+import numpy as np
+from oodd_common.charts import Floats, Smoother, product
+
+from oodd_eval.plugins.state import Arrays, take
+
+WINDOW: Final = (5, 20)
+"""Fewest and most of the latest rows in which a pattern is looked for."""
+READINGS: Final = 1280
+"""Readings of which a pattern is made, where there are neither too few rows nor too many."""
+LEVEL: Final = 5
+"""Latest rows whose mean is the level."""
+WEIGHTS: Final = (0.3, 0.1, 0.04)
+"""Weights of the newest error in the sums. The smallest lets a sum fall back within 60 rows."""
+CLIP: Final = 6.0
+"""Limit of an error in the sums, in its standard deviations, so that a sum comes down again."""
+ENERGY: Final = 10
+"""Latest rows of which squared errors are averaged."""
+LARGEST: Final = 1e4
+"""Limit of a squared error."""
+LEAST_ENERGY: Final = 1e-2
+"""Added to a mean squared error before its logarithm is taken."""
+VARIANCE: Final = 0.9
+"""Share of the variance that the components of a pattern explain."""
+NEIGHBOURS: Final = 5
+"""Nearest nominal rows whose distances are averaged."""
+BANK: Final = 2000
+"""Most nominal rows that are kept to compare with."""
+COMPONENTS: Final = 20
+"""Most principal components in which neighbours are looked for."""
+SHRINKAGE: Final = 0.02
+"""Least share of the identity in a correlation matrix."""
+PATTERNS: Final = 1000
+"""Most windows from which the components of many sensors are computed."""
+
+
+class Features(NamedTuple):
+    """Features of N rows, all of them sums and means over the latest rows.
+
+    Attributes
+    ----------
+    window
+        The latest `window_of` rows of all sensors, newest first, (N, W * S).
+    level
+        Mean of as many rows, (N, D).
+    sums
+        Exponentially weighted errors on the scale of one error, (N, WEIGHTS, D).
+    energy
+        Logarithms of the mean squared errors of `ENERGY` rows, (N, D).
+    """
+
+    window: Floats
+    level: Floats
+    sums: Floats
+    energy: Floats
+
+
+def window_of(sensors: int) -> int:
+    """Return of how many rows a pattern is made, W."""
+    return min(max(READINGS // sensors, WINDOW[0]), WINDOW[1])
+
+
+class Latest:
+    """What an episode has shown so far: each call continues where the last one ended.
+
+    Parameters
+    ----------
+    dimensions
+        Number of errors of a row, D.
+    window
+        Number of rows of which a pattern is made, W.
+    """
+
+    def __init__(self, dimensions: int, window: int) -> None:
+        self._window = window
+        self._smoother = Smoother(WEIGHTS, dimensions)
+        self._rows: Floats | None = None
+        self._levels: Floats
+        # What an error before the beginning would have been on average.
+        self._squares = np.ones((ENERGY - 1, dimensions))
+
+    def __call__(self, rows: Floats, levels: Floats, errors: Floats) -> Features:
+        """Return the features of the next N rows.
+
+        From standardized rows (N, S), their components (N, D) and errors (N, D). At the beginning
+        of an episode the first row stands for those before it.
+        """
+        n = len(rows)
+        if self._rows is None:
+            self._rows = np.repeat(rows[:1], self._window - 1, axis=0)
+            self._levels = np.repeat(levels[:1], LEVEL - 1, axis=0)
+        every = np.concatenate([self._rows, rows])
+        window = np.concatenate([every[lag : lag + n] for lag in range(self._window)[::-1]], axis=1)
+        all_levels = np.concatenate([self._levels, levels])
+        squares = np.concatenate([self._squares, np.minimum(errors**2, LARGEST)])
+        # Sums of few terms in a fixed order: the same bits for one row as for many.
+        level = _sum([all_levels[lag : lag + n] for lag in range(LEVEL)]) / LEVEL
+        energy = _sum([squares[lag : lag + n] for lag in range(ENERGY)])
+        self._rows, self._levels = every[n:], all_levels[n:]
+        self._squares = squares[n:]
+        sums = self._smoother(np.clip(errors, -CLIP, CLIP)).swapaxes(0, 1)
+        return Features(window, level, sums, np.log(energy / ENERGY + LEAST_ENERGY))
+
+
+def _sum(terms: list[Floats]) -> Floats:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total
+
+
+class PanelMember(ABC):
+    """Distance of some features from a centre."""
+
+    name: ClassVar[str]
+    means: ClassVar[str]
+    """What a large distance means, in words."""
+
+    @abstractmethod
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+
+    @abstractmethod
+    def fit(self, features: Floats) -> None:
+        """Learn from features of nominal rows, (N, F)."""
+
+    @abstractmethod
+    def differences(self, features: Floats) -> tuple[Floats, Floats]:
+        """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
+
+    def lengths(self, features: Floats) -> Floats:
+        """Return lengths of features: (N, F) to (N,)."""
+        return self.differences(features)[0]
+
+    @abstractmethod
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+
+    @abstractmethod
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+
+
+class _Mahalanobis(PanelMember):
+    """Mahalanobis length, with a covariance that is shrunk the more the fewer rows there are."""
+
+    memory: ClassVar[float]
+    """Rows over which a feature is averaged: so many rows count as one."""
+
+    def fit(self, features: Floats) -> None:
+        """Learn from features of nominal rows, (N, F)."""
+        n, f = features.shape
+        self.centre_ = self._centre(features)
+        centred = features - self.centre_
+        size = np.sqrt((centred**2).mean(axis=0))
+        size = np.where(size < 1e-6, 1.0, size)
+        scaled = centred / size
+        shrinkage = max(SHRINKAGE, f / (max(1.0, n / self.memory) + f))
+        correlation = (1 - shrinkage) * (scaled.T @ scaled) / n + shrinkage * np.eye(f)
+        # Of a positive definite matrix: rows times the root have the Mahalanobis length.
+        self.root_ = np.linalg.inv(np.linalg.cholesky(correlation)).T / size[:, None]
+
+    def _centre(self, features: Floats) -> Floats:
+        centre: Floats = features.mean(axis=0)
+        return centre
+
+    def differences(self, features: Floats) -> tuple[Floats, Floats]:
+        """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
+        centred = features - self.centre_
+        whitened = product(centred, self.root_)
+        return np.sqrt((whitened * whitened).sum(axis=1)), centred * product(whitened, self.root_.T)
+
+    def lengths(self, features: Floats) -> Floats:
+        """Return lengths of features: (N, F) to (N,)."""
+        whitened = product(features - self.centre_, self.root_)
+        lengths: Floats = np.sqrt((whitened * whitened).sum(axis=1))
+        return lengths
+
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        # As it lies in memory, on which the last bit of a product depends.
+        return {"centre": self.centre_, "root": self.root_.T}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+        self.centre_ = take(arrays, "centre", (None,))
+        f = len(self.centre_)
+        self.root_ = take(arrays, "root", (f, f)).T
+
+
+class Sums(_Mahalanobis):
+    """Multivariate EWMA charts of several memories in one distance (Lowry et al. 1992)."""
+
+    name, means = "sums", "forecast errors keep one sign"
+    memory = 1 / WEIGHTS[-1]
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.sums.reshape(len(features.sums), -1)
+
+    def _centre(self, features: Floats) -> Floats:
+        return np.zeros(features.shape[1])
+
+
+class Energy(_Mahalanobis):
+    """Mean squared errors of the sensors, or how noisy they are (MacGregor & Harris 1993)."""
+
+    name, means = "energy", "forecast errors have grown or shrunk"
+    memory = float(ENERGY)
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.energy
+
+
+class Level(_Mahalanobis):
+    """Hotelling's T² of the mean of the latest rows."""
+
+    name, means = "level", "readings are far from nominal ones"
+    memory = float(LEVEL)
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.level
+
+
+class Pattern(PanelMember):
+    """What principal components of the latest rows leave (Jackson & Mudholkar 1979, Q)."""
+
+    name, means = "pattern", "readings do not go together as usual"
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.window
+
+    def fit(self, features: Floats) -> None:
+        """Learn from features of nominal rows, (N, F)."""
+        self.centre_ = features.mean(axis=0)
+        few = features - self.centre_
+        if few.shape[1] > PATTERNS:
+            few = few[:: -(-len(few) // PATTERNS)]
+        n, f = few.shape
+        # Of the smaller matrix of products: both have the same eigenvalues.
+        values, vectors = np.linalg.eigh(few @ few.T if n < f else few.T @ few)
+        values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+        total = values.sum()
+        kept = int(np.searchsorted(np.cumsum(values), VARIANCE * total)) + 1 if total else 0
+        components = vectors[:, :kept]
+        if n < f:
+            components = few.T @ components / np.sqrt(np.maximum(values[:kept], 1e-12))
+        self.components_ = np.ascontiguousarray(components)
+
+    def differences(self, features: Floats) -> tuple[Floats, Floats]:
+        """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
+        centred = features - self.centre_
+        left = centred - product(product(centred, self.components_), self.components_.T)
+        squares = left * left
+        return np.sqrt(squares.sum(axis=1)), squares
+
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        return {"centre": self.centre_, "components": self.components_}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+        self.centre_ = take(arrays, "centre", (None,))
+        self.components_ = take(arrays, "components", (len(self.centre_), None))
+
+
+class NeighbourDistance(PanelMember):
+    """Mean distance of errors to the nearest nominal ones (Ramaswamy, Rastogi & Shim 2000)."""
+
+    name, means = "neighbours", "a combination of forecast errors is new"
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.sums[:, :2].reshape(len(features.sums), -1)
+
+    def fit(self, features: Floats) -> None:
+        """Learn from features of nominal rows, (N, F)."""
+        self.centre_ = features.mean(axis=0)
+        centred = features - self.centre_
+        _, vectors = np.linalg.eigh(centred.T @ centred)
+        self.components_ = np.ascontiguousarray(vectors[:, ::-1][:, :COMPONENTS])
+        self.bank_ = (centred @ self.components_)[:: -(-len(centred) // BANK)]
+        self._prepare()
+
+    def _prepare(self) -> None:
+        self._transposed = np.ascontiguousarray(self.bank_.T)
+        self._squares = (self.bank_ * self.bank_).sum(axis=1)
+        self._nearest = min(NEIGHBOURS, len(self.bank_))
+
+    def differences(self, features: Floats) -> tuple[Floats, Floats]:
+        """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
+        centred = features - self.centre_
+        query = product(centred, self.components_)
+        squares = self._distances(query)
+        nearest = np.argpartition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
+        middle = product(self.bank_[nearest].mean(axis=1), self.components_.T)
+        inside = product(query, self.components_.T)
+        return self._means(squares), (inside - middle) ** 2
+
+    def lengths(self, features: Floats) -> Floats:
+        """Return lengths of features: (N, F) to (N,)."""
+        lengths = np.empty(len(features))
+        for i in range(0, len(features), 4096):
+            query = product(features[i : i + 4096] - self.centre_, self.components_)
+            lengths[i : i + 4096] = self._means(self._distances(query))
+        return lengths
+
+    def _distances(self, query: Floats) -> Floats:
+        squares = (query * query).sum(axis=1, keepdims=True) + self._squares
+        squares -= 2.0 * product(query, self._transposed)
+        return np.asarray(squares, np.float64)
+
+    def _means(self, squares: Floats) -> Floats:
+        nearest = np.partition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
+        distances: Floats = np.sqrt(np.maximum(np.sort(nearest, axis=1), 0.0)).mean(axis=1)
+        return distances
+
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        return {"centre": self.centre_, "components": self.components_, "bank": self.bank_}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+        self.centre_ = take(arrays, "centre", (None,))
+        self.components_ = take(arrays, "components", (len(self.centre_), None))
+        self.bank_ = take(arrays, "bank", (None, self.components_.shape[1]))
+        self._prepare()
+
+
+MEMBERS: Final = (Pattern, Sums, NeighbourDistance, Energy, Level)
+"""In the order in which they stand in fitted arrays."""

@@ -1,0 +1,356 @@
+"""The panel: its forecast, members and tails by hand and by second formulas, and what it finds."""
+
+from functools import partial
+
+import numpy as np
+import oodd_panel.detector
+import pytest
+from oodd_panel import make_panel
+from oodd_panel.forecast import (
+    EpisodeLearner,
+    LinearForecast,
+    StandardEpisode,
+    chosen_ridge,
+    regressors,
+)
+from oodd_panel.members import (
+    ENERGY,
+    LEAST_ENERGY,
+    MEMBERS,
+    Energy,
+    Latest,
+    NeighbourDistance,
+    Pattern,
+    Sums,
+)
+from oodd_panel.surprise import SurpriseScale
+from oodd_pe import make_pe
+from sklearn.decomposition import PCA
+from sklearn.neighbors import NearestNeighbors
+
+from oodd_eval import Trajectory
+from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
+
+MIXING = np.random.default_rng(7).normal(size=(3, 8)) / 2
+
+
+def log_of(seed, rows=300, gain=1.0, level=0.0):
+    """Eight sensors that three slow causes move, with noise; a gain and a level of the episode."""
+    rng = np.random.default_rng(seed)
+    causes, o = np.zeros(3), np.empty((rows, 8))
+    for t in range(rows):
+        causes = 0.9 * causes + rng.normal(size=3)
+        o[t] = gain * causes @ MIXING + level + 0.3 * rng.normal(size=8)
+    return Trajectory(o)
+
+
+def driven(seed, gain, rows=200, onset=None):
+    """One sensor that follows a command with the episode's gain; a lost tenth of it from onset."""
+    rng = np.random.default_rng([seed, 1])
+    u, o = rng.normal(size=(rows - 1, 1)), np.zeros((rows, 1))
+    for t in range(1, rows):
+        lost = 0.5 if onset is not None and t >= onset else 0.0
+        o[t] = 0.5 * o[t - 1] + (gain - lost) * u[t - 1] + 0.05 * rng.normal()
+    return Trajectory(o, u)
+
+
+def with_step(x, start, stop, by, sensor=2):
+    rows = x.observations.copy()
+    rows[start:stop, sensor] += by
+    return Trajectory(rows, x.actions)
+
+
+@pytest.fixture(scope="module")
+def panel():
+    return make_panel().fit([log_of(seed) for seed in range(10)])
+
+
+# The forecast
+
+
+def test_regressors_hold_three_rows_and_three_actions_newest_first_then_one():
+    rows, actions = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([[10.0], [20.0], [30.0]])
+    expected = [[1, 1, 1, 10, 0, 0, 1], [2, 1, 1, 20, 10, 0, 1], [3, 2, 1, 30, 20, 10, 1]]
+    assert regressors(StandardEpisode(rows, actions), 1).tolist() == expected
+    assert regressors(StandardEpisode(rows, actions), 2).tolist() == expected[:2]
+    assert regressors(StandardEpisode(rows[:1], actions[:0]), 1).shape == (0, 7)
+
+
+def test_learnt_coefficients_are_the_posterior_mean_of_bayesian_regression():
+    rng = np.random.default_rng(0)
+    k, d, n = 4, 2, 30
+    x, y = rng.normal(size=(n, k)), rng.normal(size=(n, d))
+    root = rng.normal(size=(k, k))
+    prior, mean, scale = 0.1 * root @ root.T, rng.normal(size=(k, d)), np.array([2.0, 3.0])
+    learner = EpisodeLearner(LinearForecast(mean, scale, prior), 25)
+    errors = learner(x, y)
+    # Row 20 by normal equations, of the rows before it.
+    precision = np.linalg.inv(prior)
+    covariance = np.linalg.inv(precision + x[:20].T @ x[:20])
+    posterior = covariance @ (precision @ mean + x[:20].T @ y[:20])
+    spread = np.sqrt(1 + x[20] @ covariance @ x[20])
+    assert np.abs(errors[:25]).max() < 4  # so that no error was limited
+    np.testing.assert_allclose(errors[20], (y[20] - x[20] @ posterior) / scale / spread)
+
+
+def test_rows_beyond_the_first_ones_teach_nothing():
+    rng = np.random.default_rng(1)
+    forecast = LinearForecast(np.zeros((2, 1)), np.ones(1), np.eye(2))
+    x = rng.normal(size=(20, 2))
+    quiet, wild = np.zeros((20, 1)), np.zeros((20, 1))
+    wild[10:15] = 50.0
+    after = [EpisodeLearner(forecast, 10)(x, y)[15:] for y in (quiet, wild)]
+    np.testing.assert_array_equal(*after)
+
+
+def test_variance_of_coefficients_between_episodes_is_recovered():
+    rng = np.random.default_rng(2)
+    gains = 1.0 + 0.3 * rng.normal(size=60)
+    episodes = [driven(seed, gain) for seed, gain in enumerate(gains)]
+    plain = [
+        StandardEpisode(x.observations.astype(float), x.actions.astype(float)) for x in episodes
+    ]
+    forecast = LinearForecast.fit(plain, 1, 1e-6, varies=True)
+    assert forecast.scale[0] == pytest.approx(0.05, rel=0.05)
+    # The newest action is the fourth regressor; its prior is in units of the errors' variance.
+    assert np.sqrt(forecast.prior[3, 3]) * 0.05 == pytest.approx(gains.std(), rel=0.1)
+    assert forecast.coefficients[3, 0] == pytest.approx(gains.mean(), abs=0.02)
+
+
+def test_the_chosen_ridge_is_small_for_an_exact_system_and_large_for_noise():
+    rng = np.random.default_rng(3)
+    noise = [[StandardEpisode(rng.normal(size=(30, 6)), np.empty((29, 0)))] for _ in range(5)]
+    exact = [
+        [StandardEpisode(np.cumprod(np.r_[1.0, np.full(29, 0.9)])[:, None] * v, np.empty((29, 0)))]
+        for v in (1, 2, -1, 3, -2)
+    ]
+    assert chosen_ridge(noise, 1) == 1.0
+    assert chosen_ridge(exact, 1) == 1e-4
+
+
+# Features and members
+
+
+def test_features_are_the_same_for_one_row_at_a_time_as_for_many():
+    rng = np.random.default_rng(4)
+    rows, levels, errors = (
+        rng.normal(size=(40, 7)),
+        rng.normal(size=(40, 3)),
+        rng.normal(size=(40, 3)),
+    )
+    batch, latest = Latest(3, 4)(rows, levels, errors), Latest(3, 4)
+    steps = [latest(rows[t : t + 1], levels[t : t + 1], errors[t : t + 1]) for t in range(40)]
+    for whole, *parts in zip(batch, *steps, strict=True):
+        np.testing.assert_array_equal(whole, np.concatenate(parts))
+
+
+def test_energy_is_the_logarithm_of_the_mean_square_of_the_latest_errors():
+    errors = np.arange(1.0, 13.0)[:, None]
+    energy = Latest(1, 2)(errors, errors, errors).energy[:, 0]
+    # Errors before the beginning count as 1.
+    assert energy[0] == pytest.approx(np.log((1 + 9) / 10 + LEAST_ENERGY))
+    assert energy[1] == pytest.approx(np.log((1 + 4 + 8) / 10 + LEAST_ENERGY))
+    assert energy[11] == pytest.approx(np.log((errors[2:] ** 2).mean() + LEAST_ENERGY))
+    assert len(errors[2:]) == ENERGY
+
+
+@pytest.mark.parametrize("member", [Sums(), Energy()], ids=["sums", "energy"])
+def test_contributions_to_a_mahalanobis_length_add_up_to_its_square(member):
+    rng = np.random.default_rng(5)
+    member.fit(rng.normal(size=(200, 4)) @ rng.normal(size=(4, 4)))
+    lengths, parts = member.differences(rng.normal(size=(9, 4)))
+    np.testing.assert_allclose(parts.sum(axis=1), lengths**2)
+
+
+@pytest.mark.parametrize("rows", [400, 6], ids=["many rows", "fewer rows than features"])
+def test_a_pattern_is_what_principal_components_leave(rows):
+    rng = np.random.default_rng(6)
+    nominal = rng.normal(size=(rows, 3)) @ rng.normal(size=(3, 10)) + 0.01 * rng.normal(
+        size=(rows, 10)
+    )
+    member, seen = Pattern(), rng.normal(size=(5, 10))
+    member.fit(nominal)
+    pca = PCA(member.components_.shape[1], svd_solver="full").fit(nominal)
+    left = seen - pca.inverse_transform(pca.transform(seen))
+    np.testing.assert_allclose(member.lengths(seen), np.linalg.norm(left, axis=1), rtol=1e-6)
+    assert pca.explained_variance_ratio_.sum() >= 0.9
+    assert pca.explained_variance_ratio_[:-1].sum() < 0.9
+
+
+def test_neighbours_are_those_of_a_brute_search():
+    rng = np.random.default_rng(8)
+    nominal, seen = rng.normal(size=(300, 6)), rng.normal(size=(20, 6))
+    member = NeighbourDistance()
+    member.fit(nominal)
+    search = NearestNeighbors(n_neighbors=5).fit(nominal)
+    np.testing.assert_allclose(member.lengths(seen), search.kneighbors(seen)[0].mean(axis=1))
+    np.testing.assert_allclose(member.lengths(seen), member.differences(seen)[0])
+
+
+# Tails
+
+
+def test_surprises_of_fresh_nominal_values_are_exponential():
+    rng = np.random.default_rng(9)
+    tail = SurpriseScale()
+    tail.fit(rng.exponential(size=20_000))
+    surprises = tail(rng.exponential(size=20_000))
+    # Of a uniform p-value: mean 1, and one in a hundred beyond log 100.
+    assert surprises.mean() == pytest.approx(1.0, abs=0.05)
+    assert (surprises > np.log(20)).mean() == pytest.approx(0.05, abs=0.01)
+
+
+def test_an_exponential_tail_is_continued():
+    scale = SurpriseScale()
+    scale.fit(-np.log(1 - (np.arange(100_000) + 0.5) / 100_000))
+    assert float(scale.scale_) == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(scale(np.array([1.0, 5.0, 50.0])), [1.0, 5.0, 50.0], rtol=0.02)
+
+
+def test_few_odd_values_do_not_move_a_tail():
+    values = np.random.default_rng(13).exponential(size=2000)
+    clean, spoiled = SurpriseScale(), SurpriseScale()
+    clean.fit(values)
+    spoiled.fit(np.r_[values, np.full(20, 1e4)])
+    assert float(spoiled.scale_) == pytest.approx(float(clean.scale_), rel=0.2)
+
+
+def test_a_tail_of_few_values_is_drawn_to_the_common_scale():
+    few, many = SurpriseScale(), SurpriseScale()
+    rng = np.random.default_rng(10)
+    few.fit(rng.exponential(size=100))
+    many.fit(rng.exponential(size=100_000))
+    few_alone, many_alone = few.relative(), many.relative()
+    for scale in (few, many):
+        scale.draw(2.0)
+    assert few.relative() == pytest.approx(few_alone ** (10 / 210) * 2.0 ** (200 / 210))
+    assert many.relative() == pytest.approx(many_alone, rel=0.05)
+
+
+# The panel
+
+
+def test_three_hundred_rows_of_eight_sensors_are_enough():
+    panel = make_panel().fit([log_of(1)])
+    test = log_of(2)
+    before, after = panel.score(test), panel.score(with_step(test, 150, 300, 4.0))
+    np.testing.assert_array_equal(after[:150], before[:150])
+    assert np.median(after[155:]) > np.nanmax(before)
+
+
+def test_ten_episodes_name_the_sensor_and_the_onset(panel):
+    faulty = with_step(log_of(50), 200, 300, 3.0, sensor=5)
+    shares, onsets = panel.explain(faulty)
+    assert np.isnan(shares[0]).all()
+    assert onsets[0] == -1
+    assert (shares[205:].argmax(axis=1) == 5).mean() > 0.8
+    assert abs(np.median(onsets[210:]) - 200) <= 10
+
+
+def test_the_statistic_comes_down_within_sixty_rows_after_a_fault(panel):
+    largest = sorted(np.nanmax(panel.score(log_of(seed))) for seed in range(100, 119))
+    returned = []
+    for seed in range(200, 220):
+        scores = panel.score(with_step(log_of(seed), 100, 180, 3.0))
+        assert np.nanmax(scores[100:180]) > largest[-1]
+        returned.append(np.nanmax(scores[240:]) <= largest[-1])
+    assert np.mean(returned) >= 0.9
+
+
+def test_members_say_what_they_are_surprised_by(panel):
+    rows = log_of(51).observations.copy()
+    rows[150:, 3] += np.where(np.arange(150) % 2, 4.0, -4.0)
+    surprises = panel.surprises(Trajectory(rows))
+    assert panel.voices == tuple(member.name for member in MEMBERS)
+    assert np.isnan(surprises[0]).all()
+    typical = dict(zip(panel.voices, np.median(surprises[170:], axis=0), strict=True))
+    # Errors of alternating sign cancel in sums and in means, and not in squares.
+    assert typical["energy"] > 1.5 * max(typical["sums"], typical["level"])
+
+
+def test_streamed_scores_and_explanations_are_those_of_the_whole_episode(panel):
+    faulty = with_step(log_of(52, rows=120), 60, 120, 3.0)
+    scores, (shares, onsets) = panel.score(faulty), panel.explain(faulty)
+    panel.reset()
+    for t, row in enumerate(faulty.observations):
+        np.testing.assert_array_equal(panel.update(row), scores[t])
+        share, onset = panel.explain_last()
+        np.testing.assert_array_equal(share, shares[t])
+        assert onset == onsets[t]
+
+
+def test_a_level_of_the_day_is_taken_out_with_baseline_rows():
+    nominal = [log_of(seed, level=seed % 3) for seed in range(10)]
+    panel = make_panel(baseline=60).fit(nominal)
+    test, moved = log_of(70), log_of(70, level=40.0)
+    scores = panel.score(test)
+    np.testing.assert_allclose(scores[60:], panel.score(moved)[60:], atol=1e-3)
+    assert (scores[1:60] == 0).all()
+    panel.reset()
+    np.testing.assert_array_equal([panel.update(row) for row in test.observations], scores)
+
+
+def test_what_differs_between_episodes_is_learnt_from_their_first_rows():
+    gains = np.random.default_rng(11).uniform(0.5, 1.5, size=24)
+    nominal = [driven(seed, gain) for seed, gain in enumerate(gains)]
+    panel = make_panel("panel-a", forecast="linear").fit(nominal)
+    assert panel.forecast_.prior.size
+    calibration = [driven(100 + seed, gain) for seed, gain in enumerate(gains)]
+    threshold = max(np.nanmax(panel.score(x)) for x in calibration)
+    faulty = [driven(200 + seed, gain, onset=120) for seed, gain in enumerate(gains)]
+    assert np.mean([np.nanmax(panel.score(x)[120:]) > threshold for x in faulty]) > 0.9
+
+
+def test_equal_episodes_share_their_coefficients():
+    nominal = [driven(seed, 1.0) for seed in range(24)]
+    panel = make_panel("panel-a", forecast="linear").fit(nominal)
+    assert panel.forecast_.prior.shape == (0, 0)
+
+
+def test_more_sensors_than_components_are_forecast_by_components():
+    rng = np.random.default_rng(12)
+    mixing = rng.normal(size=(3, 100))
+
+    def wide(seed):
+        draw = np.random.default_rng([seed, 2])
+        return Trajectory(draw.normal(size=(80, 3)) @ mixing + 0.1 * draw.normal(size=(80, 100)))
+
+    panel = make_panel().fit([wide(seed) for seed in range(6)])
+    assert panel.forecast_.coefficients.shape == (3 * 64 + 1, 64)
+    faulty = with_step(wide(50), 40, 80, 5.0, sensor=77)
+    shares, _ = panel.explain(faulty)
+    assert (shares[45:].argmax(axis=1) == 77).mean() > 0.8
+
+
+def test_the_ensemble_is_a_voice_where_it_is_asked_for(monkeypatch):
+    quick = partial(make_pe, updates=60, members=1, width=16)
+    monkeypatch.setattr(oodd_panel.detector, "make_pe", quick)
+    nominal = [driven(seed, 1.0, rows=60) for seed in range(8)]
+    panel = make_panel("panel-a", forecast="ensemble").fit(nominal)
+    test = driven(90, 1.0, rows=60, onset=30)
+    scores = panel.score(test)
+    assert panel.voices[-1] == "ensemble"
+    restored = make_panel("panel-a", forecast="ensemble")
+    restored.restore(panel.state())
+    np.testing.assert_array_equal(restored.score(test), scores)
+    restored.reset()
+    actions = [None, *test.actions]
+    streamed = [restored.update(*x) for x in zip(test.observations, actions, strict=True)]
+    np.testing.assert_allclose(streamed, scores, rtol=1e-9)
+    alone = make_panel("panel-a", forecast="linear").fit(nominal)
+    assert alone.voices == tuple(member.name for member in MEMBERS)
+    assert not np.array_equal(alone.score(test), scores, equal_nan=True)
+
+
+def test_a_state_of_other_settings_is_refused(panel):
+    with pytest.raises(FittedStateError):
+        make_panel(baseline=5).restore(panel.state())
+    with pytest.raises(FittedStateError):
+        make_panel("panel-a").restore(panel.state())
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(UsageError, match="forecast"):
+        make_panel(forecast="cubic")
+    with pytest.raises(TrajectoryError, match="at least one that long"):
+        make_panel().fit([Trajectory(np.zeros((1, 2)))])
