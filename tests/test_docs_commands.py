@@ -25,6 +25,10 @@ pytestmark = pytest.mark.docs
 
 FORECASTER = """
 import numpy as np
+from river import anomaly, preprocessing
+
+def scaled_trees(n_trees=25, seed=None):
+    return preprocessing.MinMaxScaler() | anomaly.HalfSpaceTrees(n_trees=n_trees, seed=seed)
 
 class Forecaster:
     def __init__(self, order=1):
@@ -141,6 +145,9 @@ KNOWN = {
     "docs/how-to/live.md": {"rules": {r"(\w+_\w+\.py)": r"\1 --detector mewma"}},
     "examples/oodd-swimmer/README.md": {"folders": ["examples/oodd-swimmer"]},
     "detectors/pe/README.md": {"rules": {r"(?<=fresh --detector )pe,pe-a": "mewma"}},
+    # The other two train networks for a minute.
+    "detectors/rivals/README.md": {"rules": {r"(?<=pca,knn,deedee),rnd,paano": ""}},
+    "detectors/rivals/networks.md": {"rules": {r"(--detector \S+)": r"\1 --param updates=20"}},
     "docs/reproduce.md": {"rules": {r"--tier reduced": "--tier mini"}},
     "docs/submitting.md": {
         "before": ["oodd-eval new mine", "pip install -e ./oodd-mine"],
