@@ -65,7 +65,7 @@ def river(name: str) -> DetectorSpec:
     name, factory = river_factory(name)
     top = name.partition(".")[0]
     label = f"river.{version('river')}"
-    if top != name:  # code of one's own, whose digest tells when it changes
+    if top != name:  # a user's own code: its digest tells when it changes
         label = f"{label}.{top}.{source_digest(top)[:12]}"
     summary = f"river's {name} on a window of observations, learning in training alone"
     return _OnlineRecipe(factory, f"river:{name}", outlier=None).spec(summary, label)

@@ -67,19 +67,19 @@ class Features(NamedTuple):
 
 
 def window_of(sensors: int) -> int:
-    """Return of how many rows a pattern is made, W."""
+    """Return the number of rows in a pattern of so many sensors, W."""
     return min(max(READINGS // sensors, WINDOW[0]), WINDOW[1])
 
 
 class Latest:
-    """What an episode has shown so far: each call continues where the last one ended.
+    """Features of an episode, row by row: each call continues where the last one ended.
 
     Parameters
     ----------
     dimensions
         Number of errors of a row, D.
     window
-        Number of rows of which a pattern is made, W.
+        Rows that make a pattern, W.
     """
 
     def __init__(self, dimensions: int, window: int) -> None:
@@ -124,8 +124,6 @@ class PanelMember(ABC):
     """Distance of some features from a centre."""
 
     name: ClassVar[str]
-    means: ClassVar[str]
-    """What a large distance means, in words."""
 
     @abstractmethod
     def features(self, features: Features) -> Floats:
@@ -202,7 +200,7 @@ class _Mahalanobis(PanelMember):
 class Sums(_Mahalanobis):
     """Multivariate EWMA charts of several memories in one distance (Lowry et al. 1992)."""
 
-    name, means = "sums", "forecast errors keep one sign"
+    name = "sums"
     memory = 1 / WEIGHTS[-1]
 
     def features(self, features: Features) -> Floats:
@@ -216,7 +214,7 @@ class Sums(_Mahalanobis):
 class Energy(_Mahalanobis):
     """Mean squared errors of the sensors, or how noisy they are (MacGregor & Harris 1993)."""
 
-    name, means = "energy", "forecast errors have grown or shrunk"
+    name = "energy"
     memory = float(ENERGY)
 
     def features(self, features: Features) -> Floats:
@@ -227,7 +225,7 @@ class Energy(_Mahalanobis):
 class Level(_Mahalanobis):
     """Hotelling's T² of the mean of the latest rows."""
 
-    name, means = "level", "readings are far from nominal ones"
+    name = "level"
     memory = float(LEVEL)
 
     def features(self, features: Features) -> Floats:
@@ -236,9 +234,9 @@ class Level(_Mahalanobis):
 
 
 class Pattern(PanelMember):
-    """What principal components of the latest rows leave (Jackson & Mudholkar 1979, Q)."""
+    """Residual of the principal components of the latest rows (Q of Jackson & Mudholkar 1979)."""
 
-    name, means = "pattern", "readings do not go together as usual"
+    name = "pattern"
 
     def features(self, features: Features) -> Floats:
         """Return the features that it looks at, (N, F)."""
@@ -281,7 +279,7 @@ class Pattern(PanelMember):
 class NeighbourDistance(PanelMember):
     """Mean distance of errors to the nearest nominal ones (Ramaswamy, Rastogi & Shim 2000)."""
 
-    name, means = "neighbours", "a combination of forecast errors is new"
+    name = "neighbours"
 
     def features(self, features: Features) -> Floats:
         """Return the features that it looks at, (N, F)."""

@@ -53,7 +53,7 @@ class Transitions(NamedTuple):
 
 
 class Assessment(NamedTuple):
-    """How far N observations are from their forecasts.
+    """Distances of N observations from their forecasts.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class Units:
 
 
 class EpisodeForecaster(Protocol):
-    """What forecasts the varying sensors of the next observation and judges what came."""
+    """Forecaster of the varying sensors, which judges the observation that came."""
 
     def fit(
         self, units: Units, pieces: Sequence[Transitions], folds: Sequence[int]

@@ -273,7 +273,7 @@ class GaussianForecaster:
     Parameters
     ----------
     seed
-        Decides the rows by which lengths are found, and those that are used if there are many.
+        Draws the rows that decide the lengths, and the rows that are kept if there are many.
     """
 
     def __init__(self, *, seed: int) -> None:

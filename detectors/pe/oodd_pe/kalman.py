@@ -344,7 +344,7 @@ def _commands(units: Units, steps: Transitions) -> Floats:
 
 
 class Innovations(NamedTuple):
-    """What N rows say that was not expected of them.
+    """Innovations of N rows: differences from what the filter expected of them.
 
     Attributes
     ----------
