@@ -9,7 +9,7 @@ from helpers_state import assert_zero_scales_are_refused
 from oodd_pe import make_pe
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.forecaster import Transitions
-from oodd_pe.network import LEAST_SCALES, DensityNetworks, train
+from oodd_pe.network import LEAST_SCALES, DensityNetworks, rounds, train
 from oodd_pe.rare import COUNTS, LARGEST, MOST, Leaks, RareEvents, Regions, Tails
 from oodd_pe.statistic import RETURN, Charts, Evidence, Onsets, Running, deviance
 from scipy import stats
@@ -144,11 +144,11 @@ def test_what_an_error_of_one_sensor_explains_is_that_of_the_precision_matrix(dr
 
 
 def trained(network, x, y, **settings):
-    """Train all members on the same rows."""
+    """Train all members on the same rows, of which none is held out."""
     inputs, outcomes = (a.astype(np.float32) for a in (x, y))
-    rows = [np.arange(len(x))] * network.members
+    rows, none = [np.arange(len(x))] * network.members, [np.arange(0)] * network.members
     each = np.stack([outcomes] * network.members)
-    train(network, inputs, each, rows, seed=0, device="cpu", **settings)
+    train(network, inputs, each, rows, none, seed=0, device="cpu", **settings)
 
 
 def test_a_member_learns_from_its_rows_alone():
@@ -157,7 +157,8 @@ def test_a_member_learns_from_its_rows_alone():
     y = np.where(np.arange(2000)[:, None] < 1000, 1.0, -1.0) + noise
     network, rows = DensityNetworks(2, 1, 1, 16, seed=0), [np.arange(1000), np.arange(1000, 2000)]
     inputs, outcomes = (a.astype(np.float32) for a in (x, np.stack([y, y])))
-    train(network, inputs, outcomes, rows, updates=200, batch=64, seed=0, device="cpu")
+    none = [np.arange(0)] * 2
+    train(network, inputs, outcomes, rows, none, updates=200, batch=64, seed=0, device="cpu")
     means = said(network, torch.zeros(1, 1), torch.zeros(1, 1)).mean[:, 0, 0]
     np.testing.assert_allclose(means, [1.0, -1.0], atol=0.1)
 
@@ -179,6 +180,42 @@ def test_training_finds_means_scales_dependence_and_tails():
     assert matrix[1, 0] / matrix[1, 1] == pytest.approx(-0.8, abs=0.1)
     tails = found.log_tail.exp().mean((0, 1))
     assert tails[0] < 8 < tails[1]
+
+
+def test_rounds_double_up_to_the_number_of_updates():
+    assert rounds(240) == [30, 60, 120, 240]
+    assert rounds(7) == [7]
+
+
+def test_the_likelihood_of_held_out_rows_is_that_of_each_members_own():
+    random = np.random.default_rng(0)
+    x, y = random.normal(size=(12, 3)), random.normal(size=(2, 12, 2))
+    network = DensityNetworks(2, 3, 2, 8, seed=0).double()
+    rows = [np.array([0, 3, 5]), np.array([7, 8, 11])]
+    densities = DensityEnsemble(network.arrays()).log_densities(x, y)
+    expected = (densities[0, rows[0]].mean() + densities[1, rows[1]].mean()) / 2 / 2
+    likelihood = network.likelihood(torch.from_numpy(x), torch.from_numpy(y), rows)
+    assert likelihood == pytest.approx(expected)
+    assert math.isnan(
+        network.likelihood(torch.from_numpy(x), torch.from_numpy(y), [rows[0], rows[0][:0]])
+    )
+
+
+def test_what_is_learnt_by_heart_is_taken_back_where_rows_are_held_out():
+    random = np.random.default_rng(0)
+    x, y = (random.normal(size=(90, 4)).astype(np.float32) for _ in range(2))
+    rows, held_out = [np.arange(60)] * 2, [np.arange(60, 90)] * 2
+    likelihoods = {}
+    for name, unseen in {"stopped": held_out, "all": [np.arange(0)] * 2}.items():
+        network = DensityNetworks(2, 4, 4, 32, seed=0)
+        train(
+            network, x, np.stack([y, y]), rows, unseen, updates=400, batch=64, seed=0, device="cpu"
+        )
+        outcomes = torch.from_numpy(np.stack([y, y]))
+        likelihoods[name] = network.likelihood(torch.from_numpy(x), outcomes, held_out)
+    # The entropy of standard normal outcomes, which cannot be forecast from these inputs, is 1.42.
+    assert likelihoods["stopped"] > -1.8
+    assert likelihoods["all"] < -3.0
 
 
 def test_no_error_is_forecast_to_be_wider_than_those_in_training():
@@ -432,6 +469,17 @@ def test_few_episodes_are_cut_into_blocks_of_every_fold(fitted):
     assert folds == [0, 1, 2, 0, 1, 2]
     steps = [p.known.steps for p in pieces[:3]]
     np.testing.assert_array_equal(np.concatenate(steps), np.arange(149))
+
+
+@pytest.mark.parametrize(("members", "count"), [(1, 3), (2, 4), (3, 6)])
+def test_half_of_many_episodes_are_judged_and_each_member_has_seen_the_others(members, count):
+    nominal = [episode(seed) for seed in range(30)]
+    detector = make_pe("pe-a", **{**SMALL, "updates": 5, "members": members}, forecaster="ensemble")
+    _, few = detector.fit(nominal).pieces(nominal[:29])
+    pieces, folds = detector.pieces(nominal)
+    assert (max(few) + 1, max(folds) + 1) == (3, count)
+    judged = detector.forecaster.chosen.out_of_fold(pieces, folds)
+    assert [j is not None for j in judged] == [fold < members for fold in folds]
 
 
 def test_episodes_beyond_those_that_charts_need_are_in_no_fold(fitted, monkeypatch):

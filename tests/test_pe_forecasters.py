@@ -8,7 +8,7 @@ import torch
 from oodd_pe import PeParameters, make_pe
 from oodd_pe.choice import ChosenForecaster
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
-from oodd_pe.forecaster import Units
+from oodd_pe.forecaster import Transitions, Units
 from oodd_pe.gaussian import (
     GaussianForecaster,
     Kernel,
@@ -260,12 +260,30 @@ def test_the_learned_filter_is_nearly_as_likely_as_the_true_one(learned):
     assert worse < limit - 0.15
     assert forecaster.log_density_ == pytest.approx(limit, abs=0.03)
     assert [j is None for j in judged] == [fold > 0 for fold in folds]
+
     # White: neither correlated with the row before, nor of another size than 1.
     r = np.concatenate([j.residuals for j in judged if j is not None])
     assert r.std() == pytest.approx(1.0, abs=0.05)
     assert abs((r[1:] * r[:-1]).mean(axis=0)).max() < 0.15
     changes = two_rows / two_rows.std(axis=0)
     assert (changes[1:] * changes[:-1]).mean(axis=0).max() < -0.35
+
+
+def test_a_filter_judges_every_third_fold_and_is_as_likely_as_the_first_is():
+    units, pieces, folds = posed(noisy_sensors, episodes=12)
+    folds = [n % 6 for n in range(len(folds))]
+    forecaster = KalmanForecaster(seed=0, updates=3)
+    judged = forecaster.fit(units, pieces, folds)
+    assert [j is not None for j in judged] == [fold in (0, 3) for fold in folds]
+    likely = forecaster.log_density_
+    moved = [
+        Transitions(p.known, p.now + np.float32(50.0), p.before + np.float32(50.0))
+        if fold == 3
+        else p
+        for p, fold in zip(pieces, folds, strict=True)
+    ]
+    forecaster.fit(units, moved, folds)
+    assert forecaster.log_density_ == likely
 
 
 def test_a_filter_in_parts_is_the_filter_at_once(learned):

@@ -17,7 +17,7 @@ class PeParameters:
     """Parameters of the detectors of this package."""
 
     members: int = parameter(3, low=1, help="networks in the ensemble, M")
-    updates: int = parameter(2700, low=1, help="gradient steps of each member")
+    updates: int = parameter(1800, low=1, help="most gradient steps of each member")
     batch: int = parameter(256, low=1, help="transitions of an update")
     width: int = parameter(128, low=1, help="units of each of the three hidden layers")
     window: int = parameter(2, low=1, help="latest observations that a forecast uses, W")

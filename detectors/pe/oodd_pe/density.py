@@ -57,6 +57,9 @@ class DensityForecaster:
         inputs, outcomes, of_row = self._examples(pieces, folds, unseen)
         # What has no other folds to learn from judges itself.
         rows = [np.flatnonzero(seen if seen.any() else ~seen) for seen in of_row != unseen[:, None]]
+        held_out = [
+            np.flatnonzero(~seen if seen.any() else seen) for seen in of_row != unseen[:, None]
+        ]
         network = DensityNetworks(p.members, inputs.shape[1], outcomes.shape[2], p.width, self.seed)
         if outcomes.shape[2]:
             train(
@@ -64,15 +67,16 @@ class DensityForecaster:
                 inputs,
                 outcomes,
                 rows,
+                held_out,
                 updates=p.updates,
                 batch=p.batch,
                 seed=self.seed,
                 device=self.device,
             )
         self.ensemble_ = DensityEnsemble(network.arrays())
-        held_out = [piece for piece, fold in zip(pieces, folds, strict=True) if not fold]
+        first = [piece for piece, fold in zip(pieces, folds, strict=True) if not fold]
         blind = np.arange(p.members) % (max(folds) + 1) == 0
-        self.log_density_ = self._log_density(held_out, blind)
+        self.log_density_ = self._log_density(first, blind)
         return self.out_of_fold(pieces, folds)
 
     def begin(self) -> Judge:

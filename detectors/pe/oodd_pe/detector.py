@@ -32,7 +32,10 @@ TIMES: Final = 100
 """Steps from the beginning of an episode that are told apart where rare events are looked up."""
 
 FOLDS: Final = 3
-"""Parts of the nominal episodes; what judges one of them has learnt from the others."""
+"""Parts of few nominal episodes; what judges one of them has learnt from the others."""
+
+MANY: Final = 30
+"""Episodes from which half of them, in folds of half the size, are enough to learn charts from."""
 
 
 class ProbabilisticEnsemble(StorableWindowDetector):
@@ -202,16 +205,19 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         """Return pieces of episodes in random order, and the fold of each.
 
         They are whole episodes where there are enough. Those beyond `CHARTED` are in no fold, -1.
+        Of `MANY` there are twice as many folds as members, so that half of the episodes are judged
+        and each member learns from most of them.
         """
         order = np.random.default_rng([self.seed, 0]).permutation(len(usable))
         pieces = [self._transitions(usable[i]) for i in order]
+        count = FOLDS if len(pieces) < MANY else max(FOLDS, 2 * self.parameters.members)
         if len(pieces) < FOLDS:
             blocks = [np.array_split(np.arange(len(p.now)), FOLDS) for p in pieces]
             pieces = [
                 p.rows(b) for p, of_piece in zip(pieces, blocks, strict=True) for b in of_piece
             ]
         before = np.cumsum([0, *(len(p.now) for p in pieces)])[:-1]
-        folds = [n % FOLDS if n < FOLDS or before[n] < CHARTED else -1 for n in range(len(pieces))]
+        folds = [n % count if n < count or before[n] < CHARTED else -1 for n in range(len(pieces))]
         # An episode of fewer steps than folds leaves some empty.
         filled = [(p, fold) for p, fold in zip(pieces, folds, strict=True) if len(p.now)]
         return [p for p, _ in filled], [fold for _, fold in filled]

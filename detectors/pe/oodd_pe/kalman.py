@@ -39,6 +39,8 @@ RATE: Final = 2e-3
 """Learning rate of the dynamics at the start; it falls to nothing as a cosine."""
 NOISE_RATE: Final = 5e-2
 """Learning rate of the logarithms of the noises' variances."""
+HELD_OUT: Final = 3
+"""One fold of so many is not learnt from: charts are learnt from its episodes."""
 ALTERNATING: Final = -0.1
 """Mean correlation of neighbouring errors of a linear forecast from which noise is looked for."""
 RIDGE: Final = 1e-6
@@ -274,20 +276,26 @@ class KalmanForecaster:
     ) -> list[Assessment | None]:
         """Learn from nominal pieces: see `oodd_pe.forecaster.EpisodeForecaster.fit`.
 
-        Fold 0 is held out where there are others.
+        Every `HELD_OUT`-th fold is held out, of which the first decides how likely the filter is,
+        where there are others.
         """
         self.units_ = units
-        training = [p for p, fold in zip(pieces, folds, strict=True) if fold] or list(pieces)
+        seen = [bool(fold % HELD_OUT) for fold in folds]
+        training = [p for p, learnt in zip(pieces, seen, strict=True) if learnt] or list(pieces)
         self.arrays_ = fitted(
             [_rows(units, p) for p in training], updates=self.updates, seed=self.seed
         )
         judged: list[Assessment | None] = [None] * len(pieces)
         white, volumes = [], []
-        for n in np.flatnonzero(np.asarray(folds) == 0).tolist():
-            innovations = _Running(units, self.arrays_).innovations(pieces[n])
+        for n, piece in enumerate(pieces):
+            if seen[n]:
+                continue
+            innovations = _Running(units, self.arrays_).innovations(piece)
             judged[n] = _judgement(innovations)
-            white.append(innovations.white)
-            volumes.append(innovations.log_volume)
+            # As of the others' forecasts, which are compared with this one.
+            if folds[n] == 0:
+                white.append(innovations.white)
+                volumes.append(innovations.log_volume)
         density = student(np.concatenate(white)).mean()
         self.log_density_ = float(density - np.concatenate(volumes).mean() / len(units.varying))
         return judged

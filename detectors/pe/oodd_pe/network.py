@@ -23,6 +23,8 @@ from oodd_eval.plugins.state import Arrays
 LAYERS: Final = 3
 CHUNK: Final = 4096
 """Rows that are looked at together outside the training: bounds memory."""
+COMPARED: Final = 8192
+"""Most held-out rows by which a member is judged between rounds."""
 SURVEYED: Final = 65_536
 """Training rows at most from which least scales are taken, evenly spread: bounds memory."""
 RATE: Final = 8e-3
@@ -30,10 +32,12 @@ RATE: Final = 8e-3
 HIDDEN_RATE: Final = 0.03
 """Learning rate of the weights of hidden layers, by Muon."""
 DECAY: Final = 0.998
+FIRST: Final = 30
+"""Most updates of the first round."""
 WARM_UP: Final = 100
 """Updates in which the rates rise from 0."""
 MEAN_FIRST: Final = 0.25
-"""Share of the updates in which squared errors weigh more than the likelihood.
+"""Share of a round's updates in which squared errors weigh more than the likelihood.
 
 A likelihood alone widens the scales of what it could still learn to forecast.
 """
@@ -138,6 +142,24 @@ class DensityNetworks(torch.nn.Module):
         return Forecast(residual.mT, log_scale.mT, log_tail.mT, mean.mT)
 
     @torch.no_grad()
+    def likelihood(self, x: Tensor, y: Tensor, rows: Sequence[NDArray[np.int64]]) -> float:
+        """Return the mean log density of each member's own rows, by sensor; NaN without any.
+
+        From inputs (N, I), outcomes (M, N, D) and indices of rows of each member, of which as many
+        count as the least has.
+        """
+        count = min(*(len(r) for r in rows), COMPARED)
+        if not count:
+            return math.nan
+        spread = [r[np.arange(count) * len(r) // count] for r in rows]
+        members = torch.arange(self.members, device=x.device)[:, None]
+        total = 0.0
+        every = torch.from_numpy(np.stack(spread)).to(x.device)
+        for index in torch.split(every, CHUNK, dim=1):
+            total -= float(self(x[index], y[members, index]).surprise().sum())
+        return total / (count * self.members * self.sensors)
+
+    @torch.no_grad()
     def least_scales(self, x: Tensor, y: Tensor) -> Tensor:
         """Return each member's and sensor's least log scale for training rows, (M, 1, D).
 
@@ -168,6 +190,7 @@ def train(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
     rows: Sequence[NDArray[np.int64]],
+    held_out: Sequence[NDArray[np.int64]],
     *,
     updates: int,
     batch: int,
@@ -176,8 +199,11 @@ def train(
 ) -> None:
     """Maximize the likelihood of outcomes given inputs, in place.
 
-    Every member draws batches of its own. The weights are averaged over the last updates. Networks
-    are trained in single precision.
+    Every member draws batches of its own. Training goes in rounds, each about as long as all before
+    it. In a round the rates fall to nothing, and its last weights are averaged. Kept are those by
+    which held-out rows are likeliest, and after `WARM_UP` updates a round without gain is the last:
+    a few hundred rows are learnt by heart in a hundred updates. Networks are trained in single
+    precision.
 
     Parameters
     ----------
@@ -189,8 +215,10 @@ def train(
         Outcomes, (M, N, D).
     rows
         Indices of the rows that each member is trained on.
+    held_out
+        Indices of rows that it is not trained on; without any for a member, all rounds are kept.
     updates, batch
-        Gradient steps, and rows of one.
+        Most gradient steps, and rows of one.
     seed
         Decides the batches.
     device
@@ -199,25 +227,64 @@ def train(
     random = np.random.default_rng([seed, 1])
     network.to(device)
     inputs, outcomes = (torch.from_numpy(v).to(device) for v in (x, y))
+    best, kept, done = network.likelihood(inputs, outcomes, held_out), _copied(network), 0
+    for total in rounds(updates):
+        _round(network, inputs, outcomes, rows, range(done, total), batch=batch, random=random)
+        done, likelihood = total, network.likelihood(inputs, outcomes, held_out)
+        # No comparison is true of what is not a number, where nothing is held out.
+        if not likelihood <= best:
+            best, kept = likelihood, _copied(network)
+        elif done >= WARM_UP:
+            break
+    network.load_state_dict(kept)
+    network.floor = network.least_scales(inputs, outcomes)
+
+
+def _copied(network: DensityNetworks) -> dict[str, Tensor]:
+    return {name: values.clone() for name, values in network.state_dict().items()}
+
+
+def rounds(updates: int) -> list[int]:
+    """Return the numbers of updates after which rounds of a training end, the last of them all.
+
+    Each is twice the one before, about; the first is at most `FIRST`.
+    """
+    ends = [updates]
+    while ends[0] > FIRST:
+        ends.insert(0, ends[0] // 2)
+    return ends
+
+
+def _round(
+    network: DensityNetworks,
+    x: Tensor,
+    y: Tensor,
+    rows: Sequence[NDArray[np.int64]],
+    updates: range,
+    *,
+    batch: int,
+    random: np.random.Generator,
+) -> None:
+    """Train by some updates, numbered from the beginning, over which the rates fall to nothing."""
     rest = [*network.biases, network.out, network.out_bias]
     hidden, others = Muon(network.weights), Adam(rest)
     average = Average(network.parameters(), DECAY)
-    one = torch.ones(network.members, device=device)
-    members = torch.arange(network.members, device=device)[:, None]
-    for update in range(updates):
+    one = torch.ones(network.members, device=x.device)
+    members = torch.arange(network.members, device=x.device)[:, None]
+    for update in updates:
         drawn = np.stack([r[random.integers(0, len(r), batch)] for r in rows])
-        index = torch.from_numpy(drawn).to(device)
-        target = outcomes[members, index]
-        forecast = network(inputs[index], target)
+        index = torch.from_numpy(drawn).to(x.device)
+        target = y[members, index]
+        forecast = network(x[index], target)
         loss = forecast.surprise().mean(1).sum() / network.sensors
-        if update < MEAN_FIRST * updates:
+        passed = (update - updates.start) / len(updates)
+        if passed < MEAN_FIRST:
             errors = smooth_l1_loss(forecast.mean, target, beta=0.3, reduction="none")
             loss = 0.3 * loss + 3.0 * errors.mean((1, 2)).sum()
         loss.backward()
-        decay = 0.5 * (1 + math.cos(math.pi * update / updates))
+        decay = 0.5 * (1 + math.cos(math.pi * passed))
         rate = min(1.0, (update + 1) / WARM_UP) * (decay + 1e-3)
         others.step(RATE * rate * one)
         hidden.step(HIDDEN_RATE * rate * one)
         average.update()
     average.apply()
-    network.floor = network.least_scales(inputs, outcomes)
