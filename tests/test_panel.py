@@ -6,6 +6,16 @@ import numpy as np
 import oodd_panel.detector
 import pytest
 from oodd_panel import make_panel
+from oodd_panel.constants import (
+    LAGS,
+    MOVED,
+    ConstantsForecast,
+    EpisodeCharts,
+    LargestChart,
+    chosen_rank,
+    moving_of,
+    share_of_noise,
+)
 from oodd_panel.forecast import (
     EpisodeLearner,
     LinearForecast,
@@ -126,6 +136,116 @@ def test_the_chosen_ridge_is_small_for_an_exact_system_and_large_for_noise():
     ]
     assert chosen_ridge(noise, 1) == 1.0
     assert chosen_ridge(exact, 1) == 1e-4
+
+
+# Constants of an episode
+
+
+def plain_episodes(gains, seed=0):
+    episodes = [driven(seed + i, gain) for i, gain in enumerate(gains)]
+    return [
+        StandardEpisode(x.observations.astype(float), x.actions.astype(float)) for x in episodes
+    ]
+
+
+def random_charts(rank, seed=14, sensors=2, actions=1):
+    """A forecast of random numbers and regressors for it."""
+    rng = np.random.default_rng(seed)
+    k, g = LAGS * (sensors + actions) + 1, 2 * (sensors + actions) + 1
+    forecast = ConstantsForecast(
+        rng.normal(size=(k, sensors)), rng.normal(size=(rank, g, sensors)), np.array([2.0, 3.0])
+    )
+    return forecast, rng.normal(size=(400, k))
+
+
+def test_coefficients_move_of_means_over_lags_and_of_latest_values():
+    rows = np.arange(1.0, 15.0).reshape(7, 2)
+    regressed = regressors(StandardEpisode(rows, np.full((6, 1), 5.0)), 1, LAGS)
+    assert regressed.shape == (6, LAGS * 3 + 1)
+    # Before the last row, six rows with means 6 and 7, and six actions of 5.
+    assert moving_of(regressed, 2)[-1].tolist() == [6.0, 7.0, 11.0, 12.0, 5.0, 5.0, 1.0]
+
+
+def test_constants_have_the_spread_of_what_was_drawn():
+    gains = 1.0 + 0.3 * np.random.default_rng(15).normal(size=60)
+    forecast = ConstantsForecast.fit(plain_episodes(gains), 1, 1)
+    assert forecast.error_scale[0] == pytest.approx(0.05, rel=0.1)
+    # The latest action stands after the lags of the sensor, and of what moves in the fourth place.
+    assert forecast.coefficients[LAGS, 0] == pytest.approx(gains.mean(), abs=0.05)
+    assert np.abs(forecast.matrices[0, 3, 0]) == pytest.approx(gains.std(), rel=0.1)
+
+
+def test_the_rank_is_that_which_forecasts_other_episodes():
+    rng = np.random.default_rng(16)
+    assert chosen_rank(plain_episodes(np.ones(20)), 1, 60) == 0
+    levels = [
+        StandardEpisode(level + 0.1 * rng.normal(size=(200, 3)), np.empty((199, 0)))
+        for level in rng.normal(size=(20, 3))
+    ]
+    assert chosen_rank(levels, 1, 60) > 0
+
+
+def test_constants_are_learnt_as_by_normal_equations():
+    forecast, x = random_charts(3)
+    rng = np.random.default_rng(17)
+    drawn, directions = rng.normal(size=3), moving_of(x, 2)
+    noise = rng.normal(size=(400, 2)) * forecast.error_scale
+    effect = np.einsum("ng,rgd->nrd", directions, forecast.matrices)
+    y = x @ forecast.coefficients + np.einsum("nrd,r->nd", effect, drawn) + noise
+    errors = EpisodeCharts(forecast, 60).errors(x, y)
+    scaled = effect / forecast.error_scale
+    left = (y - x @ forecast.coefficients) / forecast.error_scale
+    precision = np.eye(3) + np.einsum("nrd,nsd->rs", scaled[:60], scaled[:60])
+    posterior = np.linalg.solve(precision, np.einsum("nrd,nd->r", scaled[:60], left[:60]))
+    spread = np.einsum("rd,rs,sd->d", scaled[99], np.linalg.inv(precision), scaled[99])
+    assert np.abs(errors[:60]).max() < 4  # so that no error was limited
+    np.testing.assert_allclose(
+        errors[99], (left[99] - posterior @ scaled[99]) / np.sqrt(1 + spread)
+    )
+
+
+def test_the_test_of_constants_is_chi_square_until_one_of_them_moves():
+    forecast, x = random_charts(4)
+    rng = np.random.default_rng(18)
+    effect = np.einsum("ng,rgd->nrd", moving_of(x, 2), forecast.matrices)
+    still, moved = [], []
+    for _ in range(40):
+        noise = rng.normal(size=(400, 2)) * forecast.error_scale
+        constants = np.tile(rng.normal(size=4), (400, 1))
+        for held, shift in ((still, 0.0), (moved, 0.5)):
+            constants[200:, 1] += shift
+            y = x @ forecast.coefficients + np.einsum("nrd,nr->nd", effect, constants) + noise
+            held.append(EpisodeCharts(forecast, 60)(x, y)[:, -len(MOVED) :] ** 2)
+    # The expectation of chi-square is its degrees of freedom.
+    np.testing.assert_allclose(np.mean(still, axis=0)[150:].mean(axis=0), 4.0, rtol=0.15)
+    assert (np.mean(moved, axis=0)[260] > 6.0).all()
+    np.testing.assert_array_equal(moved[0][:200], still[0][:200])
+
+
+@pytest.mark.parametrize("rank", [0, 3])
+def test_charts_are_the_same_for_one_row_at_a_time_as_for_many(rank):
+    forecast, x = random_charts(rank)
+    y = np.random.default_rng(19).normal(size=(400, 2))
+    charts = EpisodeCharts(forecast, 60)
+    steps = [charts(x[t : t + 1], y[t : t + 1]) for t in range(100)]
+    np.testing.assert_array_equal(np.concatenate(steps), EpisodeCharts(forecast, 60)(x, y)[:100])
+
+
+def test_the_largest_chart_counts_in_units_of_its_largest_nominal_values():
+    charts = [np.array([[1.0, 0.0], [0.0, 10.0]]), np.array([[3.0, 30.0]])]
+    largest = LargestChart.fit(charts, np.array([4.0, 8.0]))
+    # Largest values 1 and 3, 10 and 30: means 2 and 20, deviations 1 and 10.
+    np.testing.assert_allclose(
+        largest.standardized(np.array([[4.0, 0.0], [2.0, 50.0]])), [[2, -2], [0, 3]]
+    )
+    # Over the two episodes the largest is -1 and 1, the other statistic's 6 - 2 and 6 + 2.
+    np.testing.assert_allclose(largest(np.array([[4.0, 0.0], [2.0, 50.0]])), [10.0, 12.0])
+
+
+def test_noise_is_told_from_heavy_tails_by_its_kurtosis():
+    rng = np.random.default_rng(20)
+    errors = np.c_[rng.normal(size=4000), rng.standard_t(3, size=4000), np.zeros(4000)]
+    assert share_of_noise([np.abs(errors)], 3) == pytest.approx(1 / 3)
 
 
 # Features and members
@@ -299,6 +419,59 @@ def test_what_differs_between_episodes_is_learnt_from_their_first_rows():
     threshold = max(np.nanmax(panel.score(x)) for x in calibration)
     faulty = [driven(200 + seed, gain, onset=120) for seed, gain in enumerate(gains)]
     assert np.mean([np.nanmax(panel.score(x)[120:]) > threshold for x in faulty]) > 0.9
+
+
+def pumped(seed, gain, onset=None):
+    """A level that follows a pump near a voltage of 3 with the episode's gain; a tenth is lost."""
+    rng = np.random.default_rng([seed, 4])
+    u, level = 3.0 + 0.3 * rng.normal(size=(199, 1)), np.empty((200, 1))
+    level[0] = 2 * 3 * gain
+    for t in range(1, 200):
+        share = 0.9 if onset is not None and t >= onset else 1.0
+        level[t] = 0.5 * level[t - 1] + share * gain * u[t - 1] + 0.1 * rng.normal()
+    return Trajectory(level, u)
+
+
+@pytest.fixture(scope="module")
+def charting():
+    gains = np.random.default_rng(21).uniform(0.9, 1.1, size=32)
+    nominal = [pumped(seed, gain) for seed, gain in enumerate(gains)]
+    return make_panel("panel-a", forecast="linear").fit(nominal)
+
+
+def test_charts_of_constants_are_a_voice_that_streams_and_is_restored(charting):
+    assert charting.voices[-1] == "charts"
+    assert len(charting.charts_[0].matrices)
+    faulty = pumped(301, 1.05, onset=120)
+    scores, (shares, onsets) = charting.score(faulty), charting.explain(faulty)
+    said = charting.surprises(faulty)[1:, -1]
+    assert said[150:].min() > said[:110].max()
+    restored = make_panel("panel-a", forecast="linear")
+    restored.restore(charting.state())
+    np.testing.assert_array_equal(restored.score(faulty), scores)
+    prefix = Trajectory(faulty.observations[:151], faulty.actions[:150])
+    np.testing.assert_array_equal(charting.score(prefix), scores[:151])
+    actions = [None, *faulty.actions]
+    for t, (row, action) in enumerate(zip(faulty.observations, actions, strict=True)):
+        np.testing.assert_array_equal(restored.update(row, action), scores[t])
+        share, onset = restored.explain_last()
+        np.testing.assert_array_equal(share, shares[t])
+        assert onset == onsets[t]
+
+
+def test_a_sensor_that_always_jumps_hides_no_fault_of_the_others():
+    def with_set_point(seed, by=0.0):
+        rng = np.random.default_rng([seed, 3])
+        rows = np.c_[rng.normal(size=(200, 2)), np.repeat(rng.normal(size=10), 20)]
+        rows[150:, 0] += by
+        return Trajectory(rows)
+
+    panel = make_panel(forecast="linear").fit([with_set_point(seed) for seed in range(32)])
+    faulty = with_set_point(90, by=1.5)
+    assert panel.voices[-1] == "charts"
+    said = panel.surprises(faulty)[:, -1]
+    assert said[170:].min() > said[:150][LAGS + 1 :].max()
+    assert (panel.explain(faulty)[0][175:].argmax(axis=1) == 0).mean() > 0.8
 
 
 def test_equal_episodes_share_their_coefficients():

@@ -35,11 +35,11 @@ class StandardEpisode(NamedTuple):
     actions: Floats
 
 
-def regressors(episode: StandardEpisode, horizon: int) -> Floats:
+def regressors(episode: StandardEpisode, horizon: int, order: int = ORDER) -> Floats:
     """Return what the forecasts of rows h, ..., T use, (T + 1 - h, K).
 
-    Rows of sensors and of actions, newest first, with the first observation repeated and no action
-    (0, the mean) before the beginning; then 1.
+    The latest `order` rows of sensors and of actions, newest first, with the first observation
+    repeated and no action (0, the mean) before the beginning; then 1.
 
     Examples
     --------
@@ -48,11 +48,11 @@ def regressors(episode: StandardEpisode, horizon: int) -> Floats:
     """
     rows, actions = episode
     n = max(len(rows) - horizon, 0)
-    lags = np.arange(n)[:, None] - np.arange(ORDER)
-    parts = [rows[np.maximum(lags, 0)].reshape(n, ORDER * rows.shape[1])]
+    lags = np.arange(n)[:, None] - np.arange(order)
+    parts = [rows[np.maximum(lags, 0)].reshape(n, order * rows.shape[1])]
     if actions.shape[1]:
         known = np.where(lags[..., None] >= 0, actions[np.maximum(lags, 0)], 0.0)
-        parts.append(known.reshape(n, ORDER * actions.shape[1]))
+        parts.append(known.reshape(n, order * actions.shape[1]))
     return np.concatenate([*parts, np.ones((n, 1))], axis=1)
 
 
