@@ -22,7 +22,7 @@ class RaptParameters:
 class FlowParameters:
     """Parameters of `logpzo`."""
 
-    updates: int = parameter(3000, low=1, help="gradient steps")
+    updates: int = parameter(6000, low=1, help="gradient steps")
     batch: int = parameter(512, low=1, help="rows of an update")
     units: int = parameter(128, low=1, help="units of each of the three hidden layers")
     steps: int = parameter(1, low=1, help="Euler steps from a row to its latent")
@@ -32,7 +32,6 @@ class FlowParameters:
 class TransitionFlowParameters(FlowParameters):
     """Parameters of `logpzo-a`."""
 
-    updates: int = parameter(6000, low=1, help="gradient steps")
     steps: int = parameter(8, low=1, help="Euler steps from a transition to its latent")
     conditional: bool = parameter(
         True,
@@ -45,7 +44,7 @@ class TransitionFlowParameters(FlowParameters):
 class WorldModelParameters:
     """Parameters of `wm-kl-a`."""
 
-    updates: int = parameter(1000, low=1, help="gradient steps")
+    updates: int = parameter(2000, low=1, help="gradient steps")
     batch: int = parameter(32, low=1, help="pieces of episodes in a batch")
     chunk: int = parameter(16, low=1, help="steps of a piece, through which gradients flow")
     units: int = parameter(128, low=1, help="units of the memory and of every hidden layer")

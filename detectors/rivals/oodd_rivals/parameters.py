@@ -53,7 +53,7 @@ class RndParameters:
     limit: float = parameter(10.0, above=0, help="standardized sensors are clipped at this")
     width: int = parameter(128, low=1, help="units of each hidden layer")
     outputs: int = parameter(16, low=1, help="outputs of both networks")
-    updates: int = parameter(1500, low=1, help="gradient steps")
+    updates: int = parameter(3000, low=1, help="gradient steps")
     batch: int = parameter(256, low=1, help="rows of an update")
     rate: float = parameter(3e-3, above=0, help="learning rate at the start")
 
