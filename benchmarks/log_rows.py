@@ -16,7 +16,8 @@ odd numbers the other (1), which judges. Who is fitted on what:
 Printed are AUC by set and detector, their mean, the slowest fit, and, for skab, in how many cases
 the statistic is below its largest nominal value within 60 rows after a fault, where the readings
 themselves return: the median distance of rows 30 to 60 after it is at most twice that of nominal
-rows. The first row of a file has no score and is left out.
+rows. The first row of a file has no score and is left out. ``lstm-autoencoder`` is
+`lstm_autoencoder.LstmAutoencoder`, which is no installed detector.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from lstm_autoencoder import LstmAutoencoder
 
 from oodd_eval import Trajectory
 from oodd_eval.metrics.auc import auc
@@ -127,6 +129,7 @@ def rosa(root, half):
         yield [rows[:middle][~labels[:middle]]], [(rows[middle:], labels[middle:])]
 
 
+OTHERS = {"lstm-autoencoder": LstmAutoencoder}
 SETS = {"skab": skab, "alfa": alfa, "tep": tep, "uci": uci, "rosa": rosa}
 
 
@@ -172,6 +175,14 @@ def returns(detector, nominal, tests):
                 yield bool((scores[stop : stop + RETURN] <= limit).any())
 
 
+def unfitted(name, plugins):
+    """Return an unfitted detector, installed or not."""
+    if name in OTHERS:
+        return OTHERS[name]()
+    factory = plugins.offer(name).spec.factory
+    return make_detector(factory, seed=0, horizon=1, parameters={})
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, required=True)
@@ -179,12 +190,14 @@ def main():
     parser.add_argument("--detector", default="panel,pca,knn,mewma,mahalanobis,pe")
     options = parser.parse_args()
     plugins = discover()
-    for name in plugins.select(options.detector):
-        spec, by_set, slowest, down = plugins.offer(name).spec, {}, 0.0, []
+    installed = [name for name in options.detector.split(",") if name not in OTHERS]
+    names = plugins.select(",".join(installed)) if installed else []
+    for name in (*names, *(name for name in options.detector.split(",") if name in OTHERS)):
+        by_set, slowest, down = {}, 0.0, []
         for set_name, read in SETS.items():
             values = []
             for nominal, tests in read(options.root / set_name, options.half):
-                detector = make_detector(spec.factory, seed=0, horizon=1, parameters={})
+                detector = unfitted(name, plugins)
                 started = time.process_time()
                 detector.fit([trajectory(rows) for rows in nominal])
                 slowest = max(slowest, time.process_time() - started)
