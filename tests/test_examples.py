@@ -11,9 +11,6 @@ import pytest
 from helpers_own import forget_own
 from PIL import Image
 
-from oodd_eval import load_split
-from oodd_eval.live import Watchdog
-
 pytestmark = pytest.mark.slow
 
 pytest.importorskip("gymnasium", reason="needs the extra gym")
@@ -26,17 +23,11 @@ def example():
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """A watchdog as the example keeps one, of a small ensemble."""
-    data, place = (
-        load_split("mini").environment("cartpole"),
-        tmp_path_factory.mktemp("kept") / "fit",
-    )
-    small = {"updates": 200, "width": 32}
-    Watchdog.fit(
-        "pe-a", data.train, data.calibration, 0.1, sensors=data.sensors, parameters=small
-    ).save(place)
-    return str(place)
+def kept(tmp_path_factory, example):
+    """File of the watchdog that the example fits by default."""
+    file = tmp_path_factory.mktemp("kept") / "fit"
+    example.prepare("panel-a", 0.1, file)
+    return str(file)
 
 
 def test_a_live_loop_raises_an_alarm_after_the_onset_only(example, kept, capsys):

@@ -140,7 +140,7 @@ def run_example(name, **given):
 )
 def test_a_loop_on_a_bus_names_the_topic_with_a_fault(fault, told, monkeypatch, capsys):
     loop = run_example("bus_loop.py")
-    reading = loop.main(["--detector", "mewma", "--fault", fault, "--fast", "--steps", "140"])
+    reading = loop.main(["--fault", fault, "--fast", "--steps", "140"])
     assert reading.faults == {"pole angle": told}
     assert (reading.onset, reading.sensor) == (100, "pole angle")
     assert f"pole angle {told}, since row 100" in capsys.readouterr().out
@@ -154,10 +154,7 @@ def test_a_loop_that_skips_messages_is_found():
 
 
 def test_a_loop_on_a_bus_is_quiet_without_a_fault():
-    assert (
-        run_example("bus_loop.py").main(["--detector", "mewma", "--fault", "none", "--fast"])
-        is None
-    )
+    assert run_example("bus_loop.py").main(["--fault", "none", "--fast"]) is None
 
 
 class BaseCallback:
@@ -218,12 +215,8 @@ def test_evaluation_keeps_the_first_alarm_of_each_episode(callbacks):
 def test_the_snippet_of_the_readme_prints_what_it_says():
     (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert len(snippet.splitlines()) <= 12
-    # One network of three, with a ninth of its updates.
-    few = 'sensors=data.sensors, parameters={"members": 1, "updates": 300})'
-    quick = snippet.replace("sensors=data.sensors)", few)
-    assert quick != snippet
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        exec(compile(quick, "README.md", "exec"), {})  # noqa: S102
+        exec(compile(snippet, "README.md", "exec"), {})  # noqa: S102
     said = re.search(r"print\(info\[\"oodd\"\]\)  # (row \d+: alarm, [a-z ]+) \d+%", snippet)[1]
     assert printed.getvalue().startswith(said)
