@@ -94,6 +94,14 @@ def by_environment(name: str) -> str:
     return " | ".join([*pairs, *(f"{share:.0f}" for share in missed)])
 
 
+def by_group(name: str) -> str:
+    """Return matched AUC over all cells and by group, and two shares of alarms, on mini."""
+    groups = (board("mini").in_group(group) for group in ("sensor", "dynamics"))
+    aucs = [mean("mini", name, "auc_matched", anomalies=group) for group in groups]
+    overall, *alarms = (mean("mini", name, metric) for metric in HEADLINE)
+    return cells([overall, *aucs, *alarms])
+
+
 def at_horizons(name: str) -> str:
     """Return three metrics of a detector, each at three horizons."""
     return cells(mean("horizons", Setting(name, h), m) for m in HEADLINE for h in (1, 10, 20))
@@ -183,6 +191,7 @@ TABLES: dict[str, Row] = {
     "board mini": of_board("mini", *WHOLE),
     "board standard": of_board("standard", *WHOLE),
     "environments": by_environment,
+    "papers": by_group,
     "horizons": at_horizons,
     "run again": run_again,
     "noise": under_noise,
