@@ -37,7 +37,7 @@ COUNTS: Final = -math.log(0.01)
 LARGEST: Final = 4.0
 """Limit of what a step counts: how improbable a step is beyond that, no tail can tell."""
 NOMINAL: Final = 1.0
-"""What a sum of a hundred nominal steps comes to: one of them counts, on average by one."""
+"""Usual sum of a hundred nominal steps: one of them counts, on average by one."""
 MOST: Final = 3.0
 """Limit of the chart, in units of what is usual for an episode's largest.
 
@@ -124,7 +124,7 @@ class Regions:
 
 
 class Tails(NamedTuple):
-    """Where the tails of K quantities begin in each of R regions, and how long they are: (R, K)."""
+    """Beginnings and lengths of the tails of K quantities in each of R regions, (R, K) both."""
 
     start: Floats
     length: Floats
