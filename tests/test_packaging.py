@@ -36,6 +36,7 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_riqn/py.typed",
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
+        "oodd_eval/data/shipped/mini/croissant.json",
         "oodd_eval/plugins/template/templates/pyproject.toml.in",
         "oodd_eval/plugins/template/templates/gitignore.in",
         "oodd_eval/leaderboard/published.jsonl.gz",
