@@ -5,6 +5,7 @@ they describe, such as the detectors' READMEs, become pages of the site. A link 
 no page leads into the repository, if pyproject.toml says where that is, or becomes its path in it.
 """
 
+import html
 import json
 import os
 import re
@@ -13,7 +14,9 @@ from pathlib import Path, PurePosixPath
 import click
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure import StructureItem
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.nav import Navigation
 from mkdocs.structure.pages import Page
 
 from oodd_eval._version import repository
@@ -49,6 +52,11 @@ MATHS = re.compile(r"^\$\$(.+?)\$\$$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![^\s>-])(?=[^\s<-]*\d)[^\sA-Za-z<>-]+(?![^\s<-])")
 """A word with digits and without letters, where the search splits its index."""
 COMMANDS = "<!-- help of every command -->"
+PARAGRAPH = re.compile(r"<p>(.*?)</p>", re.DOTALL)
+SENTENCES = re.compile(r"(?<=[.?!]) ")
+
+LLMS = "llms.txt"
+"""Index of the pages for language models, as https://llmstxt.org has it."""
 
 
 def elsewhere() -> list[str]:
@@ -89,14 +97,63 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
+    """Keep the navigation, from which the index for language models is written at the end."""
+    del files
+    config.extra[LLMS] = nav
+    return nav
+
+
+def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Describe a page by its first sentence, or by more of them where the first is short."""
+    del config, files
+    texts = (_plain(paragraph) for paragraph in PARAGRAPH.findall(content))
+    first, *others = SENTENCES.split(next((text for text in texts if text.count(" ") > 2), ""))
+    while others and len(first) < 50:
+        first += " " + others.pop(0)
+    page.meta.setdefault("description", f"{first[:-1]}." if first.endswith(":") else first)
+    return content
+
+
+def _plain(text: str) -> str:
+    """Return the text of HTML in one line, without the word that opens a decision."""
+    plain = " ".join(html.unescape(re.sub(r"<[^>]+>", "", text)).split())
+    return plain.removeprefix("Context. ")
+
+
 def on_post_build(config: MkDocsConfig) -> None:
+    """Write the index for language models, and mend that of the search."""
+    index = llms(config.extra.pop(LLMS), config)
+    (Path(config.site_dir) / LLMS).write_text(index, encoding="utf-8")
+    _mend_search(Path(config.site_dir) / "search" / "search_index.json")
+
+
+def llms(nav: Navigation, config: MkDocsConfig) -> str:
+    """Return the text of llms.txt: each page with address, title and first sentence."""
+    base = config.site_url or ""
+    sections: dict[str, list[str]] = {}
+
+    def add(item: StructureItem, section: str) -> None:
+        for child in item.children or ():
+            add(child, section if item.parent else item.title)
+        if not item.children:
+            description = item.meta.get("description", "") if isinstance(item, Page) else ""
+            line = f"- [{item.title}]({base}{item.url})"
+            sections.setdefault(section, []).append(line + f": {description}" * bool(description))
+
+    for item in nav.items:
+        add(item, "Start")
+    lists = [f"## {title}\n\n" + "\n".join(lines) for title, lines in sections.items()]
+    return "\n\n".join([f"# {config.site_name}", f"> {config.site_description}", *lists]) + "\n"
+
+
+def _mend_search(path: Path) -> None:
     """Take numbers, half of all words, out of the search's index.
 
     lunr writes a node of its tree as letters that are followed by numbers of other nodes, so that
     words with digits may be taken for others, and then searches fail:
     https://github.com/olivernn/lunr.js/issues/314 has the symptom.
     """
-    path = Path(config.site_dir) / "search" / "search_index.json"
     index = json.loads(path.read_text(encoding="utf-8"))
     for entry in index["docs"]:
         entry["text"] = NUMBER.sub(" ", entry["text"])

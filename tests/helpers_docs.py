@@ -34,6 +34,9 @@ class Rule:
 NOT_RUN = [
     Rule(r"^python3\.11 -m venv", "the README's two commands: .ci/run and test_readme"),
     Rule(r"^pip install (?!-e )", "needs an index; what is installed then is what runs here"),
+    Rule(
+        r"^(uvx|pipx) ", "need an index; test_readme reads what they run, test_packaging the wheel"
+    ),
     Rule(r"^\. \.venv/bin/activate$", "the environment is this one; test_walk makes another"),
     Rule(r"^git ", "changes a repository"),
     Rule(

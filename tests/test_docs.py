@@ -88,6 +88,26 @@ def test_no_page_is_twice_in_the_navigation():
     assert sorted(pages) == sorted({*pages})
 
 
+def test_the_index_for_language_models_describes_every_page_of_the_navigation(site):
+    """llms.txt: a title, a summary, and lists of links with what the page is about."""
+    title, summary, *sections = (site / "llms.txt").read_text().split("\n\n")
+    assert title == "# oodd-eval"
+    assert summary.startswith("> Evaluation harness and leaderboard")
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    sources = re.findall(r"\S+\.(?:md|html)$", navigation, re.MULTILINE)
+    lines = "\n".join(part for part in sections if not part.startswith("## ")).splitlines()
+    links = [re.fullmatch(r"- \[(.+)\]\(([^()]+)\)(?:: (.{20,}))?", line) for line in lines]
+    built = [re.sub(r"(README)?\.md$", lambda m: "index.html" if m[1] else ".html", source)
+             for source in sources]  # fmt: skip
+    assert sorted(link[2] for link in links) == sorted(built)  # single pages come first
+    assert all((site / link[2]).is_file() for link in links)
+    bare = [link[2] for link in links if not link[3]]
+    assert bare == ["leaderboard/site/index.html"]  # which is no page of Markdown
+    (datasheet,) = (link for link in links if link[2] == "datasheet.html")
+    assert datasheet[3].startswith("What the published splits are made of")
+    assert not any(link[3] and link[3].endswith(":") for link in links)
+
+
 def test_every_page_is_reached_from_the_home_page(site, pages):
     seen, new = set(), [site / "index.html"]
     while new:

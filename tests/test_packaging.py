@@ -1,16 +1,20 @@
 """What pip installs: the built wheel, and a detector directory lifted out of the project."""
 
+import email
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from helpers_wheel import pip
+from trove_classifiers import classifiers, deprecated_classifiers
 
 pytestmark = pytest.mark.packaging
 
@@ -32,6 +36,7 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_riqn/py.typed",
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
+        "oodd_eval/data/shipped/mini/croissant.json",
         "oodd_eval/plugins/template/templates/pyproject.toml.in",
         "oodd_eval/plugins/template/templates/gitignore.in",
         "oodd_eval/leaderboard/published.jsonl.gz",
@@ -40,21 +45,76 @@ def test_wheel_ships_data_policies_and_types(wheel):
     assert "oodd_recording/frozen/ant.npz" in names
 
 
-def test_what_is_handed_out_works_in_an_environment_of_its_own(tmp_path):
-    """As docs/how-to/release.md says; `build` makes the wheel of the source distribution."""
+def run(*command):
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHON": sys.executable},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
-    def run(*command):
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False,
-            env={**os.environ, "PYTHON": sys.executable},
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
 
-    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT)
-    source, wheel = sorted(tmp_path.iterdir(), key=lambda path: path.suffix)
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory):
+    """Source distribution, and the wheel that `build` makes of it."""
+    directory = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", directory, ROOT)
+    return sorted(directory.iterdir(), key=lambda path: path.suffix)
+
+
+def test_what_is_handed_out_works_in_an_environment_of_its_own(distributions):
+    """As docs/how-to/release.md says."""
+    source, wheel = distributions
     assert source.name.endswith(".tar.gz")
     assert "works in an environment of its own" in run(ROOT / ".ci" / "check-dist", wheel)
+
+
+def test_the_source_distribution_holds_what_the_repository_does(distributions):
+    listed = ["git", "-C", ROOT, "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    tracked = {name for name in run(*listed).split("\0") if name and (ROOT / name).exists()}
+    with tarfile.open(distributions[0]) as packed:
+        top, *_ = {member.name.partition("/")[0] for member in packed}
+        names = {member.name.removeprefix(f"{top}/") for member in packed if member.isfile()}
+    assert names - {"PKG-INFO"} == tracked
+
+
+def test_the_wheel_has_no_tests_and_the_licence(distributions):
+    with zipfile.ZipFile(distributions[1]) as packed:
+        names = packed.namelist()
+        (licence,) = (name for name in names if name.endswith(".dist-info/licenses/LICENSE"))
+        assert packed.read(licence) == (ROOT / "LICENSE").read_bytes()
+    parts = {part for name in names for part in Path(name).parts}
+    assert not parts & {"tests", "docs", "benchmarks", "__pycache__", ".work", "conftest.py"}
+    # Checks of detectors are part of the product, and they alone.
+    modules = {str(Path(name).parent) for name in names if Path(name).name.startswith("test_")}
+    assert modules == {"oodd_eval/plugins/conformance"}
+
+
+def test_metadata_say_what_the_project_says(distributions):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    with zipfile.ZipFile(distributions[1]) as packed:
+        (name,) = (n for n in packed.namelist() if n.endswith(".dist-info/METADATA"))
+        metadata = email.message_from_bytes(packed.read(name))
+    assert metadata["License-Expression"] == project["license"]
+    assert metadata["Summary"] == project["description"]
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert metadata.get_payload(decode=True).decode() == (ROOT / "README.md").read_text()
+    urls = dict(url.split(", ", 1) for url in metadata.get_all("Project-URL", []))
+    assert urls == project.get("urls", {})
+    assert all(address.startswith("https://") for address in urls.values())
+    labels = metadata.get_all("Classifier")
+    assert not {*labels} - classifiers
+    assert {*labels}.isdisjoint(deprecated_classifiers)
+    columns = re.search(r"\| extra \| for \| Python (.*) \|", (ROOT / "docs/index.md").read_text())
+    minors = [label.rpartition(" ")[2] for label in labels if ":: Python :: 3." in label]
+    assert minors == columns[1].split(" | ")
+
+
+def test_the_index_takes_both_distributions(distributions):
+    """Their metadata are valid, and the readme renders as it does on the page of a project."""
+    pytest.importorskip("twine", reason="it is among the dependencies of development (extra dev)")
+    said = run(sys.executable, "-m", "twine", "--no-color", "check", "--strict", *distributions)
+    assert said.count("PASSED") == 2
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):

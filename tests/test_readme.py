@@ -1,6 +1,7 @@
 """The README's commands and the names in the documents cannot rot."""
 
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
@@ -49,6 +50,36 @@ def test_commands_in_documents_parse(path, capsys):
     for line in re.findall(r"^(?:\$ )?(oodd-eval [^\n|`]*)$", blocks, re.MULTILINE):
         if "--config" not in line:  # a file that the page shows
             parse(line)
+
+
+def test_commands_without_installing_run_the_wheel_of_this_version():
+    from oodd_eval import __version__
+
+    lines = re.findall(r"^(?:uvx|pipx) .*$", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)
+    assert len(lines) == 4
+    for line in lines:
+        words = shlex.split(line)
+        source = words[words.index("--from" if words[0] == "uvx" else "--spec") + 1]
+        assert f"/oodd_eval-{__version__}-py3-none-any.whl" in source
+        assert re.match(r"\./|oodd-eval\[\w+\] @ https://", source)
+        parse(shlex.join(words[words.index("oodd-eval") :]))
+
+
+def test_the_citation_is_one_by_its_schema():
+    """Keys, and those that are required, of the Citation File Format 1.2.0."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    further = {"abstract", "commit", "contact", "date-released", "doi", "identifiers", "keywords",
+               "license", "license-url", "preferred-citation", "references", "repository",
+               "repository-artifact", "repository-code", "type", "url", "version"}  # fmt: skip
+    assert set(citation) <= {"cff-version", "message", "title", "authors"} | further
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["type"] in {"software", "dataset"}
+    for reference in citation["references"]:
+        assert {"authors", "title", "type"} <= set(reference)
+        assert all(i["type"] in {"doi", "other", "swh", "url"} for i in reference["identifiers"])
+    for author in (*citation["authors"], *citation["references"][0]["authors"]):
+        assert set(author) in ({"name"}, {"given-names", "family-names"})
 
 
 def test_citations_have_the_version():

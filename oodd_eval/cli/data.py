@@ -7,8 +7,9 @@ from typing import Any, Final
 
 import click
 
-from oodd_eval.cli import COUNT, DIRECTORY, Converted, Name, Names, Options, command
+from oodd_eval.cli import COUNT, DIRECTORY, Converted, Name, Names, Options, command, say
 from oodd_eval.cli.terminal import make_console, register_formats
+from oodd_eval.data import croissant
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.fetch import fetch as fetch_split
 from oodd_eval.data.importing import import_data, import_recipe
@@ -173,16 +174,37 @@ def fetch(options: Options) -> int:
     return 0
 
 
-@command("data export mini --format minari --output datasets")
+@command(
+    "data export mini --format minari --output datasets",
+    "data export mini --format croissant --output metadata",
+)
 @_split_argument
 @click.option(
-    "--format", required=True, type=click.Choice(["minari"]), help="minari: one dataset a part"
+    "--format",
+    required=True,
+    type=click.Choice(["minari", "croissant"]),
+    help="minari: one dataset a part; croissant: metadata for searches of data sets",
 )
-@click.option("--output", required=True, type=DIRECTORY, help="root of the datasets")
-@click.option("--env", default="all", type=Names("envs"), help="environments")
+@click.option("--output", type=DIRECTORY, help="root of the datasets; folder of the metadata")
+@click.option("--env", default="all", type=Names("envs"), help="environments, for minari")
+@click.option("--url", default="", help="where the split can be had, for croissant")
 def export(options: Options) -> int:
-    """Write a split in another project's format."""
+    """Write a split, or what it is, in another project's format.
+
+    Metadata are written beside the manifest unless --output names a folder.
+    """
     split = load_split(options.name)
+    if options.format == "croissant":
+        if options.env != "all":
+            raise UsageError("--env is for --format minari: metadata are of a whole split")
+        metadata = croissant.write(split, options.output, url=options.url)
+        if metadata.lacking:
+            keys = ", ".join(metadata.lacking)
+            say(f"not known, and required by searches for data sets: {keys}; add before publishing")
+        make_console().print(f"metadata of split {split.name} are in {metadata.path}")
+        return 0
+    if options.output is None or options.url:
+        raise UsageError("--format minari needs --output, and has no --url")
     environments = select("environment", options.env, split.environments)
     notes = make_console(quiet=options.verbosity < 0)
     written = export_split(split, options.output, environments=environments, progress=notes.print)

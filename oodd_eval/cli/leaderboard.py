@@ -14,10 +14,11 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expre
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_eval.errors import UsageError
+from oodd_eval.leaderboard import hub
 from oodd_eval.leaderboard import submit as submission
 from oodd_eval.leaderboard.build import STALE, differences, stale
 from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.entry import GRANTS, read_entries, suite_sections
+from oodd_eval.leaderboard.entry import GRANTS, read_entries, read_entry, suite_sections
 from oodd_eval.leaderboard.verify import EntryVerdict, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
@@ -103,11 +104,17 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
     type=click.Choice(["rows", "detectors", "none"]),
     help="curves of every row, of each detector's plainest row, or none",
 )
+@click.option(
+    "--hub",
+    metavar="OWNER/NAME",
+    help="also write results for a hub of models, on which the split has this id",
+)
 def submit(options: Options) -> int:
     """Write an entry from a results directory.
 
     Nothing is written, and the exit code is 1, when the entry would not be valid.
     """
+    dataset = hub.check_dataset(options.hub) if options.hub else ""
     names = ("id", "title", "submitter", "citation", "url", "caption")
     texts = {name: getattr(options, name) or "" for name in names}
     texts["citation"] = " ".join(texts["citation"].split())
@@ -133,6 +140,10 @@ def submit(options: Options) -> int:
             f"  git add {path}\n"
             "commit it alone, and open a pull request (docs/submitting.md)"
         )
+    if dataset:
+        files = hub.write(read_entry(path), Path(f"hub-{path.name}"), dataset)
+        listed = "\n".join(f"  {file}" for file in files) or "  none: each row lacks cells"
+        console.print(f"for the repository of each detector on the hub:\n{listed}")
     return 0
 
 

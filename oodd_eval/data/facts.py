@@ -302,6 +302,9 @@ _SPLITS: Final = (
     SplitDefinition("worlds-standard", 500, 200, 50, None, 9, "ladder", environments=WORLDS),
 )
 
+LICENCE: Final = "MIT"
+"""Of the published splits and of their policies, as of all that is in the repository."""
+
 SPLITS: Final = MappingProxyType({split.name: split for split in _SPLITS})
 """The published splits by name."""
 

@@ -62,6 +62,7 @@ def describe(
         text = "{train} training, {calibration} calibration and {test} nominal test episodes; "
     sizes = text.format_map(layout.part_sizes(manifest))
     lines = [f"split {split.name}, digest {split.digest}\n{sizes}{how}\nin {split.path}"]
+    lines += [f"licence {manifest['licence']}"] if "licence" in manifest else []
     returns: dict[str, Returns] = {}
     for name in split.environments:
         entry = manifest["environments"][name]

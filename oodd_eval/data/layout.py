@@ -26,7 +26,9 @@ from oodd_eval.data.facts import (
     ANOMALIES,
     ENVIRONMENTS,
     GROUPS,
+    LICENCE,
     NAME_PATTERN,
+    SPLITS,
     Group,
     LogFacts,
     Quantity,
@@ -381,6 +383,7 @@ def _manifest_schema() -> Any:
     recipe["fields"]["strengths"] = core_schema.typed_dict_field(strengths, required=False)
     named = {"name": text, "definition": recipe, "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
+    manifest["fields"]["licence"] = core_schema.typed_dict_field(text, required=False)
     return SchemaValidator(manifest, core_schema.CoreConfig(strict=True))
 
 
@@ -403,10 +406,12 @@ def write_manifest(
 ) -> None:
     """Write ``manifest.json`` in one step from the entries of environments, in their order.
 
-    A split that was not recorded has no definition, but a mapping with its name.
+    A split that was not recorded has no definition, but a mapping with its name. That of
+    a published split has the licence, which older ones lack, as it is no part of the digest.
     """
     recipe = definition.recipe if isinstance(definition, SplitDefinition) else dict(definition)
     imported = any("logs" in entry for entry in environments.values())
+    published = definition in SPLITS.values()
     manifest = {
         "schema": LOGS_SCHEMA if imported else SCHEMA,
         "name": recipe["name"],
@@ -414,6 +419,7 @@ def write_manifest(
         "generator": generator,
         "environments": environments,
         "digest": split_digest(environments, recipe),
+        **({"licence": LICENCE} if published else {}),
         "versions": versions,
     }
     write_text(directory / MANIFEST, json.dumps(manifest, indent=1) + "\n")
