@@ -1,6 +1,7 @@
 """A watchdog beside a robot: its promise, its alarm, its memory, and what it keeps on disk."""
 
 import json
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,13 @@ import pytest
 from helpers_live import first_alarm, rows_of, walk
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError, OutputError, TrajectoryError, UsageError
+from oodd_eval.errors import (
+    ContractError,
+    FittedStateError,
+    OutputError,
+    TrajectoryError,
+    UsageError,
+)
 from oodd_eval.live import Reading, Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
@@ -258,6 +265,70 @@ def test_a_detector_of_whole_episodes_works_slowly_and_says_so():
         assert watchdog.update(*row).score == pytest.approx(live.update(*row).score)
 
 
+class Bare:
+    """Two methods, and scores in a list of float32."""
+
+    def fit(self, nominal): ...
+
+    def score(self, x):
+        return list(np.abs(x.observations).sum(axis=1))
+
+
+class Scaled(LiveSize):
+    def __init__(self, seed, scale=1.0):
+        super().__init__()
+        self.seed, self.scale = seed, scale
+
+    def score(self, x):
+        return self.scale * super().score(x)
+
+
+def test_a_class_or_function_makes_the_detector(tmp_path):
+    expected = Watchdog.fit(LiveSize(), WIDE, CALIBRATION, statistic="score").rule
+    with pytest.warns(UserWarning, match="Bare has no update"):
+        watchdog = Watchdog.fit(Bare, WIDE, CALIBRATION, statistic="score")
+    assert watchdog.rule.threshold == pytest.approx(expected.threshold)
+    assert watchdog.update([4.0, -3.0, 0.5]).score == 7.5
+    parameters = {"scale": 2.0}
+    watchdog = Watchdog.fit(
+        Scaled, WIDE, CALIBRATION, statistic="score", seed=7, parameters=parameters
+    )
+    assert watchdog.rule.threshold == 2 * expected.threshold
+    assert watchdog._handle.detector.seed == 7
+    watchdog.save(tmp_path / "scaled")
+    loaded = Watchdog.load(tmp_path / "scaled", Scaled)
+    assert (loaded._handle.detector.seed, loaded._handle.detector.scale) == (7, 2.0)
+    with pytest.raises(UsageError, match="5 is no detector: expected a name"):
+        Watchdog.fit(5, WIDE, CALIBRATION)
+
+
+def test_scores_of_another_number_or_type_are_refused():
+    class Short(Bare):
+        def score(self, x):
+            return super().score(x)[1:]
+
+    class Complex(Bare):
+        def score(self, x):
+            return [score + 1j for score in super().score(x)]
+
+    for detector, message in (
+        (Short, r"shape \(119,\), expected \(120,\)"),
+        (Complex, "expected real"),
+    ):
+        with pytest.raises(ContractError, match=message):
+            Watchdog.fit(detector, WIDE, CALIBRATION)
+
+
+def test_a_watchdog_that_cannot_be_copied_names_the_attribute():
+    class Locked(LiveSize):
+        def fit(self, nominal):
+            self.lock = threading.Lock()
+
+    watchdog = Watchdog.fit(Locked, WIDE, CALIBRATION)
+    with pytest.raises(UsageError, match=r"Locked cannot be copied, .* attribute 'lock' .*__getst"):
+        watchdog.copy()
+
+
 def test_a_detector_of_whole_episodes_explains_its_alarm():
     class Explains(Size):
         def explain(self, x):
@@ -299,7 +370,7 @@ def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
 def test_an_instance_is_loaded_into_another(tmp_path):
     watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.save(tmp_path / "kept")
-    with pytest.raises(UsageError, match=r"load\(path, detector\) needs one"):
+    with pytest.raises(UsageError, match=r"load\(path, detector\) needs the class"):
         Watchdog.load(tmp_path / "kept")
     assert Watchdog.load(tmp_path / "kept", LiveSize()).rule == watchdog.rule
     watchdog.save(tmp_path / "kept")

@@ -1,6 +1,5 @@
 """A detector with its alarm beside a running robot: one call for each observation."""
 
-import copy
 import itertools
 import math
 import warnings
@@ -21,7 +20,7 @@ from oodd_eval.live.reading import Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
-from oodd_eval.plugins.contract import Detector, StorableDetector
+from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
 
 KIND: Final = "watchdog/3"
@@ -90,7 +89,7 @@ class Watchdog:
     @classmethod
     def fit(
         cls,
-        detector: str | Detector,
+        detector: AnyDetector,
         train: EnvironmentData | Sequence[Episode],
         calibration: Sequence[Episode] | None = None,
         alpha: float = 0.05,
@@ -116,8 +115,9 @@ class Watchdog:
         Parameters
         ----------
         detector
-            Name of an installed detector, or an unfitted one. Without ``update`` it scores the
-            whole episode so far at every row, which a warning says.
+            Name of an installed detector, a class or function that makes one, or an unfitted one.
+            Without ``update`` it scores the whole episode so far at every row, which a warning
+            says.
         train, calibration
             Nominal episodes to fit on, and others for the threshold, both in the order in which
             they were recorded: `Trajectory` objects, observations of shape (T + 1, D), or tuples of
@@ -151,7 +151,7 @@ class Watchdog:
             ``"cusum"``, ``"score"``, ``"ewma"``, ``"shiryaev-roberts"`` or ``"e-detector"``: see
             `GuaranteedAlarm`. Default what a named detector declares, else the CUSUM.
         seed, horizon, parameters
-            For the factory of a named detector.
+            For the factory of a named detector, or for the class or function.
 
         Returns
         -------
@@ -421,10 +421,15 @@ class Watchdog:
         -------
         Watchdog
             At the beginning of an episode.
+
+        Raises
+        ------
+        UsageError
+            When the detector has what cannot be copied, such as a lock.
         """
-        other = copy.deepcopy(self)
-        other.reset()
-        return other
+        twin = copied(self, self._handle.detector)
+        twin.reset()
+        return twin
 
     def save(self, path: str | Path) -> None:
         """Write everything into one file, which is whole or absent.
@@ -474,15 +479,16 @@ class Watchdog:
         write_state(Path(path), pack(whole, "the watchdog"))
 
     @classmethod
-    def load(cls, path: str | Path, detector: Detector | None = None) -> Self:
+    def load(cls, path: str | Path, detector: AnyDetector | None = None) -> Self:
         """Return the watchdog that `save` wrote.
 
         Parameters
         ----------
         path : str or Path
             The file that `save` was called with.
-        detector : Detector, optional
-            An instance with the parameters of the saved one, where that had no name.
+        detector : Detector, class or function, optional
+            An instance with the parameters of the saved one, or what makes it, where that had no
+            name.
 
         Returns
         -------
@@ -506,7 +512,7 @@ class Watchdog:
             raise FittedStateError(f"{what}: {problem:.500}; fit it anew") from error
 
     @classmethod
-    def _of(cls, whole: Mapping[str, Any], detector: Detector | None) -> Self:
+    def _of(cls, whole: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
         values, limits = whole["watchdog"], StreamLimits.of(whole)
         handle = DetectorHandle.from_state(values["made"], detector)

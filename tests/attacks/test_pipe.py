@@ -324,9 +324,15 @@ ENDS = {
     "unmasked": ("ok", ""),
     "tells": ("ok", ""),
     "leaves": ("ok", ""),
-    "wide": ("invalid", r"score returned an array of shape \(\d+, 40\), expected a numpy array of"),
+    "wide": (
+        "invalid",
+        r"score returned an array of shape \(\d+, 40\), expected \(\d+,\): one score",
+    ),
     "wordy": ("error", "ValueError: no no"),
-    "odd": ("invalid", "score returned ndarray of object"),
+    "odd": (
+        "invalid",
+        r"score returned ndarray of \[\('a', '<f8'\), \('b', 'O'\)\], expected real",
+    ),
 }
 
 
