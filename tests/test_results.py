@@ -4,13 +4,16 @@ import gc
 import json
 import re
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers_plugins import install
 
 from oodd_eval import DetectorSpec, evaluate, load_results, load_split
+from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.results.collection import Results
 
 CELLS = {"environments": ["hopper", "cartpole"], "anomalies": "iid,gravity"}
 
@@ -228,6 +231,31 @@ def test_results_are_a_sequence_of_records(results):
     html = results._repr_html_()
     assert "matched AUC" in html
     assert len(html) < 20_000
+
+
+def test_a_text_of_results_is_what_the_terminal_shows(tiny_split, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    arguments = ["--detector", "range,clock", "--split", str(tiny_split), "--env", "hopper"]
+    arguments += ["--anomaly", "iid,gravity", "--output", str(tmp_path / "out"), "-q"]
+    assert main(["run", *arguments]) == 0
+    capsys.readouterr()
+    assert main(["show", str(tmp_path / "out"), "--split", str(tiny_split)]) == 0
+    printed = capsys.readouterr().out
+    assert "Separability" in printed
+    for results in (
+        load_results(tmp_path / "out", tiny_split),
+        evaluate(["range", "clock"], tiny_split, environments="hopper", anomalies="iid,gravity"),
+    ):
+        assert f"{results}\n" == printed
+        assert repr(results) == f"Results(4 cells of {results[0].split}: range, clock; 4 ok)"
+    assert repr(results[:1]).startswith("Results(1 cell of tiny")
+    assert str(results[:0]) == repr(results[:0]) == "Results(0 cells of nothing: ; none)"
+
+
+def test_a_text_of_results_says_why_cells_failed(results):
+    failed = replace(results[0], status="error", reason="no mood", metrics={})
+    lines = str(Results([failed, results[1]])).splitlines()
+    assert lines[-2:] == [f"error: {failed.cell}: no mood", "1 ok, 1 error"]
 
 
 def test_means_are_those_of_the_tables(results):
