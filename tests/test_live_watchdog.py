@@ -343,6 +343,56 @@ def test_a_detector_of_whole_episodes_explains_its_alarm():
     assert str(reading) == "row 0: alarm, y 75%, since row 0"
 
 
+class Explaining(LiveSize):
+    """Scores are sums of sizes; a sensor's share is its part of the sum, since that row."""
+
+    def explain_last(self):
+        return self.row / self.row.sum(), self.rows - 1
+
+    def reset(self):
+        self.rows = 0
+
+    def update(self, observation, action=None):
+        self.row, self.rows = np.abs(observation).astype(np.float64) + 1e-9, self.rows + 1
+        return super().update(observation, action)
+
+
+@pytest.mark.parametrize("latch", [True, False])
+def test_an_episode_is_explained_by_its_alarms(latch):
+    watchdog = Watchdog.fit(
+        Explaining, WIDE, CALIBRATION, statistic="score", sensors=NAMES, latch=latch
+    )
+    rows = 0.1 * walk(3).observations
+    rows[20:25, 1] = [60, 61, 62, 61, 60]
+    rows[24, 0] = 90.0
+    rows[60] = [-30.0, 0.0, 90.0]
+    episode = Trajectory(rows, np.zeros((119, 1)))
+    watchdog.update([0.1, 0.2, 0.3])
+    first, second = watchdog.explain(episode)
+    assert (first.first, first.last, first.onset, next(iter(first.sensors))) == (20, 24, 20, "y")
+    assert first.sensors["y"] > 0.9
+    assert (second.first, second.last, second.onset) == (60, 60, 60)
+    assert second.sensors == pytest.approx({"z": 0.75, "x": 0.25, "y": 0.0}, abs=1e-6)
+    assert str(second) == "rows 60 to 60: alarm, z 75%, since row 60"
+    # It stays in the episode that it is in.
+    assert watchdog.update([0.2, 0.1, 0.3]).t == 1
+    assert watchdog.settings.latch is latch
+    assert watchdog.explain(Trajectory(0.1 * walk(4).observations, np.zeros((119, 1)))) == []
+    with pytest.raises(TrajectoryError, match="the episode is a ndarray, expected a Trajectory"):
+        watchdog.explain(rows)
+
+
+def test_an_explained_episode_names_faults_of_sensors(watchdog):
+    x = walk(3)
+    rows = x.observations.copy()
+    rows[70:, 2] = rows[69, 2]
+    (alarm,) = watchdog.explain(Trajectory(rows, x.actions))
+    assert (alarm.faults, alarm.sensors, alarm.onset) == ({"z": "frozen"}, {"z": 1.0}, 70)
+    assert 70 < alarm.first < 100
+    assert alarm.last == 119
+    assert str(alarm) == f"rows {alarm.first} to 119: alarm, z frozen, since row 70"
+
+
 def test_detectors_are_shown_actions_if_they_look_at_them():
     watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.update(np.zeros(3))

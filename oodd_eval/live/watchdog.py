@@ -13,10 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import FittedStateError, OoddError, PromiseWarning, UsageError
+from oodd_eval.errors import (
+    FittedStateError,
+    OoddError,
+    PromiseWarning,
+    TrajectoryError,
+    UsageError,
+)
 from oodd_eval.live.handle import DetectorHandle, streaming
 from oodd_eval.live.nominal import Episode, Nominal, NominalData
-from oodd_eval.live.reading import Reading, RunLength
+from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
@@ -334,10 +340,55 @@ class Watchdog:
         -------
         list of Reading
             One for each observation. The watchdog is at the end of the episode then.
+
+        Raises
+        ------
+        TrajectoryError
+            For what is no `Trajectory`.
         """
+        if not isinstance(episode, Trajectory):
+            raise TrajectoryError(
+                f"the episode is a {type(episode).__name__}, expected a Trajectory, such as "
+                "Trajectory(observations - offsets, actions)"
+            )
         self.reset()
         rows = zip(episode.observations, [None, *episode.actions], strict=True)
         return [self._judged(row, action, None, None) for row, action in rows]
+
+    def explain(self, episode: Trajectory) -> list[EpisodeAlarm]:
+        """Return where a recorded episode alarms, which sensors are at fault, and since when.
+
+        An alarm lasts as long as its cause here, whatever `latch` says. A copy of the watchdog
+        judges, so that this one stays in the episode that it is in.
+
+        Parameters
+        ----------
+        episode
+            As for `replay`.
+
+        Returns
+        -------
+        list of EpisodeAlarm
+            In the order of their rows; empty where nothing alarms.
+
+        Raises
+        ------
+        TrajectoryError
+            For what is no `Trajectory`.
+        UsageError
+            When the detector has what cannot be copied.
+        """
+        twin = self.copy()
+        twin.settings = replace(self.settings, latch=False)
+        alarms = []
+        for alarmed, group in itertools.groupby(
+            twin.replay(episode), lambda reading: reading.alarm
+        ):
+            if alarmed:
+                first, *rest = group
+                last = rest[-1].t if rest else first.t
+                alarms.append(EpisodeAlarm(first.t, last, first.onset, first.sensors, first.faults))
+        return alarms
 
     def _judged(
         self,
