@@ -247,6 +247,8 @@ def test_endless_operation_keeps_its_promise_within_the_interval(name, episodes,
         ({"sensors": ["x"]}, r"1 names of sensors \['x'\], expected 3"),
         ({"sensors": ["x", "x", "y"]}, "all unlike"),
         ({"statistic": "sum"}, "expected one of 'cusum', 'score'"),
+        ({"seed": True}, "seed is True, expected a whole number of at least 0"),
+        ({"horizon": 0}, "horizon is 0, expected a whole number of at least 1"),
     ],
 )
 def test_what_cannot_be_promised_is_said_when_fitting(arguments, message):
@@ -291,7 +293,7 @@ def test_a_class_or_function_makes_the_detector(tmp_path):
     assert watchdog.update([4.0, -3.0, 0.5]).score == 7.5
     parameters = {"scale": 2.0}
     watchdog = Watchdog.fit(
-        Scaled, WIDE, CALIBRATION, statistic="score", seed=7, parameters=parameters
+        Scaled, WIDE, CALIBRATION, statistic="score", seed=np.int8(7), parameters=parameters
     )
     assert watchdog.rule.threshold == 2 * expected.threshold
     assert watchdog._handle.detector.seed == 7

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, UsageError
 from oodd_eval.metrics.accumulation import STATISTICS, AlarmKind
+from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,
     Detector,
@@ -53,6 +55,8 @@ class DetectorHandle:
         baseline: int = 0,
     ) -> Self:
         """Make a detector of a name or class, or take an instance, for so many baseline rows."""
+        seed = read("seed", partial(whole_number, least=0), seed)
+        horizon = read("horizon", partial(whole_number, least=1), horizon)
         kind = next((one for one in STATISTICS if one == statistic), None)
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
