@@ -253,12 +253,20 @@ def _plain(parameters: Mapping[str, Any]) -> dict[str, Any]:
         raise UsageError(f"{parameters!r:.80}, {expected}")
     if {"seed", "horizon"} & parameters.keys():
         raise UsageError(f"{parameters!r:.80}, expected no seed and horizon: they stand beside it")
-    plain = {n: v.item() if isinstance(v, np.generic) else v for n, v in parameters.items()}
+    plain: dict[str, Any] = _without_numpy(parameters)
     try:
         json.dumps(plain)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{parameters!r:.80}, {expected} ({error})") from None
     return plain
+
+
+def _without_numpy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_numpy(one) for name, one in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(_without_numpy, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 class _Bar:

@@ -185,13 +185,20 @@ class Unasked(Bare):
         raise AssertionError("it was made although an argument is wrong")
 
 
+class Weighted(Size):
+    def __init__(self, *, weights):
+        super().__init__(weights["a"][0])
+
+
 def test_numbers_of_numpy_are_numbers(tiny_split):
     numbers = {"seed": np.arange(2), "horizon": np.int8(2), "limit": np.uint16(2)}
     python = {"seed": range(2), "horizon": 2, "limit": 2}
     texts = []
-    for chosen, scale in ((numbers, np.float32(2.5)), (python, 2.5)):
+    weights = {"a": [np.float32(2.5), 1], "b": (np.int64(3),)}, {"a": [2.5, 1], "b": (3,)}
+    for chosen, values in zip((numbers, python), weights, strict=True):
+        parameters = {"weights": values}
         results = evaluate(
-            Size, tiny_split, environments="hopper", parameters={"scale": scale}, **chosen
+            Weighted, tiny_split, environments="hopper", parameters=parameters, **chosen
         )
         assert [(r.seed, r.limit) for r in results[:: len(results) // 2]] == [(0, 2), (1, 2)]
         texts.append([{**json.loads(r.to_json()), "provenance": 0} for r in results])
