@@ -109,6 +109,7 @@ def test_a_trajectory_shorter_than_the_block_may_be_undefined_throughout():
         (np.zeros(6, complex), "returned ndarray of complex128 .* expected real numbers"),
         (np.zeros(6, "datetime64[s]"), "returned ndarray of datetime64"),
         ("000000", "returned str for"),
+        (np.ma.masked_less(np.arange(6.0), 2), "returned a masked array for hopper.* expected NaN"),
         (None, "returned NoneType for"),
         ((0.0 for _ in range(6)), "returned generator for"),
         ([0.0] * 5, "returned 5 scores"),

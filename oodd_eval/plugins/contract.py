@@ -355,16 +355,10 @@ def _fails(attribute: tuple[str, object]) -> bool:
 def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
     """Return unchecked scores of some trajectories, scored all at once if the detector can.
 
-    Raises `ContractError` when ``score_many`` returns another number of score arrays, and for
-    masked values.
+    Raises `ContractError` when ``score_many`` returns another number of score arrays.
     """
     score_many = getattr(detector, "score_many", None)
     scores = list(score_many(chunk)) if score_many else [detector.score(x) for x in chunk]
-    # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
-    masked = sys.modules.get("numpy.ma")
-    if masked and any(masked.is_masked(one) for one in scores):
-        # Only its data would be sent on, with whatever stands where it is masked.
-        raise ContractError("score returned a masked array, expected NaN where it is undefined")
     if len(scores) != len(chunk):
         expected = f"{len(chunk)}: one for each trajectory"
         raise ContractError(f"score_many returned {len(scores)} score arrays, expected {expected}")
@@ -378,6 +372,12 @@ def float_scores(returned: object, subject: str = "score", where: str = "") -> S
     """
     import numpy as np  # noqa: PLC0415  see above
 
+    # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
+    masked = sys.modules.get("numpy.ma")
+    if masked and masked.is_masked(returned):
+        # Only its data would go on, with whatever stands where it is masked.
+        expected = "expected NaN where it is undefined"
+        raise ContractError(f"{subject} returned a masked array{where}, {expected}")
     kind, array = type(returned).__name__, None
     if isinstance(returned, list | tuple) or hasattr(returned, "__array__"):
         try:
