@@ -1,20 +1,32 @@
 """`evaluate` and `load_results`: the whole harness in one call, for scripts and notebooks."""
 
-import copy
 import inspect
+import json
+import os
 import re
 import shutil
 import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import PromiseWarning, UsageError
+from oodd_eval.names import each_once, read, whole_number
 from oodd_eval.plugins import hookimpl
-from oodd_eval.plugins.contract import Detector, DetectorSpec
+from oodd_eval.plugins.contract import (
+    AnyDetector,
+    Detector,
+    DetectorSpec,
+    accepted,
+    copied,
+    factory_of,
+)
 from oodd_eval.plugins.discovery import Offer, Plugins, discover
 from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.plugins.specs import check_detector_spec
@@ -26,7 +38,7 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import run
 
-Tried: TypeAlias = str | DetectorSpec | Detector | Callable[..., Detector]
+Tried: TypeAlias = AnyDetector | DetectorSpec
 """A detector for `evaluate`: a name, a spec, a class or function that makes one, an instance."""
 
 
@@ -55,9 +67,9 @@ def evaluate(
     detector
         One or several of: the name of an installed detector, which runs in worker processes, as on
         the command line. A `DetectorSpec`; a class or function called as ``factory(seed=...,
-        horizon=..., **parameters)``; an unfitted detector, of which every fit is a copy. These run
-        in this process. A class's, function's and instance's detector is shown actions, a spec's
-        if it says so.
+        horizon=..., **parameters)``, without seed or horizon if it does not take them; an unfitted
+        detector, of which every fit is a copy. These run in this process. A class's, function's and
+        instance's detector is shown actions, a spec's if it says so.
     split
         Name or path of a split, or an opened one.
     environments, anomalies
@@ -92,7 +104,7 @@ def evaluate(
     Raises
     ------
     UsageError
-        For unknown names, and for what is no detector.
+        For unknown names, what is no detector, and arguments of another type or out of bounds.
     ContractError
         When a detector in this process breaks the score contract.
 
@@ -107,8 +119,15 @@ def evaluate(
     >>> results[0].value("auc"), results.mean("auc_matched")  # doctest: +SKIP
     (1.0, 0.5)
     """
+    for name, value in (("split", split), ("output", output or "")):
+        if not isinstance(value, str | os.PathLike | Split):
+            raise UsageError(f"{name} is {value!r:.80}, expected a name or path")
     opened = split if isinstance(split, Split) else load_split(split)
-    arguments = dict(parameters or {})
+    arguments = read("parameters", _plain, parameters or {})
+    horizon = read("horizon", _count, horizon)
+    seeds = read("seed", partial(each_once, least=0), seed)
+    limit = None if limit is None else read("limit", _count, limit)
+    jobs = None if jobs is None else read("jobs", _count, jobs)
     # A detector may be a sequence, too.
     several = isinstance(detector, list | tuple)
     tried: Sequence[Tried] = detector if several else [detector]  # type: ignore[assignment,list-item]
@@ -119,7 +138,9 @@ def evaluate(
     names = [_offer(plugins, d, arguments) for d in tried]
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
-    selected = opened.select(_listed(environments), _listed(anomalies))
+    selected = opened.select(
+        read("environments", _listed, environments), read("anomalies", _listed, anomalies)
+    )
     plan = make_plan(
         plugins,
         split=opened,
@@ -127,15 +148,16 @@ def evaluate(
         environments=selected[0],
         anomalies=selected[1],
         horizons=[horizon],
-        seeds=[seed] if isinstance(seed, int) else list(seed),
+        seeds=seeds,
         parameters=arguments,
         limit=limit,
         rolling=rolling,
     )
-    path = Path(tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output)
-    directory = ResultsDirectory(path)
+    directory = ResultsDirectory(
+        tempfile.mkdtemp(prefix="oodd-eval-") if output is None else output
+    )
     if output is None:
-        weakref.finalize(directory, shutil.rmtree, path, ignore_errors=True)
+        weakref.finalize(directory, shutil.rmtree, directory.path, ignore_errors=True)
     observers = [_Bar()] if progress else []
     settings = RunSettings(jobs=jobs, row_metrics=row_metrics)
     for name, finding in doubts_before(plan, opened):
@@ -186,20 +208,13 @@ def _spec_of(
     detector: Detector | Callable[..., Detector], arguments: Mapping[str, Any]
 ) -> DetectorSpec:
     """Return the spec of a class, a function or an unfitted detector."""
-    factory: Callable[..., Detector]
-    if isinstance(detector, Detector) and not isinstance(detector, type):
-        prototype, name = detector, type(detector).__name__
-        if arguments:
-            raise UsageError(f"parameters {[*arguments]} for an instance of {name}: expected none")
-        factory = lambda **_: copy.deepcopy(prototype)  # noqa: E731
-    elif callable(detector):
-        factory, name = detector, getattr(detector, "__name__", type(detector).__name__)
-        _check_call(factory, name, arguments)
-    else:
-        raise UsageError(
-            f"{detector!r:.80} is no detector: expected a name, a DetectorSpec, a class or "
-            "function that makes one, or an object with fit(nominal) and score(trajectory)"
-        )
+    factory = factory_of(detector)
+    name = getattr(detector, "__name__", type(detector).__name__)
+    if factory is not detector and arguments:
+        raise UsageError(f"parameters {[*arguments]} for an instance of {name}: expected none")
+    _check_call(factory, name, arguments)
+    if factory is not detector:
+        copied(detector)  # says at once what prevents it
     name = re.sub("[^a-z0-9]+", "-", name.lower())[:64].strip("-") or "detector"
     parameters = declared_by(arguments)
     return DetectorSpec(name, factory, "", inputs="observations+actions", parameters=parameters)
@@ -207,21 +222,51 @@ def _spec_of(
 
 def _check_call(factory: Callable[..., Detector], name: str, arguments: Mapping[str, Any]) -> None:
     """Raise `UsageError` unless a factory takes the arguments that it will be called with."""
+    call = accepted(factory, seed=0, horizon=1) | dict(arguments)
     try:
         signature = inspect.signature(factory)
     except ValueError:  # of some compiled functions
         return
     try:
-        signature.bind(seed=0, horizon=1, **arguments)
+        signature.bind(**call)
     except TypeError as error:
         raise UsageError(
-            f"{name} cannot be called as {name}(seed=..., horizon=..., ...): {error}; let it take "
-            "them, or hand over an object that is made already"
+            f"{name} cannot be called as {name}({', '.join(f'{n}=...' for n in call)}): {error}; "
+            "name the parameters, or hand over an object that is made already"
         ) from None
 
 
+_count = partial(whole_number, least=1)
+
+
 def _listed(names: str | Iterable[str]) -> str:
-    return names if isinstance(names, str) else ",".join(names)
+    several = [names] if isinstance(names, str) or not isinstance(names, Iterable) else [*names]
+    if all(isinstance(name, str) for name in several):
+        return ",".join(several)
+    raise UsageError(f"{names!r:.80}, expected names, or a text with commas between them")
+
+
+def _plain(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters as records hold them, with Python's numbers in place of NumPy's."""
+    expected = "expected values that JSON knows by name, and other objects in a factory's closure"
+    if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
+        raise UsageError(f"{parameters!r:.80}, {expected}")
+    if {"seed", "horizon"} & parameters.keys():
+        raise UsageError(f"{parameters!r:.80}, expected no seed and horizon: they stand beside it")
+    plain: dict[str, Any] = _without_numpy(parameters)
+    try:
+        json.dumps(plain)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{parameters!r:.80}, {expected} ({error})") from None
+    return plain
+
+
+def _without_numpy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_numpy(one) for name, one in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(_without_numpy, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 class _Bar:

@@ -3,13 +3,16 @@
 import ast
 import fnmatch
 import json
+import operator
 import re
 from collections.abc import Callable, Collection, Iterable
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from oodd_eval.errors import UnknownNameError, UsageError
 
 Predicate = Callable[[str], bool]
+Value = TypeVar("Value")
+Read = TypeVar("Read")
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
 SPEC_NAME: Final = DETECTOR_NAME + r"(:\w{1,64}(\.\w{1,64}){0,7})?"
@@ -83,6 +86,47 @@ def whole_numbers(text: str, *, least: int) -> list[int]:
     if min(numbers) >= least:
         return numbers
     raise UsageError(f"{text!r}, expected whole numbers of at least {least}, separated by commas")
+
+
+def whole_number(value: object, *, least: int) -> int:
+    """Return a whole number of Python or NumPy; `UsageError` when it is none, or below `least`.
+
+    It has at most 18 digits, as that of a text.
+    """
+    try:
+        number = -1 if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if least <= number < 10**18:
+        return number
+    raise UsageError(f"{value!r:.80}, expected a whole number of at least {least}")
+
+
+def each_once(values: object, *, least: int) -> list[int]:
+    """Return one or several whole numbers as `whole_number` does; `UsageError` for equal ones.
+
+    >>> each_once(3, least=0), each_once(range(2), least=0)
+    ([3], [0, 1])
+    """
+    try:
+        several = list(values)  # type: ignore[call-overload]
+    except TypeError:
+        several = [values]
+    try:
+        numbers = [whole_number(value, least=least) for value in several]
+    except UsageError:
+        numbers = []
+    if numbers and len({*numbers}) == len(numbers):
+        return numbers
+    raise UsageError(f"{values!r:.80}, expected whole numbers of at least {least}, each once")
+
+
+def read(name: str, reader: Callable[[Value], Read], value: Value) -> Read:
+    """Return what a reader makes of the value of an option or argument; name it in `UsageError`."""
+    try:
+        return reader(value)
+    except UsageError as error:
+        raise UsageError(f"{name} is {error}") from None
 
 
 def seconds(text: str) -> float:

@@ -68,11 +68,13 @@ def run_checks(
     Parameters
     ----------
     factory
-        A detector's factory, or better its `DetectorSpec`, which tells the declared parameters too.
+        A detector's class or function, an unfitted one, or better its `DetectorSpec`, which tells
+        the declared parameters too.
     expected_failures
         Names of checks that are known to fail, with the reason; one that passes is not all right.
     arguments
-        ``horizon`` (1), ``seed`` (0) and ``parameters`` that the factory is called with.
+        ``horizon`` (1), ``seed`` (0) and ``parameters`` that the factory is called with, without
+        the first two where it does not take them.
 
     Returns
     -------

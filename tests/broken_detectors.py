@@ -136,10 +136,10 @@ class NoScore:
     def fit(self, nominal): ...
 
 
-@breaks("factory", "the factory, called with seed=0, horizon=1, raised")
-class NoHorizon(Good):
-    def __init__(self, *, seed):
-        super().__init__(seed=seed)
+@breaks("factory", "the factory, called with seed=0, raised")
+class NeedsSize(Good):
+    def __init__(self, *, seed, size):
+        super().__init__(seed=seed, power=size)
 
 
 @breaks("unknown-parameter", "the factory accepted no_such_parameter=1 without a word:")

@@ -1,11 +1,14 @@
 """The score contract, and the messages of those who break it."""
 
+import functools
+import threading
+
 import numpy as np
 import pytest
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, OoddError, UnknownNameError
-from oodd_eval.plugins.contract import check_scores
+from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
+from oodd_eval.plugins.contract import accepted, check_scores, copied
 
 EPISODE = Trajectory(np.zeros((6, 2)), np.zeros((5, 1)))
 
@@ -14,6 +17,74 @@ def check(scores, horizon=1, warm_up=0):
     return check_scores(
         scores, EPISODE, horizon=horizon, warm_up=warm_up, detector="rf", where="hopper/test[7]"
     )
+
+
+@pytest.mark.parametrize(
+    "scores",
+    [
+        [0, 1, 0, 1, 1, 0],
+        (0.0, 1.0, 0.0, 1.0, 1.0, 0.0),
+        [np.float32(0), True, 0, 1.0, np.int8(1), False],
+        *(np.array([0, 1, 0, 1, 1, 0], dtype) for dtype in ("f2", "f4", ">f8", "i1", "u8", "?")),
+        np.array([0, 1, 0, 1, 1, 0], np.longdouble),
+    ],
+    ids=repr,
+)
+def test_scores_of_any_real_type_become_float64(scores):
+    checked = check(scores)
+    assert (type(checked), checked.dtype.str) == (np.ndarray, np.dtype("f8").str)
+    assert checked.tolist() == [0.0, 1.0, 0.0, 1.0, 1.0, 0.0]
+
+
+def test_nan_of_other_types_is_undefined_too():
+    assert np.isnan(check([float("nan"), 1, 2, 3, 4, 5])[0])
+    assert np.isnan(check(np.array([np.nan, 1, 2, 3, 4, 5], np.float32))[0])
+
+
+class Seeded:
+    def __init__(self, seed):
+        self.seed = seed
+
+
+class Any:
+    def __init__(self, **arguments):
+        self.arguments = arguments
+
+
+def test_factories_get_what_they_take():
+    def both(*, horizon, seed, power=1):
+        return horizon, seed
+
+    assert accepted(Seeded, seed=3, horizon=2) == {"seed": 3}
+    assert accepted(object, seed=3, horizon=2) == {}
+    assert accepted(lambda *rows: rows, seed=3, horizon=2) == {}
+    assert accepted(both, seed=3, horizon=2) == {"seed": 3, "horizon": 2}
+    assert accepted(functools.partial(both, seed=1), horizon=2) == {"horizon": 2}
+    for unknown in (Any, lambda **_: 0):
+        assert accepted(unknown, seed=3, horizon=2) == {"seed": 3, "horizon": 2}
+
+
+class Locked:
+    def __init__(self, *parts):
+        self.name, self.parts = "x", {"parts": parts}
+
+    def fit(self, nominal): ...
+
+    def score(self, x):
+        return [0.0] * len(x)
+
+
+def test_what_cannot_be_copied_is_named(tmp_path):
+    with (tmp_path / "log").open("w") as file:
+        for part, kind in ((threading.Lock(), "_thread.lock"), (file, "TextIOWrapper")):
+            with pytest.raises(
+                UsageError, match=rf"Locked .* its attribute 'parts' .*{kind}.*: pa"
+            ):
+                copied(Locked(part))
+    detector = Locked([1.0])
+    twin = copied(detector)
+    twin.parts["parts"][0].append(2.0)
+    assert detector.parts == {"parts": ([1.0],)}
 
 
 @pytest.mark.parametrize("undefined", [0, 1, 3])
@@ -32,8 +103,17 @@ def test_a_trajectory_shorter_than_the_block_may_be_undefined_throughout():
     [
         (np.zeros(5), r"'rf' returned 5 scores for hopper/test\[7\], expected 6 \(one per obs"),
         (np.zeros((6, 1)), r"shape \(6, 1\) .* expected \(6,\)"),
-        ([0.0] * 6, "returned list"),
-        (np.zeros(6, np.float32), "float32 scores .* expected float64"),
+        ([[0.0], [0.0, 1.0]], r"list that is no array .* expected real numbers"),
+        (["0"] * 6, "'rf' returned list of <U1 for hopper/test.7., expected real numbers"),
+        ([0.0] * 5 + [None], "returned list of object"),
+        (np.zeros(6, complex), "returned ndarray of complex128 .* expected real numbers"),
+        (np.zeros(6, "datetime64[s]"), "returned ndarray of datetime64"),
+        ("000000", "returned str for"),
+        (np.ma.masked_less(np.arange(6.0), 2), "returned a masked array for hopper.* expected NaN"),
+        (None, "returned NoneType for"),
+        ((0.0 for _ in range(6)), "returned generator for"),
+        ([0.0] * 5, "returned 5 scores"),
+        (np.array([0, 0, np.inf, 0, 0, 0], np.float16), "inf at t = 2"),
         (np.array([0, 0, np.nan, 0, 0, 0]), "nan at t = 2"),
         (np.array([np.inf, 0, 0, 0, 0, 0]), "inf at t = 0"),
         (np.array([0, 0, 0, 0, 0, -np.inf]), "-inf at t = 5"),

@@ -1,6 +1,7 @@
 """A watchdog beside a robot: its promise, its alarm, its memory, and what it keeps on disk."""
 
 import json
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,13 @@ import pytest
 from helpers_live import first_alarm, rows_of, walk
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import FittedStateError, OutputError, TrajectoryError, UsageError
+from oodd_eval.errors import (
+    ContractError,
+    FittedStateError,
+    OutputError,
+    TrajectoryError,
+    UsageError,
+)
 from oodd_eval.live import Reading, Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
@@ -240,6 +247,8 @@ def test_endless_operation_keeps_its_promise_within_the_interval(name, episodes,
         ({"sensors": ["x"]}, r"1 names of sensors \['x'\], expected 3"),
         ({"sensors": ["x", "x", "y"]}, "all unlike"),
         ({"statistic": "sum"}, "expected one of 'cusum', 'score'"),
+        ({"seed": True}, "seed is True, expected a whole number of at least 0"),
+        ({"horizon": 0}, "horizon is 0, expected a whole number of at least 1"),
     ],
 )
 def test_what_cannot_be_promised_is_said_when_fitting(arguments, message):
@@ -258,6 +267,70 @@ def test_a_detector_of_whole_episodes_works_slowly_and_says_so():
         assert watchdog.update(*row).score == pytest.approx(live.update(*row).score)
 
 
+class Bare:
+    """Two methods, and scores in a list of float32."""
+
+    def fit(self, nominal): ...
+
+    def score(self, x):
+        return list(np.abs(x.observations).sum(axis=1))
+
+
+class Scaled(LiveSize):
+    def __init__(self, seed, scale=1.0):
+        super().__init__()
+        self.seed, self.scale = seed, scale
+
+    def score(self, x):
+        return self.scale * super().score(x)
+
+
+def test_a_class_or_function_makes_the_detector(tmp_path):
+    expected = Watchdog.fit(LiveSize(), WIDE, CALIBRATION, statistic="score").rule
+    with pytest.warns(UserWarning, match="Bare has no update"):
+        watchdog = Watchdog.fit(Bare, WIDE, CALIBRATION, statistic="score")
+    assert watchdog.rule.threshold == pytest.approx(expected.threshold)
+    assert watchdog.update([4.0, -3.0, 0.5]).score == 7.5
+    parameters = {"scale": 2.0}
+    watchdog = Watchdog.fit(
+        Scaled, WIDE, CALIBRATION, statistic="score", seed=np.int8(7), parameters=parameters
+    )
+    assert watchdog.rule.threshold == 2 * expected.threshold
+    assert watchdog._handle.detector.seed == 7
+    watchdog.save(tmp_path / "scaled")
+    loaded = Watchdog.load(tmp_path / "scaled", Scaled)
+    assert (loaded._handle.detector.seed, loaded._handle.detector.scale) == (7, 2.0)
+    with pytest.raises(UsageError, match="5 is no detector: expected a name"):
+        Watchdog.fit(5, WIDE, CALIBRATION)
+
+
+def test_scores_of_another_number_or_type_are_refused():
+    class Short(Bare):
+        def score(self, x):
+            return super().score(x)[1:]
+
+    class Complex(Bare):
+        def score(self, x):
+            return [score + 1j for score in super().score(x)]
+
+    for detector, message in (
+        (Short, r"shape \(119,\), expected \(120,\)"),
+        (Complex, "expected real"),
+    ):
+        with pytest.raises(ContractError, match=message):
+            Watchdog.fit(detector, WIDE, CALIBRATION)
+
+
+def test_a_watchdog_that_cannot_be_copied_names_the_attribute():
+    class Locked(LiveSize):
+        def fit(self, nominal):
+            self.lock = threading.Lock()
+
+    watchdog = Watchdog.fit(Locked, WIDE, CALIBRATION)
+    with pytest.raises(UsageError, match=r"Locked cannot be copied, .* attribute 'lock' .*__getst"):
+        watchdog.copy()
+
+
 def test_a_detector_of_whole_episodes_explains_its_alarm():
     class Explains(Size):
         def explain(self, x):
@@ -270,6 +343,56 @@ def test_a_detector_of_whole_episodes_explains_its_alarm():
     assert list(reading.sensors) == ["y", "z", "x"]
     assert reading.sensor == "y"
     assert str(reading) == "row 0: alarm, y 75%, since row 0"
+
+
+class Explaining(LiveSize):
+    """Scores are sums of sizes; a sensor's share is its part of the sum, since that row."""
+
+    def explain_last(self):
+        return self.row / self.row.sum(), self.rows - 1
+
+    def reset(self):
+        self.rows = 0
+
+    def update(self, observation, action=None):
+        self.row, self.rows = np.abs(observation).astype(np.float64) + 1e-9, self.rows + 1
+        return super().update(observation, action)
+
+
+@pytest.mark.parametrize("latch", [True, False])
+def test_an_episode_is_explained_by_its_alarms(latch):
+    watchdog = Watchdog.fit(
+        Explaining, WIDE, CALIBRATION, statistic="score", sensors=NAMES, latch=latch
+    )
+    rows = 0.1 * walk(3).observations
+    rows[20:25, 1] = [60, 61, 62, 61, 60]
+    rows[24, 0] = 90.0
+    rows[60] = [-30.0, 0.0, 90.0]
+    episode = Trajectory(rows, np.zeros((119, 1)))
+    watchdog.update([0.1, 0.2, 0.3])
+    first, second = watchdog.explain(episode)
+    assert (first.first, first.last, first.onset, next(iter(first.sensors))) == (20, 24, 20, "y")
+    assert first.sensors["y"] > 0.9
+    assert (second.first, second.last, second.onset) == (60, 60, 60)
+    assert second.sensors == pytest.approx({"z": 0.75, "x": 0.25, "y": 0.0}, abs=1e-6)
+    assert str(second) == "rows 60 to 60: alarm, z 75%, since row 60"
+    # It stays in the episode that it is in.
+    assert watchdog.update([0.2, 0.1, 0.3]).t == 1
+    assert watchdog.settings.latch is latch
+    assert watchdog.explain(Trajectory(0.1 * walk(4).observations, np.zeros((119, 1)))) == []
+    with pytest.raises(TrajectoryError, match="the episode is a ndarray, expected a Trajectory"):
+        watchdog.explain(rows)
+
+
+def test_an_explained_episode_names_faults_of_sensors(watchdog):
+    x = walk(3)
+    rows = x.observations.copy()
+    rows[70:, 2] = rows[69, 2]
+    (alarm,) = watchdog.explain(Trajectory(rows, x.actions))
+    assert (alarm.faults, alarm.sensors, alarm.onset) == ({"z": "frozen"}, {"z": 1.0}, 70)
+    assert 70 < alarm.first < 100
+    assert alarm.last == 119
+    assert str(alarm) == f"rows {alarm.first} to 119: alarm, z frozen, since row 70"
 
 
 def test_detectors_are_shown_actions_if_they_look_at_them():
@@ -299,7 +422,7 @@ def test_what_was_saved_goes_on_as_it_was(fitted, watchdog, tmp_path):
 def test_an_instance_is_loaded_into_another(tmp_path):
     watchdog = Watchdog.fit(LiveSize(), WIDE, CALIBRATION)
     watchdog.save(tmp_path / "kept")
-    with pytest.raises(UsageError, match=r"load\(path, detector\) needs one"):
+    with pytest.raises(UsageError, match=r"load\(path, detector\) needs the class"):
         Watchdog.load(tmp_path / "kept")
     assert Watchdog.load(tmp_path / "kept", LiveSize()).rule == watchdog.rule
     watchdog.save(tmp_path / "kept")

@@ -207,7 +207,16 @@ def test_settings_and_horizons_are_rows_of_their_own():
     ])  # fmt: skip
     assert [str(e) for e in board.entries] == ["riqn", "riqn[h=10]", "riqn[members=1]"]
     assert board.horizons == [1, 10]
-    assert tables.anomaly_groups(board)[1].header[2:] == ["riqn", "AVG"]
+    assert tables.anomaly_groups(board)[1].header[1:] == ["riqn", "AVG"]
+
+
+def test_of_one_environment_table_five_says_the_name_once():
+    (table,) = tables.anomaly_groups(Board([make_record(environment="arm")]))
+    assert table.title.endswith(", arm")
+    assert table.header == ["Result", "riqn", "AVG"]
+    assert [row[0] for row in table.rows] == ["AUC", "Delay", "FAR"]
+    assert "arm" not in str(table.rows)
+    assert table.transposed().header == ["Result", "AUC", "Delay", "FAR"]
 
 
 def test_no_table_mixes_digests_protocols_or_limits():
@@ -282,10 +291,12 @@ def test_notes_name_the_split_and_what_is_missing():
         "Split mini, digest abababababab, protocol 1",
         "first 3 trajectories",
         "sensor anomalies are without calibration, shutdown.",
-        "uncommitted changes of oodd-eval's checkout: 1 cells",
+        "uncommitted changes of oodd-eval's checkout: 1 cell.",
     ):
         assert phrase in notes
     assert "uncommitted" not in " ".join(tables.notes(Board(records[:1])))
+    records[0].provenance["git_dirty"] = True
+    assert "oodd-eval's checkout: 2 cells." in " ".join(tables.notes(Board(records)))
 
 
 ALARMS = {

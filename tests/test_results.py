@@ -1,13 +1,19 @@
 """Results as scripts and notebooks use them: rows, comparisons, episodes, plots, and `evaluate`."""
 
 import gc
+import json
 import re
+import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_plugins import install
 
 from oodd_eval import DetectorSpec, evaluate, load_results, load_split
+from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.results.collection import Results
 
 CELLS = {"environments": ["hopper", "cartpole"], "anomalies": "iid,gravity"}
 
@@ -57,7 +63,10 @@ def test_detectors_come_by_name_class_instance_function_and_spec(tiny_split):
     [
         ([], {}, "no detector was named"),
         (5, {}, "5 is no detector: expected a name, a DetectorSpec, a class or function"),
-        (Size, {}, r"Size cannot be called as Size\(seed=..., horizon=..., ...\): .* 'seed'"),
+        (Size, {"size": 1}, r"Size cannot be called as Size\(size=...\): .* 'size'"),
+        (Size, {"seed": 1}, "expected no seed and horizon: they stand beside it"),
+        (Size, {"scale": np.arange(2)}, "parameters is .* expected values that JSON knows"),
+        (Size, [("scale", 1)], "parameters is .* expected values that JSON knows"),
         (Size(), {"scale": 2}, r"parameters \['scale'\] for an instance of Size"),
         ([Size(), Size()], {}, r"detectors \['size', 'size'\]: expected a name for each"),
         ("rangee", {}, "unknown detector 'rangee': did you mean 'range'"),
@@ -66,6 +75,136 @@ def test_detectors_come_by_name_class_instance_function_and_spec(tiny_split):
 def test_what_is_no_detector_is_told(tiny_split, detector, parameters, message):
     with pytest.raises(UsageError, match=message):
         evaluate(detector, tiny_split, parameters=parameters)
+
+
+class Bare:
+    """The distance of the first sensor from its mean: two methods, and scores of float32."""
+
+    def fit(self, nominal):
+        self.mean = np.concatenate([x.observations for x in nominal])[:, 0].mean()
+
+    def score(self, trajectory):
+        return np.abs(trajectory.observations[:, 0] - self.mean)
+
+
+@pytest.fixture
+def bare_plugin(monkeypatch, tmp_path):
+    """The same as a plug-in, of which one says that its scores are lists."""
+    code = """
+    class Bare:
+        def fit(self, nominal):
+            self.mean = np.concatenate([x.observations for x in nominal])[:, 0].mean()
+
+        def score(self, x):
+            return np.abs(x.observations[:, 0] - self.mean)
+
+    class Listed(Bare):
+        def __init__(self, horizon):
+            self.horizon = horizon
+
+        def score(self, x):
+            return [*map(float, super().score(x))]
+
+    @hookimpl
+    def oodd_detectors():
+        return offer(bare_plugin=Bare, listed=Listed)
+    """
+    install(monkeypatch, tmp_path, "bare", code)
+
+
+@pytest.mark.usefixtures("bare_plugin")
+def test_a_class_with_fit_and_score_alone_is_enough(tiny_split):
+    tried = [Bare, "bare-plugin", "listed"]
+    results = evaluate(tried, tiny_split, environments="hopper", anomalies="iid", seed=[0, 1])
+    assert results.ok, [r.reason for r in results]
+    train = load_split(tiny_split).environment("hopper").train
+    mean = np.float32(np.mean(np.concatenate([x.observations[:, 0] for x in train]), dtype="f4"))
+    for row in results.rows:
+        episode = results.scores("hopper", "iid", row=row, seed=1)
+        assert episode.scores.dtype == np.float64
+        by_hand = [abs(float(o[0]) - mean) for o in episode.trajectory.observations]
+        np.testing.assert_allclose(episode.scores, by_hand, atol=1e-6)
+
+
+class Locked(Bare):
+    """Holds what cannot be copied, from the beginning or from its fit on."""
+
+    def __init__(self, *, early=True):
+        self.fits = 0
+        if early:
+            self.lock = threading.Lock()
+
+    def fit(self, nominal):
+        super().fit(nominal)
+        self.fits, self.lock = self.fits + 1, threading.Lock()
+
+
+def test_an_object_that_cannot_be_copied_says_why_and_its_class_will_do(tiny_split):
+    cells = {"environments": "hopper", "anomalies": "iid"}
+    with pytest.raises(UsageError, match=r"Locked cannot be copied, .* 'lock' .*: pass the class"):
+        evaluate(Locked(), tiny_split, **cells)
+    expected = evaluate(Bare, tiny_split, **cells)
+    for detector in (Locked, Locked(early=False)):
+        with pytest.warns(UserWarning, match="it is fitted again for each group"):
+            results = evaluate(detector, tiny_split, **cells)
+        for i in range(2):
+            scores = [r.scores("hopper", "iid", i).scores for r in (expected, results)]
+            np.testing.assert_array_equal(*scores)
+
+
+@pytest.mark.parametrize(
+    ("argument", "values", "expected"),
+    [
+        (
+            "seed",
+            [-1, True, "0", "0,1", 2**70, [0, 0], [], [0, -1], 0.0, None, np.array([1, 1])],
+            "whole numbers of at least 0, each once",
+        ),
+        ("horizon", [0, -1, True, "1", 1.0, [1], None], "a whole number of at least 1"),
+        ("limit", [0, True, "2", 2.0, np.float64(2), 10**18], "a whole number of at least 1"),
+        ("jobs", [0, -2, False, "all", np.bool_(1)], "a whole number of at least 1"),
+        ("environments", [5, [1], None], "names, or a text with commas between them"),
+        ("anomalies", [b"iid", [None]], "names, or a text with commas between them"),
+        ("output", [5], "a name or path"),
+        ("split", [None, 7], "a name or path"),
+    ],
+)
+def test_arguments_are_refused_by_name_before_anything_is_done(
+    tiny_split, argument, values, expected
+):
+    for value in values:
+        arguments = {"split": tiny_split, argument: value}
+        message = f"{argument} is {value!r}, expected {expected}"
+        with pytest.raises(UsageError) as refused:
+            evaluate(Unasked, **arguments)
+        assert str(refused.value) == message
+
+
+class Unasked(Bare):
+    def __init__(self):
+        raise AssertionError("it was made although an argument is wrong")
+
+
+class Weighted(Size):
+    def __init__(self, *, weights):
+        super().__init__(weights["a"][0])
+
+
+def test_numbers_of_numpy_are_numbers(tiny_split):
+    numbers = {"seed": np.arange(2), "horizon": np.int8(2), "limit": np.uint16(2)}
+    python = {"seed": range(2), "horizon": 2, "limit": 2}
+    texts = []
+    weights = {"a": [np.float32(2.5), 1], "b": (np.int64(3),)}, {"a": [2.5, 1], "b": (3,)}
+    for chosen, values in zip((numbers, python), weights, strict=True):
+        parameters = {"weights": values}
+        results = evaluate(
+            Weighted, tiny_split, environments="hopper", parameters=parameters, **chosen
+        )
+        assert [(r.seed, r.limit) for r in results[:: len(results) // 2]] == [(0, 2), (1, 2)]
+        texts.append([{**json.loads(r.to_json()), "provenance": 0} for r in results])
+        for record in texts[-1]:
+            del record["seconds_fit"], record["seconds_score"]
+    assert texts[0] == texts[1]
 
 
 def test_seeds_and_jobs_change_no_score(tiny_split):
@@ -99,6 +238,31 @@ def test_results_are_a_sequence_of_records(results):
     html = results._repr_html_()
     assert "matched AUC" in html
     assert len(html) < 20_000
+
+
+def test_a_text_of_results_is_what_the_terminal_shows(tiny_split, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    arguments = ["--detector", "range,clock", "--split", str(tiny_split), "--env", "hopper"]
+    arguments += ["--anomaly", "iid,gravity", "--output", str(tmp_path / "out"), "-q"]
+    assert main(["run", *arguments]) == 0
+    capsys.readouterr()
+    assert main(["show", str(tmp_path / "out"), "--split", str(tiny_split)]) == 0
+    printed = capsys.readouterr().out
+    assert "Separability" in printed
+    for results in (
+        load_results(tmp_path / "out", tiny_split),
+        evaluate(["range", "clock"], tiny_split, environments="hopper", anomalies="iid,gravity"),
+    ):
+        assert f"{results}\n" == printed
+        assert repr(results) == f"Results(4 cells of {results[0].split}: range, clock; 4 ok)"
+    assert repr(results[:1]).startswith("Results(1 cell of tiny")
+    assert str(results[:0]) == repr(results[:0]) == "Results(0 cells of nothing: ; none)"
+
+
+def test_a_text_of_results_says_why_cells_failed(results):
+    failed = replace(results[0], status="error", reason="no mood", metrics={})
+    lines = str(Results([failed, results[1]])).splitlines()
+    assert lines[-2:] == [f"error: {failed.cell}: no mood", "1 ok, 1 error"]
 
 
 def test_means_are_those_of_the_tables(results):

@@ -26,6 +26,9 @@ HOSTILE = """
 class PlainList(Good):
     def score(self, x): return super().score(x).tolist()
 
+class Words(Good):
+    def score(self, x): return ["calm"] * len(x)
+
 class Huge(Good):
     def score(self, x): return super().score(x) * 0 + 1.7e308
 
@@ -55,7 +58,8 @@ def oodd_detectors():
 """
 
 STATES = {
-    "plainlist": ("invalid", "score returned list, expected a numpy array of float64"),
+    "plainlist": ("ok", ""),
+    "words": ("invalid", "score returned list of <U4, expected real numbers in an array"),
     "huge": ("invalid", "too large"),
     "fewscores": ("invalid", r"score_many returned \d+ score arrays, expected \d+"),
     "badwarmup": ("invalid", "declares warm_up = 50, expected an int between 0 and 20"),

@@ -214,12 +214,12 @@ class Spy:
         return np.abs(trajectory.observations - self.mean).sum(axis=1).astype(np.float64)
 
 
-@pytest.mark.parametrize(("n", "fits"), [(9, 9), (20, 20), (33, 20)])
-def test_nothing_is_judged_by_a_fit_that_has_seen_it(n, fits):
+@pytest.mark.parametrize(("n", "fits", "detector"), [(9, 9, Spy), (20, 20, Spy()), (33, 20, Spy())])
+def test_nothing_is_judged_by_a_fit_that_has_seen_it(n, fits, detector):
     Spy.fits.clear()
     episodes = logs(n=n, rows=30)
     episodes[4][10:] += 500
-    scan = scan_episodes(episodes, detector=Spy())
+    scan = scan_episodes(episodes, detector=detector)
     assert len(Spy.fits) == fits
     assert f"{fits} fits" in scan.notes[0]
     assert scan.episodes[4].odd  # by a CUSUM of its scores

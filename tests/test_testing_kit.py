@@ -128,6 +128,26 @@ def test_expected_failures_are_all_right_where_they_fail_or_do_not_apply():
     assert "1 failed as expected" in report.summary()
 
 
+class Bare:
+    """No seed, no horizon, and scores in a list."""
+
+    def fit(self, nominal):
+        self.mean = np.concatenate([x.observations for x in nominal])[:, 0].mean()
+
+    def score(self, x):
+        if not hasattr(self, "mean"):
+            raise RuntimeError("call fit first")
+        return [float(score) for score in np.abs(x.observations[:, 0] - self.mean)]
+
+
+@pytest.mark.parametrize("detector", [Bare, Bare(), lambda seed: Bare()], ids=repr)
+def test_a_class_with_fit_and_score_alone_is_checked_like_any_other(detector):
+    report = run_checks(detector, seed=3, horizon=2)
+    assert [result.name for result in report.failed] == ["wrong-dimension"]
+    passed = {result.name for result in report.results if result.status == "passed"}
+    assert {"factory", "fits", "scores", "horizon", "prefix", "same-seed", "order"} <= passed
+
+
 def test_an_expected_failure_that_passes_is_a_failure():
     report = run_checks(GOOD, expected_failures={"order": "a guess"})
     assert not report.ok

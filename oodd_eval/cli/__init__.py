@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
-from oodd_eval.names import memory_bytes, parameter, seconds, whole_numbers
+from oodd_eval.names import memory_bytes, parameter, read, seconds, whole_numbers
 
 NAMES: Final = "names separated by commas, globs, or 'all'"
 
@@ -199,11 +199,8 @@ class Converted(click.ParamType[Any]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return what the text stands for."""
         del ctx
-        try:
-            return self._function(value) if isinstance(value, str) else value
-        except UsageError as error:
-            option = param.opts[0] if param else "the value"
-            raise UsageError(f"{option} is {error}") from None
+        option = param.opts[0] if param else "the value"
+        return read(option, self._function, value) if isinstance(value, str) else value
 
 
 class Names(click.ParamType[str]):

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -10,9 +11,17 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import ContractError, UsageError
 from oodd_eval.metrics.accumulation import STATISTICS, AlarmKind
-from oodd_eval.plugins.contract import Detector, StreamingDetector, make_detector
+from oodd_eval.names import read, whole_number
+from oodd_eval.plugins.contract import (
+    AnyDetector,
+    Detector,
+    StreamingDetector,
+    factory_of,
+    float_scores,
+    make_detector,
+)
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.explanations import ExplainingDetector
 
@@ -26,7 +35,7 @@ class DetectorHandle:
 
     `alarm` is the statistic of its alarms, `actions` tells whether it gets actions, and `adapts`
     whether it learns from baseline rows by itself. `state` has JSON values that `from_state` reads;
-    its name is empty for an instance that was passed in.
+    its name is empty for a class, a function or an instance that was passed in.
     """
 
     detector: Detector
@@ -38,14 +47,16 @@ class DetectorHandle:
     @classmethod
     def make(
         cls,
-        detector: str | Detector,
+        detector: AnyDetector,
         statistic: str | None,
         seed: int,
         horizon: int,
         parameters: Mapping[str, Any],
         baseline: int = 0,
     ) -> Self:
-        """Make the detector of that name, or take an instance, for so many baseline rows."""
+        """Make a detector of a name or class, or take an instance, for so many baseline rows."""
+        seed = read("seed", partial(whole_number, least=0), seed)
+        horizon = read("horizon", partial(whole_number, least=1), horizon)
         kind = next((one for one in STATISTICS if one == statistic), None)
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
@@ -64,9 +75,9 @@ class DetectorHandle:
                 baseline=baseline if adapts else 0,
             )
             kind, name, actions = kind or spec.alarm, spec.name, spec.inputs != "observations"
-        elif not isinstance(detector, Detector):
-            expected = "a name or an object with the methods fit(nominal) and score(trajectory)"
-            raise UsageError(f"detector is {type(detector).__name__}, expected {expected}")
+        elif isinstance(detector, type) or not isinstance(detector, Detector):
+            factory = factory_of(detector)
+            detector = make_detector(factory, seed=seed, horizon=horizon, parameters=parameters)
         state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
         state |= {"seed": seed, "horizon": horizon}
         state |= {"parameters": dict(parameters), "baseline": baseline}
@@ -79,17 +90,21 @@ class DetectorHandle:
 
     def scores(self, trajectory: Trajectory, base: Baseline | None = None) -> Floats:
         """Return the scores of a whole episode, undefined in its baseline rows."""
-        scores = np.asarray(self.detector.score(self.visible(trajectory, base)), np.float64)
+        visible = self.visible(trajectory, base)
+        scores = float_scores(self.detector.score(visible))
+        if scores.shape != (len(visible),):
+            expected = f"expected ({len(visible)},): one score per observation"
+            raise ContractError(f"score returned an array of shape {scores.shape}, {expected}")
         rows = base.rows if base else 0
         return undefined(scores[len(scores) - len(trajectory) + rows :], rows)
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any], detector: Detector | None) -> Self:
+    def from_state(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Make a saved detector again, not fitted; one without a name is `detector`."""
         if not state["name"] and detector is None:
             raise UsageError(
-                "this watchdog was fitted with an instance: load(path, detector) needs one "
-                "with the same parameters"
+                "this watchdog was fitted with a detector without a name: load(path, detector) "
+                "needs the class, or an instance with the same parameters"
             )
         return cls.make(
             detector or state["name"],
@@ -132,7 +147,7 @@ class _Prefixes:
         if action is not None:
             self._actions.append(action)
         self._sofar = Trajectory(self._observations, self._actions or None)
-        return float(self._detector.score(self._sofar)[-1])
+        return float(float_scores(self._detector.score(self._sofar))[-1])
 
     def _explain_last(self) -> tuple[NDArray[np.float64], int]:
         shares, onsets = self._detector.explain(self._sofar)

@@ -198,13 +198,45 @@ class Reading:
 
     def __str__(self) -> str:
         """Return one line: the state, and in an alarm what is at fault and since when."""
-        parts = [f"row {self.t}: {'alarm' if self.alarm else 'nominal'}"]
-        parts += [f"{name} {fault}" for name, fault in self.faults.items()]
-        if self.sensor and self.sensor not in self.faults:
-            parts.append(f"{self.sensor} {self.sensors[self.sensor]:.0%}")
-        if self.onset is not None:
-            parts.append(f"since row {self.onset}")
-        return ", ".join(parts)
+        state = "alarm" if self.alarm else "nominal"
+        return ", ".join([f"row {self.t}: {state}", *_causes(self)])
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeAlarm:
+    """An alarm in a recorded episode, as `Watchdog.explain` returns it.
+
+    Attributes
+    ----------
+    first, last
+        Rows from 0 that it lasts from and to.
+    onset
+        The row with which the anomaly began, as seen at the first one; None where nothing is known.
+    sensors
+        Share of each sensor in the evidence of the first row, by name, the largest first; empty
+        where nothing is known.
+    faults
+        Sensors with a fault in the first row, as those of a `Reading`.
+    """
+
+    first: int
+    last: int
+    onset: int | None
+    sensors: dict[str, float]
+    faults: dict[str, str]
+
+    def __str__(self) -> str:
+        """Return one line: its rows, what is at fault, and since when."""
+        return ", ".join([f"rows {self.first} to {self.last}: alarm", *_causes(self)])
+
+
+def _causes(alarm: Reading | EpisodeAlarm) -> list[str]:
+    """Return what is at fault and since when, in words."""
+    parts = [f"{name} {fault}" for name, fault in alarm.faults.items()]
+    sensor = next(iter(alarm.sensors), "")
+    if sensor and sensor not in alarm.faults:
+        parts.append(f"{sensor} {alarm.sensors[sensor]:.0%}")
+    return parts if alarm.onset is None else [*parts, f"since row {alarm.onset}"]
 
 
 def as_nanoseconds(time: float) -> int:

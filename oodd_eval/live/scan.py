@@ -42,7 +42,7 @@ from oodd_eval.metrics.outliers import (
     rank_p,
     rank_threshold,
 )
-from oodd_eval.plugins.contract import Detector
+from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_eval.results.record import without_nan
 
@@ -224,7 +224,7 @@ def scan_episodes(
     episodes: Sequence[Episode | ArrayLike],
     *,
     sensors: Sequence[Any] | None = None,
-    detector: str | Detector = SCANNER,
+    detector: AnyDetector = SCANNER,
     watchdog: Watchdog | None = None,
     fdr: float = 0.1,
     window: int | None = None,
@@ -247,7 +247,7 @@ def scan_episodes(
     sensors
         Names, or quantities with names; default "sensor 0" and so on.
     detector
-        Name of an installed detector, or an unfitted one.
+        Name of an installed detector, a class or function that makes one, or an unfitted one.
     watchdog
         Judges all episodes in place of a detector that is fitted on them.
     fdr
@@ -260,8 +260,8 @@ def scan_episodes(
         Number of rows at the start of every episode that are nominal. They are not judged, and
         each sensor's mean and spread over them are brought to those of the other episodes.
     seed, horizon, parameters
-        For the factory of a named detector. Of `panel`, which is the default, ``forecast`` is
-        ``"linear"`` unless it is given: networks would be fitted 20 times.
+        For the factory of a named detector, the class or the function. Of `panel`, which is the
+        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted 20 times.
     jobs
         Fits at a time, in processes of their own where more than 1.
 
@@ -426,7 +426,7 @@ def _watched(watchdog: Watchdog, one: Episode, longest: float, trajectory: Traje
 class _Fit:
     """A function that makes a detector for one fit."""
 
-    detector: str | Detector
+    detector: AnyDetector
     seed: int
     horizon: int
     parameters: Mapping[str, Any]

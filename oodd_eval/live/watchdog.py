@@ -1,6 +1,5 @@
 """A detector with its alarm beside a running robot: one call for each observation."""
 
-import copy
 import itertools
 import math
 import warnings
@@ -14,14 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import FittedStateError, OoddError, PromiseWarning, UsageError
+from oodd_eval.errors import (
+    FittedStateError,
+    OoddError,
+    PromiseWarning,
+    TrajectoryError,
+    UsageError,
+)
 from oodd_eval.live.handle import DetectorHandle, streaming
 from oodd_eval.live.nominal import Episode, Nominal, NominalData
-from oodd_eval.live.reading import Reading, RunLength
+from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
-from oodd_eval.plugins.contract import Detector, StorableDetector
+from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
 
 KIND: Final = "watchdog/3"
@@ -90,7 +95,7 @@ class Watchdog:
     @classmethod
     def fit(
         cls,
-        detector: str | Detector,
+        detector: AnyDetector,
         train: EnvironmentData | Sequence[Episode],
         calibration: Sequence[Episode] | None = None,
         alpha: float = 0.05,
@@ -116,8 +121,9 @@ class Watchdog:
         Parameters
         ----------
         detector
-            Name of an installed detector, or an unfitted one. Without ``update`` it scores the
-            whole episode so far at every row, which a warning says.
+            Name of an installed detector, a class or function that makes one, or an unfitted one.
+            Without ``update`` it scores the whole episode so far at every row, which a warning
+            says.
         train, calibration
             Nominal episodes to fit on, and others for the threshold, both in the order in which
             they were recorded: `Trajectory` objects, observations of shape (T + 1, D), or tuples of
@@ -151,7 +157,7 @@ class Watchdog:
             ``"cusum"``, ``"score"``, ``"ewma"``, ``"shiryaev-roberts"`` or ``"e-detector"``: see
             `GuaranteedAlarm`. Default what a named detector declares, else the CUSUM.
         seed, horizon, parameters
-            For the factory of a named detector.
+            For the factory of a named detector, or for the class or function.
 
         Returns
         -------
@@ -334,10 +340,55 @@ class Watchdog:
         -------
         list of Reading
             One for each observation. The watchdog is at the end of the episode then.
+
+        Raises
+        ------
+        TrajectoryError
+            For what is no `Trajectory`.
         """
+        if not isinstance(episode, Trajectory):
+            raise TrajectoryError(
+                f"the episode is a {type(episode).__name__}, expected a Trajectory, such as "
+                "Trajectory(observations - offsets, actions)"
+            )
         self.reset()
         rows = zip(episode.observations, [None, *episode.actions], strict=True)
         return [self._judged(row, action, None, None) for row, action in rows]
+
+    def explain(self, episode: Trajectory) -> list[EpisodeAlarm]:
+        """Return where a recorded episode alarms, which sensors are at fault, and since when.
+
+        An alarm lasts as long as its cause here, whatever `latch` says. A copy of the watchdog
+        judges, so that this one stays in the episode that it is in.
+
+        Parameters
+        ----------
+        episode
+            As for `replay`.
+
+        Returns
+        -------
+        list of EpisodeAlarm
+            In the order of their rows; empty where nothing alarms.
+
+        Raises
+        ------
+        TrajectoryError
+            For what is no `Trajectory`.
+        UsageError
+            When the detector has what cannot be copied.
+        """
+        twin = self.copy()
+        twin.settings = replace(self.settings, latch=False)
+        alarms = []
+        for alarmed, group in itertools.groupby(
+            twin.replay(episode), lambda reading: reading.alarm
+        ):
+            if alarmed:
+                first, *rest = group
+                last = rest[-1].t if rest else first.t
+                alarms.append(EpisodeAlarm(first.t, last, first.onset, first.sensors, first.faults))
+        return alarms
 
     def _judged(
         self,
@@ -421,10 +472,15 @@ class Watchdog:
         -------
         Watchdog
             At the beginning of an episode.
+
+        Raises
+        ------
+        UsageError
+            When the detector has what cannot be copied, such as a lock.
         """
-        other = copy.deepcopy(self)
-        other.reset()
-        return other
+        twin = copied(self, self._handle.detector)
+        twin.reset()
+        return twin
 
     def save(self, path: str | Path) -> None:
         """Write everything into one file, which is whole or absent.
@@ -474,15 +530,16 @@ class Watchdog:
         write_state(Path(path), pack(whole, "the watchdog"))
 
     @classmethod
-    def load(cls, path: str | Path, detector: Detector | None = None) -> Self:
+    def load(cls, path: str | Path, detector: AnyDetector | None = None) -> Self:
         """Return the watchdog that `save` wrote.
 
         Parameters
         ----------
         path : str or Path
             The file that `save` was called with.
-        detector : Detector, optional
-            An instance with the parameters of the saved one, where that had no name.
+        detector : Detector, class or function, optional
+            An instance with the parameters of the saved one, or what makes it, where that had no
+            name.
 
         Returns
         -------
@@ -506,7 +563,7 @@ class Watchdog:
             raise FittedStateError(f"{what}: {problem:.500}; fit it anew") from error
 
     @classmethod
-    def _of(cls, whole: Mapping[str, Any], detector: Detector | None) -> Self:
+    def _of(cls, whole: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
         values, limits = whole["watchdog"], StreamLimits.of(whole)
         handle = DetectorHandle.from_state(values["made"], detector)

@@ -3,7 +3,8 @@
 Higher scores mean more anomalous: the reverse of scikit-learn's ``score_samples`` and
 ``decision_function``, so negate theirs.
 
-A detector is fitted on nominal trajectories and then gives one float64 score per observation row.
+A detector is fitted on nominal trajectories and then gives one score per observation row: a real
+number of any type, which becomes float64.
 It is causal: ``score(x)[:n]`` equals ``score(x[:n])`` for every prefix, so that a score at time t
 uses nothing after t (randomness has to be keyed by seed and time, not by call order). NaN means
 "not defined yet" and stands only in a leading block of at most ``max(horizon, warm_up)`` rows.
@@ -11,12 +12,23 @@ uses nothing after t (randomness has to be keyed by seed and time, not by call o
 
 from __future__ import annotations
 
+import copy
+import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    runtime_checkable,
+)
 
-from oodd_eval.errors import ContractError
+from oodd_eval.errors import ContractError, UsageError
 
 # Every plug-in imports this module when detectors are listed, which should not take numpy's time.
 if TYPE_CHECKING:
@@ -45,6 +57,7 @@ ROLLOUT_TOLERANCE: Final = 5e-3
 """The same at larger horizons: ten steps in single precision have reached 1.4e-3."""
 
 Scores: TypeAlias = "NDArray[np.float64]"
+Copied = TypeVar("Copied")
 
 Alarm = Literal["cusum", "score", "ewma", "shiryaev-roberts", "e-detector"]
 """Statistic of a detector's guaranteed alarms, see `oodd_eval.metrics.alarms.GuaranteedAlarm`."""
@@ -104,8 +117,8 @@ class Detector(Protocol):
 
         Returns
         -------
-        float64 array of shape (T + 1,)
-            NaN in the leading undefined rows only.
+        array of real numbers of shape (T + 1,)
+            NaN in the leading undefined rows only. A list and other dtypes than float64 do, too.
 
         Raises
         ------
@@ -185,6 +198,10 @@ class StorableDetector(Detector, Protocol):
         """
 
 
+AnyDetector: TypeAlias = str | Detector | Callable[..., Detector]
+"""A detector as scripts have it: a name, an object, a class or function that makes one."""
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorSpec:
     """A detector as a plug-in offers it.
@@ -195,7 +212,8 @@ class DetectorSpec:
         The name on the command line: lower-case letters, digits and hyphens.
     factory
         Called as ``factory(seed=..., horizon=..., **parameters)``; returns an unfitted `Detector`.
-        ``seed`` decides every random draw, ``horizon`` is the prediction horizon in steps.
+        ``seed`` decides every random draw, ``horizon`` is the prediction horizon in steps. One that
+        does not take one of these two is called without it.
     summary
         One line for ``oodd-eval list``.
     reference
@@ -270,30 +288,107 @@ def make_detector(
     `baseline` is the number of baseline rows for one that adapts to them.
     """
     adapting = {"baseline": baseline} if baseline else {}
-    detector = factory(seed=seed, horizon=horizon, **adapting, **parameters)
+    detector = factory(**accepted(factory, seed=seed, horizon=horizon), **adapting, **parameters)
     if not isinstance(detector, Detector):
         expected = "an object with the methods fit(nominal) and score(trajectory)"
         raise ContractError(f"the factory returned {type(detector).__name__}, expected {expected}")
     return detector
 
 
+def accepted(factory: Callable[..., object], **arguments: Any) -> dict[str, Any]:
+    """Return those of some arguments that a factory takes; all where its signature is not known.
+
+    >>> accepted(lambda seed: seed, seed=0, horizon=1)
+    {'seed': 0}
+    """
+    try:
+        taken = inspect.signature(factory).parameters
+    except (TypeError, ValueError):  # of some compiled functions
+        return arguments
+    if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
+        return arguments
+    return {name: value for name, value in arguments.items() if name in taken}
+
+
+def factory_of(detector: object) -> Callable[..., Detector]:
+    """Return what makes a detector: a class or function as it is, of an object its copies.
+
+    Raises `UsageError` for anything else.
+    """
+    if isinstance(detector, Detector) and not isinstance(detector, type):
+        return lambda: copied(detector)
+    if callable(detector):
+        return detector
+    raise UsageError(
+        f"{detector!r:.80} is no detector: expected a name, a DetectorSpec, a class or "
+        "function that makes one, or an object with fit(nominal) and score(trajectory)"
+    )
+
+
+def copied(whole: Copied, detector: object = None) -> Copied:
+    """Return a deep copy; `UsageError` names the attribute of the detector that prevents it.
+
+    The detector is the whole, or part of it.
+    """
+    try:
+        return copy.deepcopy(whole)
+    except Exception as error:  # a lock raises another one than an open file or a tensor
+        detector = whole if detector is None else detector
+        name = type(detector).__name__
+        culprit = next(filter(_fails, getattr(detector, "__dict__", {}).items()), None)
+        because = f", because of its attribute {culprit[0]!r}" if culprit else ""
+        raise UsageError(
+            f"{name} cannot be copied{because} ({type(error).__name__}: {error}): pass the class "
+            f"or a function that makes it, or define __getstate__ of {name} without what cannot be "
+            "copied, and __setstate__, which makes it again"
+        ) from error
+
+
+def _fails(attribute: tuple[str, object]) -> bool:
+    try:
+        copy.deepcopy(attribute[1])
+    except Exception:  # noqa: BLE001  whatever it raises
+        return True
+    return False
+
+
 def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:
     """Return unchecked scores of some trajectories, scored all at once if the detector can.
 
-    Raises `ContractError` when ``score_many`` returns another number of score arrays, and for
-    masked values.
+    Raises `ContractError` when ``score_many`` returns another number of score arrays.
     """
     score_many = getattr(detector, "score_many", None)
     scores = list(score_many(chunk)) if score_many else [detector.score(x) for x in chunk]
-    # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
-    masked = sys.modules.get("numpy.ma")
-    if masked and any(masked.is_masked(one) for one in scores):
-        # Only its data would be sent on, with whatever stands where it is masked.
-        raise ContractError("score returned a masked array, expected NaN where it is undefined")
     if len(scores) != len(chunk):
         expected = f"{len(chunk)}: one for each trajectory"
         raise ContractError(f"score_many returned {len(scores)} score arrays, expected {expected}")
     return scores
+
+
+def float_scores(returned: object, subject: str = "score", where: str = "") -> Scores:
+    """Return scores of any real type, a list or an array, as a float64 array of the same shape.
+
+    An array of float64 is returned as it is. `ContractError` names what else a detector returned.
+    """
+    import numpy as np  # noqa: PLC0415  see above
+
+    # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
+    masked = sys.modules.get("numpy.ma")
+    if masked and masked.is_masked(returned):
+        # Only its data would go on, with whatever stands where it is masked.
+        expected = "expected NaN where it is undefined"
+        raise ContractError(f"{subject} returned a masked array{where}, {expected}")
+    kind, array = type(returned).__name__, None
+    if isinstance(returned, list | tuple) or hasattr(returned, "__array__"):
+        try:
+            array = np.asarray(returned)
+        except Exception as error:  # noqa: BLE001  lists of unequal lengths, tensors with gradients
+            kind = f"{kind} that is no array ({error})"
+        else:
+            kind = f"{kind} of {array.dtype}"
+    if array is None or array.dtype.kind not in "biuf":
+        raise ContractError(f"{subject} returned {kind}{where}, expected real numbers in an array")
+    return array.astype(np.float64, copy=False)
 
 
 def check_scores(
@@ -338,15 +433,12 @@ def check_scores(
         raise ContractError(f"detector {detector!r} declares warm_up = {warm_up!r}, {expected}")
     rows = trajectory if isinstance(trajectory, int) else len(trajectory)
     block = baseline + max(horizon, warm_up)
-    if not isinstance(scores, np.ndarray):
-        wrong = f"{type(scores).__name__} for {where}, expected a numpy array of float64"
-    elif scores.ndim != 1:
+    scores = float_scores(scores, f"detector {detector!r}", f" for {where}")
+    if scores.ndim != 1:
         shape = f"an array of shape {scores.shape} for {where}"
         wrong = f"{shape}, expected ({rows},): one score per observation"
     elif len(scores) != rows:
         wrong = f"{len(scores)} scores for {where}, expected {rows} (one per observation)"
-    elif scores.dtype != np.float64:
-        wrong = f"{scores.dtype} scores for {where}, expected float64"
     elif (bad := ~np.isfinite(scores) & ~(np.isnan(scores) & (np.arange(rows) < block))).any():
         t = int(bad.argmax())
         behind = f", behind {baseline} baseline rows" if baseline else ""

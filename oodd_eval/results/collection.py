@@ -17,14 +17,15 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.catalogue import LEVELS, metric_info
-from oodd_eval.names import check_known, select
+from oodd_eval.names import check_known, counted, select
 from oodd_eval.results import plots
 from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render.text import terminal_text
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
 from oodd_eval.results.strengths import (
@@ -82,16 +83,39 @@ class Results(Sequence[Record]):
 
     def __repr__(self) -> str:
         """Return one line: how many cells of what, and how many failed."""
-        states = ", ".join(f"{n} {status}" for status, n in Counter(r.status for r in self).items())
         splits = ", ".join(dict.fromkeys(r.split for r in self)) or "nothing"
-        return f"Results({len(self)} cells of {splits}: {', '.join(self.rows)}; {states or 'none'})"
+        cells = counted(len(self), "cell(s)")
+        return f"Results({cells} of {splits}: {', '.join(self.rows)}; {self._states or 'none'})"
+
+    def __str__(self) -> str:
+        """Return what ``oodd-eval show`` prints: tables, sentences, why cells failed, how many."""
+        if not self.records:
+            return repr(self)
+        tables = terminal_text(self._report.sections)
+        return "\n".join([tables.rstrip("\n"), "", *self._failures, self._states])
 
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""
-        failures = (f"{r.status}: {r.cell}: {r.reason}" for b in boards(self) for r in b.failures())
+        lines = repr(self), *self._failures
+        tables = FORMATS["html"].render(self._report)
+        return "".join(f"<p>{escape(text)}</p>\n" for text in lines) + tables
+
+    @property
+    def _report(self) -> Report:
         units = self._split.units if self._split else NO_UNITS
-        tables = FORMATS["html"].render(Report(self.records, detail="brief", units=units))
-        return "".join(f"<p>{escape(text)}</p>\n" for text in (repr(self), *failures)) + tables
+        return Report(self.records, detail="brief", units=units)
+
+    @property
+    def _states(self) -> str:
+        """Return how many cells came to which status."""
+        counts = Counter(r.status for r in self)
+        return ", ".join(f"{counts[status]} {status}" for status in STATUSES if counts[status])
+
+    @property
+    def _failures(self) -> list[str]:
+        """Return why cells failed, a line each."""
+        failed = (r for board in boards(self) for r in board.failures())
+        return [f"{r.status}: {r.cell}: {r.reason}" for r in failed]
 
     @property
     def rows(self) -> tuple[str, ...]:

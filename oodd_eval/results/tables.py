@@ -13,6 +13,7 @@ from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.metrics.promise import enough_episodes
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
@@ -255,6 +256,9 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
     header = ["Environment", "Result", *(str(replace(e, horizon=1)) for e in entries), "AVG"]
     left_out = [str(e) for e in entries if e not in averaged]
     note = f"AVG is the mean without the trivial rows: {', '.join(left_out)}." if left_out else ""
+    if len(board.environments) == 1:  # the title says it
+        title += f", {title_of(board.environments[0])}"
+        return Table(title, header[1:], [row[1:] for row in rows], labels=1, note=note)
     return Table(title, header, rows, labels=2, note=note)
 
 
@@ -425,7 +429,8 @@ def notes(board: Board) -> list[str]:
         )
     lines += uncalibrated(board)
     if changed := sum(bool(r.provenance.get("git_dirty")) for r in board.records):
-        lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {changed} cells.")
+        dirty = counted(changed, "cell(s)")
+        lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {dirty}.")
     lines.append(
         f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
         "* marks a mean over fewer cells than the split has there. A failure is shown as its state."

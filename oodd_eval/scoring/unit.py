@@ -1,8 +1,8 @@
 """Score one unit: take kept scores, or fit and score in a worker, and check all that comes back."""
 
-import copy
 import secrets
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -185,7 +185,25 @@ class GroupedScoring:
         return Scored(file=replace(scores, cost={**cost, "steps_scored": steps}))
 
     def in_process(self) -> Scored:
-        """Fit and score in this process, a copy each group; errors of the detector pass through."""
+        """Fit and score in this process, a copy each group; errors of the detector pass through.
+
+        One that cannot be copied is fitted again for each group.
+        """
+        detector = self._fitted()
+
+        def returned(
+            groups: Iterable[list[Member]], work: Callable[..., list[object]]
+        ) -> list[object]:
+            chunks = ([*self._members(group)] for group in groups)
+            return [one for chunk in chunks for one in work(self._another(detector), chunk)]
+
+        scores = returned(self._groups, contract.score_chunk)
+        again = self._explained if explanations.explains(detector) else ()
+        explained = returned(again, explanations.explain_chunk)
+        return Scored(file=self._file(scores, explained, getattr(detector, "warm_up", 0)))
+
+    def _fitted(self) -> contract.Detector:
+        """Return a detector that was made and fitted in this process."""
         unit = self._job.unit
         detector = contract.make_detector(
             self._job.offer.spec.factory,
@@ -195,17 +213,20 @@ class GroupedScoring:
             baseline=self._adapting,
         )
         detector.fit([*self._train])
+        return detector
 
-        def returned(
-            groups: Iterable[list[Member]], work: Callable[..., list[object]]
-        ) -> list[object]:
-            chunks = ([*self._members(group)] for group in groups)
-            return [one for chunk in chunks for one in work(copy.deepcopy(detector), chunk)]
-
-        scores = returned(self._groups, contract.score_chunk)
-        again = self._explained if explanations.explains(detector) else ()
-        explained = returned(again, explanations.explain_chunk)
-        return Scored(file=self._file(scores, explained, getattr(detector, "warm_up", 0)))
+    def _another(self, detector: contract.Detector) -> contract.Detector:
+        """Return a copy of a fitted detector, or one that is fitted like it."""
+        try:
+            return contract.copied(detector)
+        except UsageError:
+            warnings.warn(
+                f"{type(detector).__name__} cannot be copied after its fit, so that it is fitted "
+                "again for each group of episodes: define __getstate__ and __setstate__ to save "
+                "that time",
+                stacklevel=2,
+            )
+            return self._fitted()
 
     @property
     def _adapting(self) -> int:

@@ -54,7 +54,7 @@ _BASELINE = 20
 
 
 def test_factory(trial: Trial) -> None:
-    """The factory takes seed and horizon and returns an object with fit and score."""
+    """The factory returns an object with fit and score; it may take seed and horizon."""
     trial.make()
 
 
@@ -131,7 +131,7 @@ def _refusal(
 
 
 def test_scores(trial: Trial) -> None:
-    """Scores are one float64 per observation, finite from the first defined one on."""
+    """Scores are one real number per observation, finite from the first defined one on."""
     trajectories = [*trial.nominal(), *(wild for wild, _, _ in trial.anomalous())]
     _check_scores(trial, trial.fitted(), trial.horizon, trajectories)
 

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError
 from oodd_eval.metrics.auc import Floats
 from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, watch
 from oodd_eval.plugins.contract import (
@@ -27,7 +28,10 @@ from oodd_eval.plugins.contract import (
     Detector,
     DetectorSpec,
     Scores,
+    accepted,
     difference,
+    factory_of,
+    float_scores,
 )
 from oodd_eval.plugins.isolation.worker import reason_of
 
@@ -35,7 +39,8 @@ SENSORS: Final = 3
 ACTIONS: Final = 2
 EPISODES: Final = 12
 ROWS: Final = 80  # observations of an episode, beyond the horizon
-Factory = Callable[..., Detector] | DetectorSpec  # a factory, or what a plug-in offers
+Factory = Callable[..., Detector] | Detector | DetectorSpec
+"""A class or function that makes a detector, one that is copied, or what a plug-in offers."""
 
 
 class RaisedError(AssertionError):
@@ -50,8 +55,9 @@ class Trial:
     Parameters
     ----------
     factory
-        Called as ``factory(seed=..., horizon=..., **parameters)``; a `DetectorSpec` tells what the
-        detector declares too.
+        Called as ``factory(seed=..., horizon=..., **parameters)``, without seed or horizon if it
+        does not take them; a `DetectorSpec` tells what the detector declares too. Of an unfitted
+        detector copies are made.
     horizon
         Prediction horizon in steps.
     seed
@@ -71,11 +77,11 @@ class Trial:
         self.spec = (
             factory
             if isinstance(factory, DetectorSpec)
-            else DetectorSpec("", factory, "", inputs="observations+actions")
+            else DetectorSpec("", factory_of(factory), "", inputs="observations+actions")
         )
         self.actions = self.spec.inputs == "observations+actions"
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
-        self.arguments = {"seed": seed, "horizon": horizon, **self.parameters}
+        self.arguments = self._accepted(seed=seed, horizon=horizon) | self.parameters
         self.rows = ROWS + horizon  # of an ordinary episode
         self.tolerance = TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE
         self.events = Events()  # of all checks so far
@@ -88,7 +94,8 @@ class Trial:
 
     def make(self, **changes: Any) -> Detector:
         """Return a new unfitted detector; `changes` replace seed, horizon or parameters."""
-        arguments = {**self.arguments, **changes}
+        fixed = self._accepted(**{n: changes.pop(n) for n in ("seed", "horizon") if n in changes})
+        arguments = self.arguments | fixed | changes
         called = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
         with doing(f"the factory, called with {called},"):
             detector = self.spec.factory(**arguments)
@@ -98,6 +105,9 @@ class Trial:
                 "expected an object with fit(nominal) and score(trajectory)"
             )
         return detector
+
+    def _accepted(self, **arguments: int) -> dict[str, Any]:
+        return accepted(self.spec.factory, **arguments)
 
     def unfitted(self) -> Detector:
         """Return a new unfitted detector, for checks that are about something else."""
@@ -228,12 +238,13 @@ def doing(what: str) -> Iterator[None]:
 
 def as_scores(returned: object, trajectory: Trajectory) -> Scores:
     """Return scores as float64; skip when their form, which another check is about, is wrong."""
-    if not isinstance(returned, np.ndarray) or returned.shape != (len(trajectory),):
-        pytest.skip("needs one score per observation: see check 'scores'")
     try:
-        return returned.astype(np.float64)
-    except (TypeError, ValueError):
+        scores = float_scores(returned)
+    except ContractError:
         pytest.skip("needs scores that are numbers: see check 'scores'")
+    if scores.shape != (len(trajectory),):
+        pytest.skip("needs one score per observation: see check 'scores'")
+    return scores
 
 
 def assert_equal(

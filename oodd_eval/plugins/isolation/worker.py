@@ -39,6 +39,7 @@ from oodd_eval.plugins.contract import (
     Detector,
     StorableDetector,
     StreamingDetector,
+    float_scores,
     make_detector,
     score_chunk,
 )
@@ -222,19 +223,14 @@ def _score(channel: Channel, detector: Detector, *, score: int = 0, explain: int
     start = time.perf_counter()
     returned = (explain_chunk if explain else score_chunk)(detector, chunk)
     seconds = 0.0 if explain else time.perf_counter() - start
-    for trajectory, array in zip(chunk, returned, strict=True):
-        if not isinstance(array, np.ndarray):
-            wrong = type(array).__name__
-        elif array.nbytes > ROW_BYTES * len(trajectory):
-            wrong = f"an array of shape {array.shape}"
-        elif array.dtype.hasobject:
-            wrong = "ndarray of object"
-        else:
-            continue
-        raise ContractError(f"score returned {wrong}, expected a numpy array of float64")
+    arrays = [np.asarray(x) if explain else float_scores(x) for x in returned]
+    for trajectory, array in zip(chunk, arrays, strict=True):
+        if array.nbytes > ROW_BYTES * len(trajectory):
+            expected = f"expected ({len(trajectory)},): one score per observation"
+            raise ContractError(f"score returned an array of shape {array.shape}, {expected}")
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
-    for array in returned:
-        channel.send_array(np.asarray(array))
+    for array in arrays:
+        channel.send_array(array)
 
 
 def _score_rows(channel: Channel, detector: Detector, *, stream: int) -> None:
@@ -255,6 +251,7 @@ def _score_rows(channel: Channel, detector: Detector, *, stream: int) -> None:
 
 
 def _real(score: object) -> float:
+    score = score.item() if isinstance(score, np.generic) else score
     if not isinstance(score, numbers.Real):
         raise ContractError(f"update returned {type(score).__name__}, expected a float")
     return float(score)
@@ -275,10 +272,10 @@ class _Prefixes:
             self._actions = np.vstack([self._actions, np.zeros(0) if action is None else action])
         self._observations.append(observation)
         prefix = Trajectory(self._observations, self._actions)
-        (scores,) = score_chunk(self._detector, [prefix])
-        if not isinstance(scores, np.ndarray) or scores.shape != (len(prefix),):
-            form = getattr(scores, "shape", type(scores).__name__)
-            raise ContractError(f"score returned {form} for {len(prefix)} observations")
+        (returned,) = score_chunk(self._detector, [prefix])
+        scores = float_scores(returned)
+        if scores.shape != (len(prefix),):
+            raise ContractError(f"score returned {scores.shape} for {len(prefix)} observations")
         return scores[-1]
 
 

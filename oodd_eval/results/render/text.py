@@ -1,11 +1,12 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
+import io
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from html import escape as escape_html
-from typing import Final
+from typing import Any, Final
 
 from rich.console import Console
 from rich.text import Text
@@ -138,6 +139,14 @@ def print_sections(sections: Sequence[Section], console: Console) -> None:
             print_prose(line, console, "dim")
         if section.notes:
             console.print("")
+
+
+def terminal_text(sections: Sequence[Section]) -> str:
+    """Return what `print_sections` prints, as wide as the terminal, without colours."""
+    text = io.StringIO()
+    plain: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
+    print_sections(sections, Console(file=text, color_system=None, force_jupyter=False, **plain))
+    return text.getvalue()
 
 
 def print_table(table: Table, console: Console, width: int = 0) -> None:
