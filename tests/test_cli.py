@@ -14,10 +14,12 @@ import pytest
 from helpers_docs import parse
 from helpers_plugins import install
 from helpers_split import make_split
+from rich.console import Console
 
 from oodd_eval import cli as cli_package
-from oodd_eval.cli import listing
+from oodd_eval.cli import listing, terminal
 from oodd_eval.cli import main as cli
+from oodd_eval.cli import run as run_module
 from oodd_eval.errors import MissingExtraError
 
 
@@ -81,7 +83,7 @@ def test_collect_only_prints_cells_and_does_nothing(run, tmp_path):
     assert code == 0
     assert out.splitlines() == [
         *(f"tiny/cartpole/{a}::clock[h=1,seed=0]" for a in ("iid", "wind-l2r", "wind-r2l")),
-        "3 cells in 1 fits",
+        "3 cells in 1 fit",
     ]
     assert list(tmp_path.iterdir()) == []
 
@@ -136,6 +138,68 @@ def test_x_stops_at_the_first_failure(run, failing):
     )
     assert code == 1
     assert re.search(r"^8 error in", out, re.MULTILINE)
+    assert out.splitlines()[-1] == "0 of 4 fits are kept; the same command continues"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "last"),
+    [
+        (["--detector=fails"], "0 of 1 fit is kept; the same command fits the other again"),
+        (["--detector=fails,clock"], "1 of 2 fits is kept; the same command fits the other again"),
+        (
+            ["--detector=fails,clock", "--fresh"],
+            "1 of 2 fits is kept; the same command without --fresh fits the other again",
+        ),
+    ],
+)
+def test_the_last_line_of_a_run_with_failures_says_what_is_kept(run, failing, arguments, last):
+    _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+    _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+
+
+SLOW = """
+class Slow(Good):
+    def fit(self, nominal, progress=None):
+        super().fit(nominal)
+        if progress:
+            progress(0.4)
+        time.sleep(1)
+
+@hookimpl
+def oodd_detectors():
+    return offer(slow=Slow)
+"""
+
+
+def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
+    slow = (*CLOCK, "--detector", "slow", "--fresh")
+    assert "slow on" not in run(*slow)[1]
+    monkeypatch.setattr(terminal, "SILENCE", 0.25)
+    code, out, _ = run(*slow)
+    assert code == 0
+    assert 1 <= len(re.findall(r"^slow on cartpole: fitting 40 %, [01] s$", out, re.MULTILINE)) <= 4
+    assert "slow on" not in run(*slow, "-q")[1]
+
+
+def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
+    screen = Console(file=io.StringIO(), force_terminal=True, width=80, markup=False)
+    monkeypatch.setattr(run_module, "make_console", lambda **_: screen)
+    assert run(*CLOCK, "--detector", "slow", "--seed", "0,1")[0] == 0
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
+    assert re.search(r"0/16 cells, 0:00:0\d so far", text)
+    assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, [01] s", text)
+
+
+def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):
+    code, out, _ = run(*CLOCK, "--detector", "rf,clock")
+    assert code == 0
+    assert out.index("ok           cartpole/clock") < out.index("ok           cartpole/rf")
+    lines = (tmp_path / "oodd-results" / "records.jsonl").read_text().splitlines()
+    assert ['"detector": "rf"' in line for line in lines] == [True] * 8 + [False] * 8
 
 
 def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, monkeypatch, tmp_path_factory):

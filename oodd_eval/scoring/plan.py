@@ -67,7 +67,7 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All units of a run, in the order in which they are begun and recorded.
+    """All units of a run, in the order in which they are recorded.
 
     Of each part the first `limit` trajectories are used; None means all. `groups` are those of
     anomalies by name, `strengths` the numbers of the split's strengths by environment.

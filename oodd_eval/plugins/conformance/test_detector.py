@@ -9,6 +9,7 @@ import contextlib
 import re
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from oodd_eval.plugins.contract import (
     StreamingDetector,
     check_scores,
     difference,
+    takes_progress,
 )
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 from oodd_eval.plugins.isolation.worker import reason_of
@@ -214,6 +216,23 @@ def test_same_seed(trial: Trial) -> None:
     with seeded_generators(1):
         advice = "draw all randomness from the seed"
         trial.must_agree(trial.fit(), f"{second} has other scores", advice)
+
+
+def test_progress(trial: Trial) -> None:
+    """Telling how far the fit is changes no score; shares rise, from 0 to 1."""
+    trial.fitted()
+    detector: Any = trial.make()
+    if not takes_progress(detector):
+        pytest.skip("its fit has no parameter progress")
+    shares: list[float] = []
+    with doing("fit with progress"):
+        detector.fit(tuple(trial.training()), progress=shares.append)
+    trial.must_agree(detector, "a detector whose fit told its progress has other scores")
+    rising = [0.0, *shares, 1.0]
+    problem = next((s for before, s in pairwise(rising) if not before <= s), None)
+    assert problem is None, (
+        f"fit called progress with {problem!r:.80}: expected shares that rise from 0 to 1"
+    )
 
 
 def test_deterministic(trial: Trial) -> None:
