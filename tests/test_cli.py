@@ -234,6 +234,60 @@ def test_an_unavailable_detector_is_listed_with_the_command_and_fails_when_run(
     assert "8 unavailable in" in out
 
 
+KNOWS = """
+class Knows(Good):
+    def __init__(self, *, seed=0, horizon=1, size=5):
+        super().__init__()
+        self.size = size
+    def score(self, x): return super().score(x) * self.size
+
+@hookimpl
+def oodd_detectors():
+    one = dict(parameters=declared_by({"size": 5}))
+    return [DetectorSpec(n, Knows, "", **one) for n in ("large", "small")]
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rows"),
+    [
+        (["--param=size=7"], ["large[h=1,seed=0,size=7]", "small[h=1,seed=0,size=7]"]),
+        (["--param=small.size=2"], ["large[h=1,seed=0]", "small[h=1,seed=0,size=2]"]),
+        (["--param=small.size=2", "--param=size=7"],
+         ["large[h=1,seed=0,size=7]", "small[h=1,seed=0,size=2]"]),
+        (["--config=c.toml"], ["large[h=1,seed=0,size=9]", "small[h=1,seed=0,size=2]"]),
+        (["--detector=clock,small", "--param=small.size=2"],
+         ["clock[h=1,seed=0]", "small[h=1,seed=0,size=2]"]),
+    ],
+)  # fmt: skip
+def test_parameters_of_one_detector_of_several(
+    run, monkeypatch, tmp_path, tmp_path_factory, arguments, rows
+):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+    (tmp_path / "c.toml").write_text("[param]\nlarge.size = 9\n'small.size' = 2\n")
+    first = (*CLOCK, "--detector=large,small", "--collect-only", "--anomaly=iid")
+    code, out, err = run(*first, *arguments)
+    assert (code, err) == (0, "")
+    assert [line.partition("::")[2] for line in out.splitlines()[:-1]] == rows
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ("size=7", "'size' is for all detectors, but clock has none of that name: write small"),
+        ("smal.size=7", "unknown detector 'smal': did you mean 'small'"),
+        ("small.sise=7", "did you mean 'size'"),
+    ],
+)
+def test_a_parameter_that_not_all_detectors_have_is_refused(
+    run, monkeypatch, tmp_path_factory, parameter, message
+):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+    code, _, err = run(*CLOCK, "--detector=clock,small", "--param", parameter)
+    assert code == 4
+    assert message in err
+
+
 def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, failing):
     (tmp_path / "run.toml").write_text(
         'detector = ["clock", "random"]\nenv = "all"\nsplit = "tiny"\nhorizon = [1, 2]\n'

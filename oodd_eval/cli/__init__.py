@@ -18,6 +18,8 @@ from click.shell_completion import CompletionItem
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
 from oodd_eval.names import memory_bytes, parameter, seconds, whole_numbers
 
+PARAM: Final = "a parameter, of one detector as DETECTOR.K=V; V is JSON or text"
+
 NAMES: Final = "names separated by commas, globs, or 'all'"
 
 Options: TypeAlias = SimpleNamespace
@@ -323,7 +325,7 @@ row_metrics_option: Final = click.option(
 )
 
 detector_options: Final = together(
-    click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text"),
+    click.option("--param", multiple=True, type=PARAMETER, help=PARAM),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
 )
 

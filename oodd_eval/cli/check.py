@@ -19,7 +19,7 @@ from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
 from oodd_eval.plugins.conformance import CheckReport
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.parameters import resolve_parameters
+from oodd_eval.plugins.parameters import parameters_by_detector, resolve_parameters
 
 _EXPECTED: Final = Converted(assignment, "NAME=REASON")
 STYLES: Final = {
@@ -53,7 +53,7 @@ def check(options: Options) -> int:
     from oodd_eval.testing import CHECKS, supervise
 
     limits = Limits(options.timeout, options.memory)
-    expecting, parameters = dict(options.expect), dict(options.param)
+    expecting = dict(options.expect)
     selects = expression(options.expression)
     plugins = discovered(options)
     try:
@@ -65,6 +65,7 @@ def check(options: Options) -> int:
     offer.require()
     spec = offer.spec
     check_known("check", CHECKS, *expecting)
+    parameters = parameters_by_detector([spec.name], dict(options.param))[spec.name]
     resolve_parameters(spec.name, spec.parameters, parameters, others=spec.other_parameters)
     names = [name for name in CHECKS if selects(name)]
     if not names:

@@ -9,7 +9,7 @@ import click
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, FILE, PARAMETER, Name, Options, command
+from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command
 from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
@@ -18,6 +18,7 @@ from oodd_eval.live.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
 from oodd_eval.live.scan_page import NUMBERS, cells, page, summary, titles
 from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
+from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.results.render.text import print_prose
 
 _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
@@ -45,7 +46,7 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
 )
 @click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
 @click.option("--detector", default=SCANNER, type=Name("detectors"), help="that judges")
-@click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text")
+@click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
 @click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
 @click.option(
     "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
@@ -72,7 +73,9 @@ def scan(options: Options) -> int:
         watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
         fdr=options.fdr,
         baseline=logs.baseline,
-        parameters=dict(options.param),
+        parameters=parameters_by_detector([options.detector], dict(options.param))[
+            options.detector
+        ],
         jobs=options.jobs,
     )
     _print(result, logs.notes, options)

@@ -113,8 +113,8 @@ class _Running:
     def __str__(self) -> str:
         """Return a line such as ``riqn on acrobot: fitting 40 %, 32 s``."""
         doing = "scoring" if self.share == 1 else "fitting"
-        known = f" {self.share:.0%}".replace("%", " %") if self.share and self.share < 1 else ""
-        return f"{self.name}: {doing}{known}, {time.perf_counter() - self.start:.0f} s"
+        done = f" {self.share:.0%}".replace("%", " %") if self.share and self.share < 1 else ""
+        return f"{self.name}: {doing}{done}, {time.perf_counter() - self.start:.0f} s"
 
 
 class TerminalReporter:
