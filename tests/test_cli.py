@@ -559,3 +559,23 @@ def test_info_describes_detectors_environments_and_anomalies(run):
     code, _, err = run("info", "gravty")
     assert code == 4
     assert "did you mean 'gravity'" in err
+
+
+def test_info_describes_splits_and_metrics(run):
+    code, out, _ = run("info", "tiny")
+    assert (code, out) == run("data", "info", "tiny")[:2]
+    assert out.startswith("split tiny, digest ")
+    code, out, _ = run("info", "standard")
+    assert code == 0
+    assert re.search(
+        r"^trajectories +500 train, 200 calibration, 50 test seeds$", out, re.MULTILINE
+    )
+    assert "not here: oodd-eval data build standard" in out
+    code, out, _ = run("info", "missed_at_5pct")
+    assert code == 0
+    assert re.search(r"^better side +lower is better$", out, re.MULTILINE)
+    assert re.search(r"^alarms +guaranteed, in at most 5 % of nominal", out, re.MULTILINE)
+    for name, near in (("auc_mached", "auc_matched"), ("tinny", "tiny"), ("standrad", "standard")):
+        code, _, err = run("info", name)
+        assert code == 4
+        assert f"did you mean '{near}'" in err
