@@ -384,6 +384,27 @@ def test_show_prints_what_the_run_printed(run, clock):
     assert "50.0 [50.0, 50.0]" in run("show", clock, "--intervals")[1]
 
 
+def test_show_finds_a_split_that_was_named_by_its_path(run, tmp_path):
+    make_split(tmp_path / "mine", name="mine")
+    assert run(*CLOCK, "--split", "mine")[0] == 0
+    code, out, _ = run("show", "oodd-results")
+    assert code == 0
+    assert out.startswith("split mine, digest ")
+    assert out.splitlines()[0].endswith(f", in {tmp_path / 'mine'}")
+    (tmp_path / "mine").rename(tmp_path / "moved")
+    code, _, err = run("show", "oodd-results")
+    assert code == 4
+    assert f"it was in {str(tmp_path / 'mine')!r}, and is not there any more; pass --split" in err
+    assert run("show", "oodd-results", "--split", "moved")[0] == 0
+    (tmp_path / "oodd-results" / "splits.json").write_text("[1")
+    code, _, err = run("show", "oodd-results")
+    assert code == 4
+    assert "the split 'mine' of these results is not found: unknown split 'mine'" in err
+    # Another run writes the damaged file anew.
+    assert run(*CLOCK, "--split", "moved")[0] == 0
+    assert run("show", "oodd-results")[0] == 0
+
+
 def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
     shutil.copytree(clock, "oodd-results")
     file = tmp_path / "oodd-results" / "records.jsonl"

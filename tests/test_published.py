@@ -287,9 +287,9 @@ def test_place_prints_the_rows_nearby_unless_all_are_asked_for(
     first = capsys.readouterr().out.split("Ranking by guaranteed alarms")[0]
     rows = [" ".join(line.split()) for line in first.splitlines()]
     start = next(i for i, line in enumerate(rows) if line.startswith("-"))
-    assert [re.sub(r" \d.*", "", line.lstrip("0123456789 ab")) for line in rows[start + 1 :]] == [
-        "(2 more rows)", "fair[h=5]", "> mine", "poor", "(1 more row)", "",
-    ]  # fmt: skip
+    above, better, mine, worse, below, blank, *_ = rows[start + 1 :]
+    assert (above, below, blank) == ("(2 more rows)", "(1 more row)", "")
+    assert [" fair" in better, " > mine " in mine, " poor " in worse] == [True, True, True]
     assert main(["leaderboard", "place", directory, "--all"]) == 0
     assert "more row" not in capsys.readouterr().out
     assert main(["leaderboard", "place", directory, "--all", "--csv"]) == 4

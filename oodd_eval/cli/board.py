@@ -167,9 +167,9 @@ def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
         lines.append(text)
     if placed.cells != placed.expected:
         lines.append(
-            f"These ranks are over the {counted(len(placed.cells), 'cell(s)')} that your rows have, "
-            f"of {len(placed.expected)}, and so not the board's. With few episodes hardly any "
-            "difference is significant. Run the other cells into the same directory."
+            f"These ranks are over the {counted(len(placed.cells), 'cell(s)')} that your rows "
+            f"have, of {len(placed.expected)}, and so not the board's. With few episodes hardly "
+            "any difference is significant. Run the other cells into the same directory."
         )
     if placed.rows - placed.published:
         lines.append(

@@ -20,7 +20,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.split import Split, load_split
+from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.accumulation import STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
@@ -82,10 +82,11 @@ def show(options: Options) -> int:
     passes = expression(options.expression)
     records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
     units: dict[str, str] = {}
+    splits: dict[str, Split] = {}
     if not options.stored:
         if options.alarm:
             records = [replace(record, alarm=options.alarm) for record in records]
-        splits = _splits(records, options.split)
+        splits = _splits(records, results, options.split)
         records = _recomputed(records, results, splits, rows=options.row_metrics)
         units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}
     say_notes(results.notes)
@@ -107,6 +108,11 @@ def show(options: Options) -> int:
         print(layout.render(report), end="")
         return code
     reporter = TerminalReporter(make_console())
+    for split in splits.values() if options.verbosity >= 0 else ():
+        if split.path not in split_directories().values():
+            reporter.console.print(
+                f"split {split.name}, digest {split.digest[:12]}, in {split.path}\n"
+            )
     print_sections(report.sections, reporter.console)
     if not options.detector:
         reporter.failures(records)
@@ -114,11 +120,10 @@ def show(options: Options) -> int:
     return code
 
 
-def _splits(records: list[Record], at: str | None) -> dict[str, Split]:
+def _splits(records: list[Record], results: ResultsDirectory, at: str | None) -> dict[str, Split]:
     """Open the splits of records, by their digests."""
-    # A split that is not the published one carries its digest behind its name.
-    names = {r.split_digest: at or r.split.partition("@")[0] for r in records}
-    return {digest: load_split(name) for digest, name in names.items()}
+    of_digest = {r.split_digest: r for r in records}
+    return {d: load_split(at) if at else results.split_of(r) for d, r in of_digest.items()}
 
 
 def _recomputed(

@@ -62,6 +62,7 @@ def run(
         raise UsageError("rows are streamed to detectors of plug-ins only: name one")
     if results:
         results.prepare()
+        results.note_split(split)
     executor = open_executor(settings, split, results)
     writer = RecordWriter(results)
     notify = Observers(plugins, observers).notify
