@@ -405,6 +405,54 @@ def test_show_finds_a_split_that_was_named_by_its_path(run, tmp_path):
     assert run("show", "oodd-results")[0] == 0
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("show --metric auc", "--metric is of the table of one detector: name it with --detector"),
+        ("show --csv --json", "--json and --csv|--csv and --json"),
+        ("show --stored --split tiny", "--split is for computing"),
+        ("show --stored --row-metrics", "--row-metrics is for computing"),
+        ("show --row-metrics", "--row-metrics is for splits without twins"),
+        ("show --wide --markdown", "--wide is for the terminal"),
+        ("show --wide --detector clock", "--wide prints tables of all detectors"),
+        ("show --csv --detector clock --metric auc", "--metric is of a table"),
+        ("compare --metric auc --against oodd-results", "--metric is for the comparison of two"),
+        ("compare clock range --fail auc:-1", "--fail is for a comparison with --against"),
+        ("compare --write-reference x --two-sided", "--two-sided is for a comparison: say with"),
+        ("compare --against oodd-results --keep auc", "--keep is for a reference"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(run, clock, arguments, message):
+    command, _, options = arguments.partition(" ")
+    shutil.copytree(clock, "oodd-results")
+    code, out, err = run(command, "oodd-results", *options.split())
+    assert (code, out) == (4, "")
+    assert any(text in err for text in message.split("|")), err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("check clock --env hopper", "--env is for anomalies, and clock is a detector"),
+        ("scan logs --watchdog x --jobs 2", "--jobs is for fits, and --watchdog judges without"),
+        ("scan logs --recipe x.toml --format csv", "--format is said by the recipe"),
+        ("reproduce --render-only --budget 2h", "--budget is for a run, and --render-only runs"),
+        ("run --detector clock --env all --split tiny --row-metrics", "splits without twins"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused_elsewhere(run, arguments, message):
+    code, out, err = run(*arguments.split())
+    assert (code, out) == (4, "")
+    assert message in err
+
+
+def test_data_of_one_detector(run):
+    run(*CLOCK, "--detector", "clock,range")
+    lines = run("show", "oodd-results", "--csv", "--detector", "range")[1].splitlines()
+    assert len(lines) == 1 + 8
+    assert not any(",clock," in line for line in lines)
+
+
 def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
     shutil.copytree(clock, "oodd-results")
     file = tmp_path / "oodd-results" / "records.jsonl"

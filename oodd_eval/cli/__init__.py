@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any, Final, TypeAlias
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
@@ -23,7 +24,10 @@ PARAM: Final = "a parameter, of one detector as DETECTOR.K=V; V is JSON or text"
 NAMES: Final = "names separated by commas, globs, or 'all'"
 
 Options: TypeAlias = SimpleNamespace
-"""The values of a command's options and arguments, with ``invocation``, the whole command line."""
+"""The values of a command's options and arguments.
+
+``invocation`` is the whole command line, ``passed`` has the options that are in it by their names.
+"""
 
 Commands: TypeAlias = Mapping[str, tuple[str, "str | Commands"]]
 """A summary for each name, with ``module:attribute`` of a command, or the commands of a group."""
@@ -78,7 +82,12 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> int:
         """Run the command and return its exit code."""
-        return self.handler(Options(**ctx.params, invocation=ctx.obj))
+        passed = {
+            p.name: p.opts[0]
+            for p in self.params
+            if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE
+        }
+        return self.handler(Options(**ctx.params, invocation=ctx.obj, passed=passed))
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""
@@ -348,6 +357,12 @@ def fit_options(timeout: str) -> Decorator:
     choice = click.Choice(["auto", "cpu", "cuda"])
     device = click.option("--device", type=choice, help="where networks of detectors compute")
     return together(jobs_option, device, limit_options("a fit with its scores", timeout))
+
+
+def refuse(options: Options, names: Iterable[str], why: str) -> None:
+    """Raise `UsageError` for the first of some options that was passed: it would do nothing."""
+    for option in (options.passed[name] for name in names if name in options.passed):
+        raise UsageError(f"{option} {why}")
 
 
 def say_notes(notes: Iterable[str]) -> None:

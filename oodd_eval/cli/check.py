@@ -12,6 +12,7 @@ from oodd_eval.cli import (
     detector_options,
     limit_options,
     load,
+    refuse,
     say,
 )
 from oodd_eval.cli.terminal import discovered, make_console
@@ -22,6 +23,7 @@ from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import parameters_by_detector, resolve_parameters
 
 _EXPECTED: Final = Converted(assignment, "NAME=REASON")
+_OF_DETECTORS: Final = ("param", "horizon", "seed", "expect", "timeout", "memory")
 STYLES: Final = {
     "passed": "green",
     "failed": "bold red",
@@ -60,8 +62,10 @@ def check(options: Options) -> int:
         offer = plugins.offer(options.name)
     except UnknownNameError:
         if options.name in plugins.custom_specs:
+            refuse(options, _OF_DETECTORS, f"is for detectors, and {options.name} is none")
             return int(load("oodd_recording.commands:check_custom")(options, selects))
         raise
+    refuse(options, ["env"], f"is for anomalies, and {options.name} is a detector")
     offer.require()
     spec = offer.spec
     check_known("check", CHECKS, *expecting)

@@ -29,6 +29,7 @@ from oodd_eval.cli import (
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
+from oodd_eval.data.layout import log_facts
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.promise import PromiseFinding
@@ -102,6 +103,8 @@ def run(options: Options) -> int:
     limits = Limits(options.timeout, options.memory, hidden)
     plugins = discovered(options, limits)
     environments, anomalies = split.select(options.env, options.anomaly)
+    if options.row_metrics and not any(_lacks_twins(split, name) for name in environments):
+        raise UsageError(f"--row-metrics is for splits without twins, unlike split {split.name}")
     plan = make_plan(
         plugins,
         split=split,
@@ -158,6 +161,12 @@ def run(options: Options) -> int:
     if done.interrupted:
         return 2
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
+
+
+def _lacks_twins(split: Split, environment: str) -> bool:
+    """Tell whether an environment is of logs whose anomalous episodes have no nominal twins."""
+    facts = log_facts(split.manifest["environments"][environment])
+    return facts is not None and not facts.paired
 
 
 def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:

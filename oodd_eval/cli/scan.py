@@ -9,7 +9,7 @@ import click
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command
+from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
 from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
@@ -63,6 +63,11 @@ def scan(options: Options) -> int:
     that its files are relative to. Each episode is judged by a fit on the others, whatever labels
     say. Most have to be nominal. The exit code is 1 when an episode is odd.
     """
+    if options.watchdog:
+        judges = "is for fits, and --watchdog judges without one: leave out one of them"
+        refuse(options, ["detector", "param", "jobs"], judges)
+    if options.recipe:
+        refuse(options, ["format", "read"], "is said by the recipe: write it there")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
     logs = read_logs(options.logs, recipe, options.format or "", dict(options.read), options.window)

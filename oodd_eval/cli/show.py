@@ -13,6 +13,7 @@ from oodd_eval.cli import (
     Options,
     command,
     expression_option,
+    refuse,
     row_metrics_option,
     say,
     say_notes,
@@ -28,7 +29,7 @@ from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
-from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
 
@@ -73,6 +74,17 @@ def show(options: Options) -> int:
         raise UsageError(
             f"--alarm {options.alarm} computes figures that --stored would not show: leave out one"
         )
+    layout = _format(options)
+    if options.stored:
+        refuse(options, ["split", "row_metrics"], "is for computing, and --stored computes nothing")
+    if not options.detector:
+        refuse(options, ["metric"], "is of the table of one detector: name it with --detector")
+    if layout:
+        refuse(options, ["wide"], "is for the terminal: a format has all metrics")
+    if options.detector:
+        refuse(options, ["wide"], "prints tables of all detectors: leave out --detector")
+    if layout and not layout.tables:
+        refuse(options, ["metric"], "is of a table, and that format has all metrics of a cell")
     if options.metric:
         check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
@@ -90,12 +102,15 @@ def show(options: Options) -> int:
         records = _recomputed(records, results, splits, rows=options.row_metrics)
         units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}
     say_notes(results.notes)
+    if options.row_metrics and records and all(r.paired for r in records):
+        raise UsageError("--row-metrics is for splits without twins, and these results have twins")
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))
     if options.detector:
         check_known("detector of these results", {r.detector for r in records}, options.detector)
-    layout = next((FORMATS[name] for name in FORMATS if getattr(options, name)), None)
+        if layout and not layout.tables:
+            records = [r for r in records if r.detector == options.detector]
     report = Report(
         records,
         intervals=options.intervals,
@@ -118,6 +133,14 @@ def show(options: Options) -> int:
         reporter.failures(records)
     reporter.console.print(summary(records))
     return code
+
+
+def _format(options: Options) -> Format | None:
+    """Return the format that is asked for, if one is."""
+    names = [name for name in FORMATS if getattr(options, name)]
+    if len(names) > 1:
+        raise UsageError(f"--{names[0]} and --{names[1]} are two formats: leave out one")
+    return FORMATS[names[0]] if names else None
 
 
 def _splits(records: list[Record], results: ResultsDirectory, at: str | None) -> dict[str, Split]:

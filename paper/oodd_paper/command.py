@@ -1,8 +1,20 @@
 """``oodd-eval reproduce``: compute the paper's tables, figures and claims."""
 
+from typing import Final
+
 import click
 
-from oodd_eval.cli import DIRECTORY, TIME, Name, Options, command, fit_options, load, say_notes
+from oodd_eval.cli import (
+    DIRECTORY,
+    TIME,
+    Name,
+    Options,
+    command,
+    fit_options,
+    load,
+    refuse,
+    say_notes,
+)
 from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
@@ -19,6 +31,11 @@ from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
 from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
 from oodd_paper.page import publish
 from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
+
+_OF_RUNS: Final = (
+    *("tier", "split", "only", "plan", "budget", "fresh", "build"),
+    *("jobs", "device", "timeout", "memory"),
+)
 
 
 @command(
@@ -71,6 +88,7 @@ def reproduce(options: Options) -> int:
     """
     check_known("tier", TIERS, options.tier)
     if options.render_only:
+        refuse(options, _OF_RUNS, "is for a run, and --render-only runs nothing: leave out one")
         header = Reproduction.load(options.output)
         records = load_records(header, options.records or [options.output])
         return _render(options, header, records)

@@ -21,6 +21,7 @@ from oodd_eval.cli import (
     Options,
     command,
     jobs_option,
+    refuse,
     say,
 )
 from oodd_eval.cli.check import STYLES
@@ -370,6 +371,8 @@ def check_custom(options: Options, selects: Predicate) -> int:
             if isinstance(s, EnvironmentSpec) and _package_of(s) == _package_of(spec)
         )
         environment = options.env or next(iter([*spec.environments, *beside, "cartpole"]))
+    else:
+        refuse(options, ["env"], f"is for anomalies, and {spec.name} is an environment")
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
     for name, check in custom_checks(spec, environment):
