@@ -282,7 +282,7 @@ def test_notes_name_the_split_and_what_is_missing():
         "Split mini, digest abababababab, protocol 1",
         "first 3 trajectories",
         "sensor anomalies are without calibration, shutdown.",
-        "uncommitted changes of oodd-eval's checkout: 1 cells",
+        "uncommitted changes of oodd-eval's checkout: 1 cell",
     ):
         assert phrase in notes
     assert "uncommitted" not in " ".join(tables.notes(Board(records[:1])))

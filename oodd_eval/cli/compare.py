@@ -9,7 +9,7 @@ from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.names import expression, select
+from oodd_eval.names import counted, expression, select
 from oodd_eval.results import compare as regression
 from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
 from oodd_eval.results.render.data import junit
@@ -85,7 +85,7 @@ def compare(options: Options) -> int:
         keep = select("metric", options.keep, NAMES) if options.keep else ()
         write_reference(now.records, options.write_reference, keep=keep)
         if options.verbosity >= 0:
-            print(f"{len(now.records)} cells written to {options.write_reference}")
+            print(f"{counted(len(now.records), 'cell(s)')} written to {options.write_reference}")
     return code
 
 

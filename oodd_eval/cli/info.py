@@ -27,6 +27,7 @@ from oodd_eval.data.split import imported_environments, split_directories
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.metrics.accumulation import NOUNS
 from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -88,12 +89,15 @@ def _environment(info: EnvironmentInfo) -> Lines:
     yield "environment", f"{info.id} ({info.title} of the paper)"
     yield "simulator", info.simulator
     yield "policy", f"{info.policy}, mean return {info.paper_return:g} in the paper"
-    yield "longest episode", f"{info.episode_cap} steps"
+    yield "longest episode", counted(info.episode_cap, "step(s)")
     for i, sensor in enumerate(info.sensors):
-        yield "" if i else f"{info.observation_dim} sensors", f"{sensor.name} ({sensor.unit})"
-    kind = "discrete actions" if info.discrete else "actions"
+        yield (
+            "" if i else counted(info.observation_dim, "sensor(s)"),
+            f"{sensor.name} ({sensor.unit})",
+        )
+    kind = "discrete action(s)" if info.discrete else "action(s)"
     for i, action in enumerate(info.actions):
-        yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
+        yield "" if i else counted(info.action_dim, kind), f"{action.name} ({action.unit})"
 
 
 def _custom(spec: Spec, origin: str) -> Lines:
@@ -105,10 +109,10 @@ def _custom(spec: Spec, origin: str) -> Lines:
         yield "environments", ", ".join(spec.environments) or "any"
         return
     yield "environment", f"{spec.name} ({spec.title or spec.name}), {origin}"
-    yield "longest episode", f"{spec.episode_cap} steps"
-    for kind, columns in (("sensors", spec.sensors), ("actions", spec.actions)):
+    yield "longest episode", counted(spec.episode_cap, "step(s)")
+    for kind, columns in (("sensor(s)", spec.sensors), ("action(s)", spec.actions)):
         for i, column in enumerate(columns):
-            yield "" if i else f"{len(columns)} {kind}", f"{column.name} ({column.unit})"
+            yield "" if i else counted(len(columns), kind), f"{column.name} ({column.unit})"
     yield "attributes", ", ".join(spec.attributes) or "none"
 
 
@@ -119,10 +123,13 @@ def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
         if text := getattr(facts, key):
             yield key, text
     for part, group in entry["groups"].items():
-        yield part, f"{group['trajectories']} episodes"
+        yield part, counted(group["trajectories"], "episode(s)")
     for kind in ("sensors", "actions"):
         for i, column in enumerate(entry[kind]):
-            yield "" if i else f"{len(entry[kind])} {kind}", f"{column['name']} ({column['unit']})"
+            yield (
+                "" if i else counted(len(entry[kind]), f"{kind[:-1]}(s)"),
+                f"{column['name']} ({column['unit']})",
+            )
     yield "more", f"oodd-eval data info {split}"
 
 

@@ -18,6 +18,7 @@ from oodd_eval.live.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
 from oodd_eval.live.scan_page import NUMBERS, cells, page, summary, titles
 from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
+from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.results.render.text import print_prose
 
@@ -123,7 +124,7 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         console.print("")
         left = len(result.episodes) - len(listed)
         for note in [
-            *([f"Not listed: {left} episodes that are less odd (-v lists all)."] if left else []),
+            *([f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."] * (left > 0)),
             *notes,
             *result.notes,
             *_on_labels(result, fitted=not options.watchdog),
@@ -141,8 +142,9 @@ def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
         return
     odd = sum(one.odd for one in labelled)
     many = fitted and len(labelled) > len(result.episodes) * _LARGEST_SHARE
+    anomalous = counted(len(labelled), "episode(s)")
     yield (
-        f"{len(labelled)} episodes are anomalous by their labels, {odd} of them odd here."
+        f"Anomalous by their labels: {anomalous}, {odd} of them odd here."
         + " Where more than a fifth are, they pass for nominal: scan nominal logs alone, or judge "
         "by a watchdog that was fitted on these (--watchdog FILE)." * many
     )

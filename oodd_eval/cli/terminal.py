@@ -48,6 +48,7 @@ from oodd_eval.scoring.plan import Plan, Unit
 SILENCE: Final = 30.0
 """Seconds without a line after which a run says what it is at, where it is no terminal."""
 
+_PART: Final = "trajector(y/ies) of each part"
 _MOST_RUNNING: Final = 8  # units that are named at a time
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
@@ -172,7 +173,7 @@ class TerminalReporter:
         if self.verbosity < 0:
             return
         names = dict.fromkeys(u.setting.detector for u in plan.units)
-        limited = f", first {plan.limit} trajectories of each part" if plan.limit else ""
+        limited = f", first {counted(plan.limit, _PART)}" if plan.limit else ""
         self._print(f"oodd-eval {__version__}, protocol {PROTOCOL}")
         self._print(f"split {plan.split}, digest {plan.split_digest[:12]}{limited}")
         self._print(f"detectors: {', '.join(names)}")

@@ -17,7 +17,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.catalogue import LEVELS, metric_info
-from oodd_eval.names import check_known, select
+from oodd_eval.names import check_known, counted, select
 from oodd_eval.results import plots
 from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -84,7 +84,8 @@ class Results(Sequence[Record]):
         """Return one line: how many cells of what, and how many failed."""
         states = ", ".join(f"{n} {status}" for status, n in Counter(r.status for r in self).items())
         splits = ", ".join(dict.fromkeys(r.split for r in self)) or "nothing"
-        return f"Results({len(self)} cells of {splits}: {', '.join(self.rows)}; {states or 'none'})"
+        cells = counted(len(self), "cell(s)")
+        return f"Results({cells} of {splits}: {', '.join(self.rows)}; {states or 'none'})"
 
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""

@@ -21,7 +21,7 @@ from oodd_eval.data.files import packed, write_bytes
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import NAMES, metric_info
-from oodd_eval.names import Predicate, check_known
+from oodd_eval.names import Predicate, check_known, counted
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Cell
@@ -230,8 +230,9 @@ def compare(
         inside = {c for c in expected if c.environment in envs and (c.setting, c.seed) in rows}
         if outside := expected.keys() - inside:
             notes.append(
-                f"Missing in {now.where}: {len(outside)} cells of the reference (split "
-                f"{conditions.split}; environments {_listed(c.environment for c in outside)}; "
+                f"Missing in {now.where}: {counted(len(outside), 'cell(s)')} of the reference "
+                f"(split {conditions.split}; "
+                f"environments {_listed(c.environment for c in outside)}; "
                 f"detectors {_listed(c.setting.detector for c in outside)}), whose environment or "
                 "detector was not run at all. Choose cells to compare with -k."
             )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
+from oodd_eval.names import counted
 from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, grouped
 from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
@@ -192,17 +193,17 @@ def comparison_section(comparison: Comparison, *, everything: bool = False) -> S
     within = [d for d in compared if d.verdict == "within"]
     title = "Regression check passed"
     if failures := len(comparison.failures):
-        title = f"Regression check failed: {failures} of {len(compared)} figures"
-    units = {"cell": "cells", "group": "group means", "mean": "means"}[comparison.by]
+        title = f"Regression check failed: {failures} of {counted(len(compared), 'figure(s)')}"
+    units = {"cell": "cell(s)", "group": "group mean(s)", "mean": "mean(s)"}[comparison.by]
     metrics = list(dict.fromkeys(d.tolerance.metric for d in compared))
     counts = Counter(d.verdict for d in compared)
     verdicts = ", ".join(f"{counts[v]} {v}" for v in MEANINGS if counts[v])
     new = len({str(d) for d in comparison.differences if d.verdict == "new"})
-    more = f"; {new} new cells are not in the reference" if new else ""
+    more = f"; not in the reference: {counted(new, 'new cell(s)')}" if new else ""
     name = metrics[0] if len(metrics) == 1 else f"{len(metrics)} metrics"
     return Section(
         title,
-        [f"{len(set(map(str, compared)))} {units} compared in {name}: {verdicts}{more}."],
+        [f"{counted(len(set(map(str, compared))), units)} compared in {name}: {verdicts}{more}."],
         tables=_comparison_tables(listed, comparison.by),
         fold="Differences within the tolerance",
         folded=_comparison_tables(within, comparison.by),

@@ -13,6 +13,7 @@ from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.metrics.promise import enough_episodes
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
@@ -362,7 +363,7 @@ def findings(board: Board) -> list[str]:
             if value > beaten:
                 sentences.append(
                     f"{simple} beats {entry} in mean {info.title}: {info.text(value)} against "
-                    f"{info.text(beaten)} over {cells} cell{'s' if cells != 1 else ''}."
+                    f"{info.text(beaten)} over {counted(cells, 'cell(s)')}."
                 )
     return sentences
 
@@ -405,7 +406,8 @@ def notes(board: Board) -> list[str]:
     if not board.paired:
         lines = [f"Split {board.split}, {facts}, episodes without twins.", *_episodes(board)]
     if board.limit is not None:
-        lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
+        first = counted(board.limit, "trajector(y/ies)")
+        lines.append(f"Limited to the first {first} of each part: for trying.")
     cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
     if len(cells) > len({cell[:2] for cell in cells}):
         lines.append(
@@ -425,7 +427,8 @@ def notes(board: Board) -> list[str]:
         )
     lines += uncalibrated(board)
     if changed := sum(bool(r.provenance.get("git_dirty")) for r in board.records):
-        lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {changed} cells.")
+        cells_changed = counted(changed, "cell(s)")
+        lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {cells_changed}.")
     lines.append(
         f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
         "* marks a mean over fewer cells than the split has there. A failure is shown as its state."

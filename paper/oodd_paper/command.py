@@ -19,7 +19,7 @@ from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
-from oodd_eval.names import check_known, select
+from oodd_eval.names import check_known, counted, select
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
@@ -140,7 +140,9 @@ def _run(options: Options) -> int:
     code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
     if outcome.left:
         why = "interrupted" if outcome.interrupted else "the budget is used up"
-        left_over = f"{outcome.left} units left, about {duration(progress.remaining())}"
+        left_over = (
+            f"{counted(outcome.left, 'unit(s)')} left, about {duration(progress.remaining())}"
+        )
         console.print(f"{why}: {left_over}; the same command goes on")
     return 2 if outcome.left else code
 

@@ -18,6 +18,7 @@ import pytest
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.metrics.auc import auc
+from oodd_eval.names import counted
 from oodd_eval.plugins.conformance.side_effects import DAEMON, outside, seeded_generators
 from oodd_eval.plugins.conformance.trial import (
     SENSORS,
@@ -371,7 +372,7 @@ def _rows(trial: Trial) -> tuple[int, ...]:
 def test_short_trajectories(trial: Trial) -> None:
     """Episodes of one and two observations, and as short as the horizon, are scored."""
     for n in sorted({1, 2, trial.horizon, trial.horizon + 1}):
-        what = f"an episode of {n} observation{'s' if n > 1 else ''}"
+        what = f"an episode of {counted(n, 'observation(s)')}"
         _must_be_finite(trial, trial.fitted(), trial.episode(7, n), what)
 
 
