@@ -180,7 +180,7 @@ def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
     monkeypatch.setattr(terminal, "SILENCE", 0.25)
     code, out, _ = run(*slow)
     assert code == 0
-    assert 1 <= len(re.findall(r"^slow on cartpole: fitting 40 %, [01] s$", out, re.MULTILINE)) <= 4
+    assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
     assert "slow on" not in run(*slow, "-q")[1]
 
 
@@ -190,8 +190,8 @@ def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_f
     monkeypatch.setattr(run_module, "make_console", lambda **_: screen)
     assert run(*CLOCK, "--detector", "slow", "--seed", "0,1")[0] == 0
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
-    assert re.search(r"0/16 cells, 0:00:0\d so far", text)
-    assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, [01] s", text)
+    assert re.search(r"0/16 cells, 0:00:\d\d so far", text)
+    assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, \d+ s", text)
 
 
 def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):

@@ -353,7 +353,7 @@ def test_a_reference_is_written_of_the_selected_cells(run, tmp_path):
     code, out, _ = run("same", "--write-reference", "new.json", "-k", "hopper")
     assert (code, out) == (0, "2 cells written to new.json\n")
     assert run("worse", "--against", "new.json", "--fail", "auc:0.5")[0] == 0
-    assert "1 new cells" in run("same", "--against", "new.json")[1]
+    assert "1 new cell" in run("same", "--against", "new.json")[1]
 
 
 def test_a_reference_can_be_compared_with_and_then_replaced(run):

@@ -74,6 +74,8 @@ def show(options: Options) -> int:
         raise UsageError(
             f"--alarm {options.alarm} computes figures that --stored would not show: leave out one"
         )
+    if options.metric:
+        check_known("metric", NAMES, options.metric)
     layout = _format(options)
     if options.stored:
         refuse(options, ["split", "row_metrics"], "is for computing, and --stored computes nothing")
@@ -85,8 +87,6 @@ def show(options: Options) -> int:
         refuse(options, ["wide"], "prints tables of all detectors: leave out --detector")
     if layout and not layout.tables:
         refuse(options, ["metric"], "is of a table, and that format has all metrics of a cell")
-    if options.metric:
-        check_known("metric", NAMES, options.metric)
     results = ResultsDirectory(options.directory)
     records = results.records()
     known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
