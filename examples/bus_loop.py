@@ -93,9 +93,15 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     data = load_split("mini").environment("cartpole")
     parameters = PARAMETERS.get(options.detector)
+    episodes = f"{len(data.train)} nominal episodes of CartPole"
+    print(f"fitting {options.detector} on {episodes}, which takes seconds ...", flush=True)
+    start = time.monotonic()
     watchdog = Watchdog.fit(options.detector, data, rate=RATE, parameters=parameters)
     bus = Bus()
     robot = Robot(bus, watchdog.sensors, options.fault, options.topic, options.onset, options.seed)
+    print(f"fitted in {time.monotonic() - start:.1f} s; {watchdog.promise}")
+    fault = f"{options.topic}: {options.fault} from step {options.onset} on"
+    print(f"{options.steps} steps at {RATE} Hz; {'no fault' if options.fault == 'none' else fault}")
     late = 0
     monitor = TerminalMonitor("bus") if options.monitor else contextlib.nullcontext()
     with monitor as shown:

@@ -77,7 +77,9 @@ def evaluate(
     horizon, seed
         Prediction horizon in steps, at least 1, and seeds of the detectors.
     parameters
-        Arguments of factories besides seed and horizon.
+        Arguments of factories besides seed and horizon: those of all detectors by name, those of
+        one installed detector as ``{"panel": {"forecast": "linear"}}`` or
+        ``{"panel.forecast": "linear"}``.
     limit
         Use the first so many trajectories of each part.
     output
@@ -135,7 +137,9 @@ def evaluate(
         raise UsageError("no detector was named: expected at least one")
     installed = any(isinstance(d, str) for d in tried)
     plugins = discover() if installed else discover(only=())
-    names = [_offer(plugins, d, arguments) for d in tried]
+    by_name = {d for d in tried if isinstance(d, str)}
+    shared = {k: v for k, v in arguments.items() if "." not in k and k not in by_name}
+    names = [_offer(plugins, d, shared) for d in tried]
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
     selected = opened.select(

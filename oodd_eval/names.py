@@ -36,12 +36,13 @@ def check_known(kind: str, known: Collection[str], *names: str) -> None:
 
 
 def counted(n: int, noun: str) -> str:
-    """Return a number with a noun in singular or plural, whose ending is ``(s)``.
+    """Return a number with a noun in singular or plural, whose ending is ``(s)`` or ``(y/ies)``.
 
-    >>> counted(1, "row(s) left out"), counted(3, "episode(s)")
-    ('1 row left out', '3 episodes')
+    >>> counted(1, "row(s) left out"), counted(3, "episode(s)"), counted(0, "entr(y/ies)")
+    ('1 row left out', '3 episodes', '0 entries')
     """
-    return f"{n} {noun.replace('(s)', 's' * (n != 1))}"
+    singular, plural = (r"\1", "") if n == 1 else (r"\2", "s")
+    return f"{n} " + re.sub(r"\((\w+)/(\w+)\)", singular, noun).replace("(s)", plural)
 
 
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:

@@ -14,7 +14,7 @@ from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.names import select
+from oodd_eval.names import counted, select
 from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
@@ -82,7 +82,8 @@ class Cells:
     def pytest_report_header(self) -> str:
         """Return a line on what is checked, and against what."""
         where = f"against {self.reference.where}" if self.reference else "without a reference"
-        return f"oodd-eval: {len(self.names)} cells in {len(self.plan.units)} fits, {where}"
+        cells = counted(len(self.names), "cell(s)")
+        return f"oodd-eval: {cells} in {counted(len(self.plan.units), 'fit(s)')}, {where}"
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, session: pytest.Session, items: list[Any]) -> None:

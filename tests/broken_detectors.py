@@ -26,11 +26,13 @@ class Good:
         self.seed, self.horizon, self.power, self.baseline = seed, horizon, power, baseline
         self.std_ = None
 
-    def fit(self, nominal):
+    def fit(self, nominal, progress=None):
         rows = np.concatenate([x.observations for x in nominal]).astype(np.float64)
         std = rows.std(axis=0)
         self.std_ = np.where(std < 1e-6, 1.0, std)
         self.reset()
+        for share in (0.5, 1.0) if progress else ():
+            progress(share)
 
     def score(self, x):
         if self.std_ is None:
@@ -306,6 +308,24 @@ class ReadsTheGlobalState(Good):
     def fit(self, nominal):
         super().fit(nominal)
         self.std_ *= 1 + np.random.get_state()[1][0] % 1000 / 2000  # noqa: NPY002
+
+
+@breaks("progress", "a detector whose fit told its progress has other scores: at t =")
+class LearnsWhenWatched(Good):
+    def fit(self, nominal, progress=None):
+        super().fit(nominal)
+        if progress is not None:
+            progress(1.0)
+            self.std_ *= 2
+
+
+@breaks("progress", "fit called progress with 0.5: expected shares that rise")
+class StartsAgain(Good):
+    def fit(self, nominal, progress=None):
+        super().fit(nominal)
+        for share in (1.0, 0.5):
+            if progress is not None:
+                progress(share)
 
 
 @breaks("refit", "a detector that was fitted on something else before has")

@@ -151,7 +151,7 @@ def test_an_entry_that_is_not_valid_is_refused(repository, add, capsys):
     (place / "records.jsonl").write_text("{}\n")
     repository.commit()
     assert repository.verify() == 1
-    assert "1 of 1 entries are refused" in capsys.readouterr().err
+    assert "refused: 1 of 1 entry" in capsys.readouterr().err
 
 
 def test_an_entry_that_copies_another_one_is_refused(repository, add, capsys):

@@ -14,10 +14,12 @@ import pytest
 from helpers_docs import parse
 from helpers_plugins import install
 from helpers_split import make_split
+from rich.console import Console
 
 from oodd_eval import cli as cli_package
-from oodd_eval.cli import listing
+from oodd_eval.cli import listing, terminal
 from oodd_eval.cli import main as cli
+from oodd_eval.cli import run as run_module
 from oodd_eval.errors import MissingExtraError
 
 
@@ -81,7 +83,7 @@ def test_collect_only_prints_cells_and_does_nothing(run, tmp_path):
     assert code == 0
     assert out.splitlines() == [
         *(f"tiny/cartpole/{a}::clock[h=1,seed=0]" for a in ("iid", "wind-l2r", "wind-r2l")),
-        "3 cells in 1 fits",
+        "3 cells in 1 fit",
     ]
     assert list(tmp_path.iterdir()) == []
 
@@ -136,6 +138,68 @@ def test_x_stops_at_the_first_failure(run, failing):
     )
     assert code == 1
     assert re.search(r"^8 error in", out, re.MULTILINE)
+    assert out.splitlines()[-1] == "0 of 4 fits are kept; the same command continues"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "last"),
+    [
+        (["--detector=fails"], "0 of 1 fit is kept; the same command fits the other again"),
+        (["--detector=fails,clock"], "1 of 2 fits is kept; the same command fits the other again"),
+        (
+            ["--detector=fails,clock", "--fresh"],
+            "1 of 2 fits is kept; the same command without --fresh fits the other again",
+        ),
+    ],
+)
+def test_the_last_line_of_a_run_with_failures_says_what_is_kept(run, failing, arguments, last):
+    _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+    _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+
+
+SLOW = """
+class Slow(Good):
+    def fit(self, nominal, progress=None):
+        super().fit(nominal)
+        if progress:
+            progress(0.4)
+        time.sleep(1)
+
+@hookimpl
+def oodd_detectors():
+    return offer(slow=Slow)
+"""
+
+
+def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
+    slow = (*CLOCK, "--detector", "slow", "--fresh")
+    assert "slow on" not in run(*slow)[1]
+    monkeypatch.setattr(terminal, "SILENCE", 0.25)
+    code, out, _ = run(*slow)
+    assert code == 0
+    assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
+    assert "slow on" not in run(*slow, "-q")[1]
+
+
+def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_factory):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
+    screen = Console(file=io.StringIO(), force_terminal=True, width=80, markup=False)
+    monkeypatch.setattr(run_module, "make_console", lambda **_: screen)
+    assert run(*CLOCK, "--detector", "slow", "--seed", "0,1")[0] == 0
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
+    assert re.search(r"0/16 cells, 0:00:\d\d so far", text)
+    assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, \d+ s", text)
+
+
+def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):
+    code, out, _ = run(*CLOCK, "--detector", "rf,clock")
+    assert code == 0
+    assert out.index("ok           cartpole/clock") < out.index("ok           cartpole/rf")
+    lines = (tmp_path / "oodd-results" / "records.jsonl").read_text().splitlines()
+    assert ['"detector": "rf"' in line for line in lines] == [True] * 8 + [False] * 8
 
 
 def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, monkeypatch, tmp_path_factory):
@@ -168,6 +232,60 @@ def test_an_unavailable_detector_is_listed_with_the_command_and_fails_when_run(
     code, out, _ = run("run", "--detector", "far", "--env", "cartpole", "--split", "tiny")
     assert code == 1
     assert "8 unavailable in" in out
+
+
+KNOWS = """
+class Knows(Good):
+    def __init__(self, *, seed=0, horizon=1, size=5):
+        super().__init__()
+        self.size = size
+    def score(self, x): return super().score(x) * self.size
+
+@hookimpl
+def oodd_detectors():
+    one = dict(parameters=declared_by({"size": 5}))
+    return [DetectorSpec(n, Knows, "", **one) for n in ("large", "small")]
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rows"),
+    [
+        (["--param=size=7"], ["large[h=1,seed=0,size=7]", "small[h=1,seed=0,size=7]"]),
+        (["--param=small.size=2"], ["large[h=1,seed=0]", "small[h=1,seed=0,size=2]"]),
+        (["--param=small.size=2", "--param=size=7"],
+         ["large[h=1,seed=0,size=7]", "small[h=1,seed=0,size=2]"]),
+        (["--config=c.toml"], ["large[h=1,seed=0,size=9]", "small[h=1,seed=0,size=2]"]),
+        (["--detector=clock,small", "--param=small.size=2"],
+         ["clock[h=1,seed=0]", "small[h=1,seed=0,size=2]"]),
+    ],
+)  # fmt: skip
+def test_parameters_of_one_detector_of_several(
+    run, monkeypatch, tmp_path, tmp_path_factory, arguments, rows
+):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+    (tmp_path / "c.toml").write_text("[param]\nlarge.size = 9\n'small.size' = 2\n")
+    first = (*CLOCK, "--detector=large,small", "--collect-only", "--anomaly=iid")
+    code, out, err = run(*first, *arguments)
+    assert (code, err) == (0, "")
+    assert [line.partition("::")[2] for line in out.splitlines()[:-1]] == rows
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ("size=7", "'size' is for all detectors, but clock has none of that name: write small"),
+        ("smal.size=7", "unknown detector 'smal': did you mean 'small'"),
+        ("small.sise=7", "did you mean 'size'"),
+    ],
+)
+def test_a_parameter_that_not_all_detectors_have_is_refused(
+    run, monkeypatch, tmp_path_factory, parameter, message
+):
+    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+    code, _, err = run(*CLOCK, "--detector=clock,small", "--param", parameter)
+    assert code == 4
+    assert message in err
 
 
 def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, failing):
@@ -264,6 +382,75 @@ def test_show_prints_what_the_run_printed(run, clock):
     assert "All metrics" not in shown
     assert "All metrics" in run("show", clock, "--wide")[1]
     assert "50.0 [50.0, 50.0]" in run("show", clock, "--intervals")[1]
+
+
+def test_show_finds_a_split_that_was_named_by_its_path(run, tmp_path):
+    make_split(tmp_path / "mine", name="mine")
+    assert run(*CLOCK, "--split", "mine")[0] == 0
+    code, out, _ = run("show", "oodd-results")
+    assert code == 0
+    assert out.startswith("split mine, digest ")
+    assert out.splitlines()[0].endswith(f", in {tmp_path / 'mine'}")
+    (tmp_path / "mine").rename(tmp_path / "moved")
+    code, _, err = run("show", "oodd-results")
+    assert code == 4
+    assert f"it was in {str(tmp_path / 'mine')!r}, and is not there any more; pass --split" in err
+    assert run("show", "oodd-results", "--split", "moved")[0] == 0
+    (tmp_path / "oodd-results" / "splits.json").write_text("[1")
+    code, _, err = run("show", "oodd-results")
+    assert code == 4
+    assert "the split 'mine' of these results is not found: unknown split 'mine'" in err
+    # Another run writes the damaged file anew.
+    assert run(*CLOCK, "--split", "moved")[0] == 0
+    assert run("show", "oodd-results")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("show --metric auc", "--metric is of the table of one detector: name it with --detector"),
+        ("show --csv --json", "--json and --csv|--csv and --json"),
+        ("show --stored --split tiny", "--split is for computing"),
+        ("show --stored --row-metrics", "--row-metrics is for computing"),
+        ("show --row-metrics", "--row-metrics is for splits without twins"),
+        ("show --wide --markdown", "--wide is for the terminal"),
+        ("show --wide --detector clock", "--wide prints tables of all detectors"),
+        ("show --csv --detector clock --metric auc", "--metric is of a table"),
+        ("compare --metric auc --against oodd-results", "--metric is for the comparison of two"),
+        ("compare clock range --fail auc:-1", "--fail is for a comparison with --against"),
+        ("compare --write-reference x --two-sided", "--two-sided is for a comparison: say with"),
+        ("compare --against oodd-results --keep auc", "--keep is for a reference"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(run, clock, arguments, message):
+    command, _, options = arguments.partition(" ")
+    shutil.copytree(clock, "oodd-results")
+    code, out, err = run(command, "oodd-results", *options.split())
+    assert (code, out) == (4, "")
+    assert any(text in err for text in message.split("|")), err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("check clock --env hopper", "--env is for anomalies, and clock is a detector"),
+        ("scan logs --watchdog x --jobs 2", "--jobs is for fits, and --watchdog judges without"),
+        ("scan logs --recipe x.toml --format csv", "--format is said by the recipe"),
+        ("reproduce --render-only --budget 2h", "--budget is for a run, and --render-only runs"),
+        ("run --detector clock --env all --split tiny --row-metrics", "splits without twins"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused_elsewhere(run, arguments, message):
+    code, out, err = run(*arguments.split())
+    assert (code, out) == (4, "")
+    assert message in err
+
+
+def test_data_of_one_detector(run):
+    run(*CLOCK, "--detector", "clock,range")
+    lines = run("show", "oodd-results", "--csv", "--detector", "range")[1].splitlines()
+    assert len(lines) == 1 + 8
+    assert not any(",clock," in line for line in lines)
 
 
 def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
@@ -441,3 +628,23 @@ def test_info_describes_detectors_environments_and_anomalies(run):
     code, _, err = run("info", "gravty")
     assert code == 4
     assert "did you mean 'gravity'" in err
+
+
+def test_info_describes_splits_and_metrics(run):
+    code, out, _ = run("info", "tiny")
+    assert (code, out) == run("data", "info", "tiny")[:2]
+    assert out.startswith("split tiny, digest ")
+    code, out, _ = run("info", "standard")
+    assert code == 0
+    assert re.search(
+        r"^trajectories +500 train, 200 calibration, 50 test seeds$", out, re.MULTILINE
+    )
+    assert "not here: oodd-eval data build standard" in out
+    code, out, _ = run("info", "missed_at_5pct")
+    assert code == 0
+    assert re.search(r"^better side +lower is better$", out, re.MULTILINE)
+    assert re.search(r"^alarms +guaranteed, in at most 5 % of nominal", out, re.MULTILINE)
+    for name, near in (("auc_mached", "auc_matched"), ("tinny", "tiny"), ("standrad", "standard")):
+        code, _, err = run("info", name)
+        assert code == 4
+        assert f"did you mean '{near}'" in err

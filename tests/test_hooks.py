@@ -138,6 +138,48 @@ def test_observers_hear_of_a_run_in_order(watched):
     ]
 
 
+TELLS = """
+class Tells(Good):
+    def fit(self, nominal, progress=None):
+        super().fit(nominal)
+        progress(0.25)
+        self.later = progress
+    def score(self, x):
+        self.later(0.5)  # when nobody listens any more
+        return super().score(x)
+
+@hookimpl
+def oodd_detectors(): return offer(tells=Tells, silent=Good)
+"""
+
+
+@pytest.mark.parametrize(("detector", "shares"), [("tells", [0.25, 1.0]), ("silent", [1.0])])
+def test_oodd_fit_progressed(tiny_split, monkeypatch, tmp_path, detector, shares):
+    install(monkeypatch, tmp_path, "talker", TELLS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    heard, plugins, split = [], discover(), load_split(tiny_split)
+
+    class Listener:
+        @hookimpl
+        def oodd_fit_progressed(self, unit, share):
+            heard.append((unit.environment, share))
+
+    plan = make_plan(plugins, split=split, detectors=[detector], environments=["cartpole"])
+    done = run(plan, split, plugins, RunSettings(jobs=1), observers=[Listener()])
+    assert {record.status for record in done.records} == {"ok"}
+    assert heard == [("cartpole", share) for share in shares]
+
+
+@pytest.mark.parametrize("share", ["2", "float('nan')"])
+def test_a_share_that_is_none_is_the_detectors_error(tiny_split, monkeypatch, tmp_path, share):
+    install(monkeypatch, tmp_path, "talker", TELLS.replace("0.25", share))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    plugins, split = discover(), load_split(tiny_split)
+    plan = make_plan(plugins, split=split, detectors=["tells"], environments=["cartpole"])
+    (record, *_) = run(plan, split, plugins, RunSettings(jobs=1)).records
+    assert (record.status, "progress" in record.reason) == ("invalid", True)
+
+
 OBSERVES = """
 HEARD = []
 @hookimpl

@@ -380,7 +380,7 @@ def test_the_second_ranking_is_by_guaranteed_alarms_and_lower_is_better():
         ([r for r in board() if (r.horizon, r.environment, r.anomaly) != (10, "ant", "iid")],
          "riqn[h=10]", "1 of 4 cells missing"),
         ([record("riqn", [None] * SEEDS), record("clock", [0.5] * SEEDS)],
-         "riqn", "undefined in 1 of 1 cells"),
+         "riqn", "undefined in 1 of 1 cell"),
         ([*board(), record("riqn", [0.7] * SEEDS, environment="ant", seed=1)],
          "riqn", "3 of 8 cells missing"),
     ],
@@ -396,7 +396,7 @@ def test_a_row_that_is_not_whole_is_listed_with_its_state_and_no_rank(records, r
 def test_boards_without_any_ranked_row_are_rendered():
     failed = [make_record(status="error", reason="no"), make_record("rf", status="oom")]
     text = page(sections([entry("all-failed", failed)]))
-    assert "Not ranked: riqn, error in 1 of 1 cells." in text
+    assert "Not ranked: riqn, error in 1 of 1 cell." in text
     assert "Win rates" not in text
 
 

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from threading import get_ident as here
 from types import SimpleNamespace
 
 import pytest
@@ -34,7 +35,8 @@ class Executor:
     def __init__(self, work=lambda job: None, jobs=1):
         self.work, self.jobs, self.begun, self.stopped = work, jobs, [], False
 
-    def __call__(self, job):
+    def __call__(self, job, progress):
+        progress(1.0)
         self.begun.append(job.name)
         self.work(job)
         return Scored(resumed=True)
@@ -45,7 +47,11 @@ class Executor:
 
 def finish(text, executor, *, kept="", results=True, **settings):
     found = _as_they_finish(
-        jobs_of(text), executor, RunSettings(**settings), Results(kept) if results else None
+        jobs_of(text),
+        executor,
+        RunSettings(**settings),
+        Results(kept) if results else None,
+        lambda *_: None,
     )
     began, finished = [], []
     for index, scored in found:
@@ -62,6 +68,16 @@ def test_units_begin_in_the_order_of_the_plan():
     executor = Executor()
     assert finish("a b c", executor) == [0, 1, 2]
     assert executor.begun == ["a", "b", "c"]
+
+
+def test_shares_of_fits_are_heard_in_the_thread_that_asks():
+    heard = []
+    jobs = jobs_of("a b c")
+    for event in _as_they_finish(
+        jobs, Executor(jobs=2), RunSettings(), None, lambda *told: heard.append((told, here()))
+    ):
+        assert event[0] in range(3)
+    assert sorted(heard) == [((i, 1.0), here()) for i in range(3)]
 
 
 def test_a_unit_whose_fit_is_under_way_is_passed_over():
@@ -129,7 +145,7 @@ def test_scores_of_a_few_units_are_in_memory_at_a_time():
     jobs = jobs_of(" ".join(f"{n:02d}" for n in range(50)))
     for job in jobs:
         job.unit.fit_key = job.name
-    for _, scored in _as_they_finish(jobs, executor, RunSettings(), None):
+    for _, scored in _as_they_finish(jobs, executor, RunSettings(), None, print):
         taken += scored is not None
         time.sleep(0.001)
     assert taken == 50
@@ -139,7 +155,7 @@ def test_scores_of_a_few_units_are_in_memory_at_a_time():
 def test_units_go_on_while_the_caller_is_busy():
     second = threading.Event()
     executor = Executor(lambda job: second.set() if job.name == "b" else None)
-    finished = _as_they_finish(jobs_of("a b"), executor, RunSettings(), None)
+    finished = _as_they_finish(jobs_of("a b"), executor, RunSettings(), None, print)
     next(finished)
     assert second.wait(10)
     finished.close()

@@ -9,6 +9,7 @@ import pytest
 from helpers_records import make_record
 from helpers_site import submitted
 
+from oodd_eval.cli import board as board_command
 from oodd_eval.cli.main import main
 from oodd_eval.data.files import compress, decompress
 from oodd_eval.errors import ResultsError, UsageError
@@ -263,7 +264,9 @@ def test_show_prints_both_rankings(shipped, capsys):
 def test_place_says_where_a_run_stands(shipped, tmp_path, capsys):
     directory = run_of([*row("mine", 0.7), *row("good", 0.9)], tmp_path / "out")
     assert main(["leaderboard", "place", directory]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
+    text = capsys.readouterr().out
+    assert text.splitlines()[1].startswith("good: rank 1 by separability, rank 1 by guaranteed")
+    printed = " ".join(text.split())
     assert "mine: rank 3 by separability, rank 3 by guaranteed alarms." in printed
     assert "good: rank 1 by separability, rank 1 by guaranteed alarms. It has the" in printed
     assert re.search(r" 3 > mine \d", printed)
@@ -273,6 +276,26 @@ def test_place_says_where_a_run_stands(shipped, tmp_path, capsys):
     assert "mine" not in capsys.readouterr().out
     assert main(["leaderboard", "place", directory, "-q"]) == 0
     assert "Ranking" not in capsys.readouterr().out
+
+
+def test_place_prints_the_rows_nearby_unless_all_are_asked_for(
+    shipped, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(board_command, "NEARBY", 1)
+    directory = run_of(row("mine", 0.7), tmp_path / "out")
+    assert main(["leaderboard", "place", directory]) == 0
+    first = capsys.readouterr().out.split("Ranking by guaranteed alarms")[0]
+    rows = [" ".join(line.split()) for line in first.splitlines()]
+    start = next(i for i, line in enumerate(rows) if line.startswith("-"))
+    above, better, mine, worse, below, blank, *_ = rows[start + 1 :]
+    assert (above, below, blank) == ("(2 more rows)", "(1 more row)", "")
+    assert [" fair" in better, " > mine " in mine, " poor " in worse] == [True, True, True]
+    assert main(["leaderboard", "place", directory, "--all"]) == 0
+    assert "more row" not in capsys.readouterr().out
+    assert main(["leaderboard", "place", directory, "--all", "--csv"]) == 4
+    assert "--all is for the tables" in capsys.readouterr().err
+    assert main(["leaderboard", "show", "--markdown", "--csv"]) == 4
+    assert "leave out one" in capsys.readouterr().err
 
 
 def test_the_file_is_read_from_a_compressed_copy_alone(shipped, tmp_path, monkeypatch):

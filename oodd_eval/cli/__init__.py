@@ -13,15 +13,21 @@ from types import SimpleNamespace
 from typing import Any, Final, TypeAlias
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
 from oodd_eval.names import memory_bytes, parameter, read, seconds, whole_numbers
 
+PARAM: Final = "a parameter, of one detector as DETECTOR.K=V; V is JSON or text"
+
 NAMES: Final = "names separated by commas, globs, or 'all'"
 
 Options: TypeAlias = SimpleNamespace
-"""The values of a command's options and arguments, with ``invocation``, the whole command line."""
+"""The values of a command's options and arguments.
+
+``invocation`` is the whole command line, ``passed`` has the options that are in it by their names.
+"""
 
 Commands: TypeAlias = Mapping[str, tuple[str, "str | Commands"]]
 """A summary for each name, with ``module:attribute`` of a command, or the commands of a group."""
@@ -76,7 +82,12 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> int:
         """Run the command and return its exit code."""
-        return self.handler(Options(**ctx.params, invocation=ctx.obj))
+        passed = {
+            p.name: p.opts[0]
+            for p in self.params
+            if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE
+        }
+        return self.handler(Options(**ctx.params, invocation=ctx.obj, passed=passed))
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""
@@ -320,7 +331,7 @@ row_metrics_option: Final = click.option(
 )
 
 detector_options: Final = together(
-    click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text"),
+    click.option("--param", multiple=True, type=PARAMETER, help=PARAM),
     click.option("--horizon", default="1", type=HORIZONS, help="prediction horizons"),
 )
 
@@ -343,6 +354,12 @@ def fit_options(timeout: str) -> Decorator:
     choice = click.Choice(["auto", "cpu", "cuda"])
     device = click.option("--device", type=choice, help="where networks of detectors compute")
     return together(jobs_option, device, limit_options("a fit with its scores", timeout))
+
+
+def refuse(options: Options, names: Iterable[str], why: str) -> None:
+    """Raise `UsageError` for the first of some options that was passed: it would do nothing."""
+    for option in (options.passed[name] for name in names if name in options.passed):
+        raise UsageError(f"{option} {why}")
 
 
 def say_notes(notes: Iterable[str]) -> None:

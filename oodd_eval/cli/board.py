@@ -4,6 +4,9 @@ Both read the board that is installed with the package, so that neither needs a 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +17,7 @@ from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import ENTRY, read_entry
 from oodd_eval.leaderboard.published import (
+    MARK,
     Placement,
     PublishedBoard,
     board_of,
@@ -22,16 +26,20 @@ from oodd_eval.leaderboard.published import (
     rankings,
     read_published,
 )
-from oodd_eval.names import check_known, select
+from oodd_eval.names import check_known, counted, select
 from oodd_eval.results import tables
 from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
-from oodd_eval.results.render.text import markdown_section, print_sections
+from oodd_eval.results.render.text import markdown_section, print_prose, print_sections
 from oodd_eval.results.report import Section
 from oodd_eval.results.strengths import overview, thresholds
+from oodd_eval.results.tables import Table
+
+NEARBY: Final = 3
+"""Rows above and below those of a run that `place` prints."""
 
 _format_options: Final = together(
     click.option("--markdown", is_flag=True, help="print Markdown"),
@@ -72,29 +80,41 @@ def show(options: Options) -> int:
 @command("leaderboard place oodd-results", "leaderboard place oodd-results --detector mine")
 @click.argument("directory", type=DIRECTORY, help="results directory of oodd-eval run, or an entry")
 @click.option("--detector", default="all", type=Names("detectors"), help=NAMES)
+@click.option("--all", "everything", is_flag=True, help="print all rows, not those nearby alone")
 @_format_options
 def place_run(options: Options) -> int:
-    """Show where a run would stand on the published board.
+    """Show where a run would stand on the published board, and the rows nearby.
 
     The exit code is 4 when nothing of the run can be compared with a board.
     """
+    output = _Output(options)
+    if options.everything and (output.csv or output.quiet):
+        raise UsageError("--all is for the tables, which --csv and -q do not print: leave out one")
     records, primary = _read(options.directory, options.detector)
     published = read_published()
-    output = _Output(options)
     runs = boards(records)
     compared_with = [board_of(run.records, published.boards) for run in runs]
     for run, board in zip(runs, compared_with, strict=True):
         placed = placement(run.records, board, primary)
         new = placed.rows - placed.published
         trust = board.trust | dict.fromkeys(new, "yours")
-        of_ranks, notes = [], _sentences(placed, board.entries)
+        of_ranks, notes = [], []
         if not output.quiet:
             of_ranks = rankings(placed.ranks, trust, placed.rows)
-            nearby = (neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str))
-            of_ranks += [table for table in nearby if table]
-            notes = [*tables.ranking_notes(placed.ranks, whole=False), *notes]
+            if not options.everything:
+                of_ranks = list(map(_nearby, of_ranks))
+            compared = (
+                neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str)
+            )
+            of_ranks += [table for table in compared if table]
+            notes = tables.ranking_notes(placed.ranks, whole=False)
         output.print(
-            Section(f"Your rows on the leaderboard, {board}", tables=of_ranks, notes=notes),
+            Section(
+                f"Your rows on the leaderboard, {board}",
+                facts=_sentences(placed, board.entries),
+                tables=of_ranks,
+                notes=notes,
+            ),
             ranking_csv(placed.ranks, trust) if output.csv and not output.quiet else "",
         )
     return 0
@@ -112,6 +132,18 @@ def _read(directory: Path, detectors: str) -> tuple[list[Record], Sequence[str]]
     primary = read_entry(directory).meta.primary if (directory / ENTRY).is_file() else ()
     names = select("detector of these results", detectors, sorted({r.detector for r in records}))
     return [r for r in records if r.detector in names], primary
+
+
+def _nearby(table: Table) -> Table:
+    """Return a ranking with the rows next to those that are marked alone."""
+    marked = [i for i, line in enumerate(table.rows) if line[1].startswith(MARK)]
+    near = [any(abs(i - at) <= NEARBY for at in marked) for i in range(len(table.rows))]
+    lines: list[list[str]] = []
+    for close, run in groupby(zip(near, table.rows, strict=True), key=itemgetter(0)):
+        rows = [row for _, row in run]
+        left_out = f"({counted(len(rows), 'more row(s)')})"
+        lines += rows if close else [["", left_out, *[""] * (len(table.header) - 2)]]
+    return replace(table, rows=lines)
 
 
 def _of_entries(board: PublishedBoard) -> list[str]:
@@ -135,9 +167,9 @@ def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
         lines.append(text)
     if placed.cells != placed.expected:
         lines.append(
-            f"These ranks are over the {len(placed.cells)} cells that your rows have, of "
-            f"{len(placed.expected)}, and so not the board's. With few episodes hardly any "
-            "difference is significant. Run the other cells into the same directory."
+            f"These ranks are over the {counted(len(placed.cells), 'cell(s)')} that your rows "
+            f"have, of {len(placed.expected)}, and so not the board's. With few episodes hardly "
+            "any difference is significant. Run the other cells into the same directory."
         )
     if placed.rows - placed.published:
         lines.append(
@@ -155,6 +187,8 @@ class _Output:
     """Prints sections as the options ask: for a terminal, as Markdown, or as CSV."""
 
     def __init__(self, options: Options) -> None:
+        if options.markdown and options.csv:
+            raise UsageError("--markdown and --csv are two formats: leave out one")
         self.markdown, self.csv, self.quiet = options.markdown, options.csv, options.verbosity < 0
         self._console = make_console()
 
@@ -164,5 +198,9 @@ class _Output:
         elif self.markdown:
             print(markdown_section(section))
         else:
-            self._console.print(f"{section.title}\n")
+            self._console.print(section.title if section.facts else f"{section.title}\n")
+            for sentence in section.facts:
+                print_prose(sentence, self._console)
+            if section.facts and section.tables:
+                self._console.print("")
             print_sections([section], self._console)

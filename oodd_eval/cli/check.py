@@ -12,6 +12,7 @@ from oodd_eval.cli import (
     detector_options,
     limit_options,
     load,
+    refuse,
     say,
 )
 from oodd_eval.cli.terminal import discovered, make_console
@@ -19,9 +20,10 @@ from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
 from oodd_eval.plugins.conformance import CheckReport
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.parameters import resolve_parameters
+from oodd_eval.plugins.parameters import parameters_by_detector, resolve_parameters
 
 _EXPECTED: Final = Converted(assignment, "NAME=REASON")
+_OF_DETECTORS: Final = ("param", "horizon", "seed", "expect", "timeout", "memory")
 STYLES: Final = {
     "passed": "green",
     "failed": "bold red",
@@ -53,18 +55,21 @@ def check(options: Options) -> int:
     from oodd_eval.testing import CHECKS, supervise
 
     limits = Limits(options.timeout, options.memory)
-    expecting, parameters = dict(options.expect), dict(options.param)
+    expecting = dict(options.expect)
     selects = expression(options.expression)
     plugins = discovered(options)
     try:
         offer = plugins.offer(options.name)
     except UnknownNameError:
         if options.name in plugins.custom_specs:
+            refuse(options, _OF_DETECTORS, f"is for detectors, and {options.name} is none")
             return int(load("oodd_recording.commands:check_custom")(options, selects))
         raise
+    refuse(options, ["env"], f"is for anomalies, and {options.name} is a detector")
     offer.require()
     spec = offer.spec
     check_known("check", CHECKS, *expecting)
+    parameters = parameters_by_detector([spec.name], dict(options.param))[spec.name]
     resolve_parameters(spec.name, spec.parameters, parameters, others=spec.other_parameters)
     names = [name for name in CHECKS if selects(name)]
     if not names:

@@ -5,17 +5,19 @@ from typing import Final
 
 import click
 
-from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, say
+from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, refuse, say
 from oodd_eval.cli.terminal import make_console
 from oodd_eval.errors import OutputError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.names import expression, select
+from oodd_eval.names import counted, expression, select
 from oodd_eval.results import compare as regression
 from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
 from oodd_eval.results.render.data import junit
 from oodd_eval.results.render.text import markdown_section, print_prose, print_table
 from oodd_eval.results.report import comparison_section
 from oodd_eval.results.standings import compare_rows
+
+_AGAINST: Final = ("fail", "two_sided", "by", "junit", "markdown")  # with --against alone
 
 LOG_WIDTH: Final = 160
 """Columns that a log has at least."""
@@ -61,6 +63,14 @@ def compare(options: Options) -> int:
         raise UsageError(
             "nothing to do: expected two rows, --against REFERENCE or --write-reference FILE"
         )
+    if options.rows:
+        refuse(options, _AGAINST, "is for a comparison with --against, not for two rows")
+    else:
+        refuse(options, ["metric"], "is for the comparison of two rows: name them")
+    if not options.against:
+        refuse(options, _AGAINST, "is for a comparison: say with what by --against REFERENCE")
+    if not options.write_reference:
+        refuse(options, ["keep"], "is for a reference: say where it goes by --write-reference FILE")
     passes = expression(options.expression)
     now = read_record_set(options.results).selected(passes)
     if options.rows:
@@ -75,7 +85,7 @@ def compare(options: Options) -> int:
         keep = select("metric", options.keep, NAMES) if options.keep else ()
         write_reference(now.records, options.write_reference, keep=keep)
         if options.verbosity >= 0:
-            print(f"{len(now.records)} cells written to {options.write_reference}")
+            print(f"{counted(len(now.records), 'cell(s)')} written to {options.write_reference}")
     return code
 
 

@@ -21,7 +21,7 @@ from oodd_eval.data.recipe import Recipe
 from oodd_eval.data.shipped_recipes import shipped_recipes
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import assignment, select
+from oodd_eval.names import assignment, counted, select
 from oodd_eval.results.render.text import print_prose
 from oodd_eval.scoring.doubts import promises_of
 
@@ -149,7 +149,8 @@ def verify(options: Options) -> int:
         if options.verbosity > 0 or not check.ok:
             expected = "" if check.ok else f"expected {check.expected}, found "
             console.print(f"{check.file}, {check.group}: {expected}{check.actual}")
-    good = f"{sum(check.ok for check in checks)} of {len(checks)} groups as they should be"
+    groups = counted(len(checks), "group(s)")
+    good = f"{sum(check.ok for check in checks)} of {groups} as they should be"
     console.print(f"split {split.name}, digest {split.digest}: {good}")
     return int(not all(check.ok for check in checks))
 
@@ -209,7 +210,7 @@ def export(options: Options) -> int:
     notes = make_console(quiet=options.verbosity < 0)
     written = export_split(split, options.output, environments=environments, progress=notes.print)
     hint = f"Minari finds them with MINARI_DATASETS_PATH={options.output}"
-    make_console().print(f"{len(written)} datasets in {options.output}: {hint}")
+    make_console().print(f"{counted(len(written), 'dataset(s)')} in {options.output}: {hint}")
     return 0
 
 

@@ -4,7 +4,7 @@ import click
 
 from oodd_eval.cli import DIRECTORY, Options, command, expression_option, say
 from oodd_eval.errors import UsageError
-from oodd_eval.names import expression
+from oodd_eval.names import counted, expression
 from oodd_eval.results.directory import ResultsDirectory
 
 
@@ -27,5 +27,5 @@ def forget(options: Options) -> int:
         return say(f"no cell of {options.directory} is selected: nothing was removed", 5)
     results.forget(gone)
     if options.verbosity >= 0:
-        print(f"{len(gone)} cells removed from {options.directory}")
+        print(f"{counted(len(gone), 'cell(s)')} removed from {options.directory}")
     return 0

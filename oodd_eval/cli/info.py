@@ -1,5 +1,6 @@
-"""``oodd-eval info``: describe a detector, an environment or an anomaly."""
+"""``oodd-eval info``: describe a detector, an environment, an anomaly, a split or a metric."""
 
+import difflib
 import json
 from collections.abc import Iterator, Mapping
 from itertools import chain
@@ -9,14 +10,24 @@ import click
 from tabulate import tabulate
 
 from oodd_eval.cli import Name, Options, command, load
+from oodd_eval.cli.listing import KINDS, rows
 from oodd_eval.cli.terminal import discovered
 from oodd_eval.data.condition import read_ladder, rungs_of
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, AnomalyInfo, EnvironmentInfo
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    SPLITS,
+    TABLE1,
+    AnomalyInfo,
+    EnvironmentInfo,
+)
 from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
-from oodd_eval.data.split import imported_environments
-from oodd_eval.errors import UnknownNameError
+from oodd_eval.data.split import imported_environments, split_directories
+from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.metrics.accumulation import NOUNS
+from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
@@ -24,15 +35,22 @@ from oodd_eval.plugins.parameters import parameters_of
 Lines = Iterator[tuple[str, str]]
 
 
-@command("info pe", "info hopper", "info gravity", plugins=True)
-@click.argument("name", type=Name("detectors", "envs", "anomalies"), metavar="DETECTOR|ENV|ANOMALY")
+@command("info pe", "info hopper", "info gravity", "info mini", "info auc_matched", plugins=True)
+@click.argument(
+    "name", type=Name(*KINDS), metavar="NAME", help="of a detector, environment, anomaly, ..."
+)
 def info(options: Options) -> int:
-    """Print all there is to know of one detector, environment or anomaly."""
+    """Print all there is to know of one detector, environment, anomaly, split or metric."""
     name = options.name
+    if name not in ENVIRONMENTS and name not in ANOMALIES and name in split_directories():
+        described: int = load("oodd_eval.cli.data:info").handler(options)
+        return described
     if name in ENVIRONMENTS:
         lines = _environment(ENVIRONMENTS[name])
     elif name in ANOMALIES:
         lines = _anomaly(ANOMALIES[name])
+    elif name in NAMES:
+        lines = _metric(metric_info(name))
     else:
         plugins = discovered(options)
         custom = plugins.custom_specs
@@ -44,25 +62,42 @@ def info(options: Options) -> int:
                 lines = _custom(*custom[name])
             elif name in imported:
                 lines = _imported(name, *imported[name])
+            elif name in SPLITS:
+                lines = _absent(*next(r for r in rows("splits", plugins) if r[0] == name))
             else:
                 lines = _detector(plugins.offer(name))
         except UnknownNameError:
             names = [*ENVIRONMENTS, *ANOMALIES, *custom, *imported, *plugins.offers]
-            raise UnknownNameError("detector, environment or anomaly", name, names) from None
+            names += [*SPLITS, *split_directories(), *NAMES]
+            near = difflib.get_close_matches(name, dict.fromkeys(names), n=5, cutoff=0.5)
+            meant = f": did you mean {' or '.join(map(repr, near))}?" if near else ":"
+            kinds = "detector, environment, anomaly, split or metric"
+            raise UsageError(
+                f"unknown {kinds} {name!r}{meant} `oodd-eval list KIND` has all names of a kind"
+            ) from None
     print(tabulate(lines, tablefmt="plain", disable_numparse=True))
     return 0
+
+
+def _absent(split: str, sizes: str, why: str) -> Lines:
+    yield "split", split
+    yield "trajectories", sizes
+    yield "digest", f"unknown, as it is {why}"
 
 
 def _environment(info: EnvironmentInfo) -> Lines:
     yield "environment", f"{info.id} ({info.title} of the paper)"
     yield "simulator", info.simulator
     yield "policy", f"{info.policy}, mean return {info.paper_return:g} in the paper"
-    yield "longest episode", f"{info.episode_cap} steps"
+    yield "longest episode", counted(info.episode_cap, "step(s)")
     for i, sensor in enumerate(info.sensors):
-        yield "" if i else f"{info.observation_dim} sensors", f"{sensor.name} ({sensor.unit})"
-    kind = "discrete actions" if info.discrete else "actions"
+        yield (
+            "" if i else counted(info.observation_dim, "sensor(s)"),
+            f"{sensor.name} ({sensor.unit})",
+        )
+    kind = "discrete action(s)" if info.discrete else "action(s)"
     for i, action in enumerate(info.actions):
-        yield "" if i else f"{info.action_dim} {kind}", f"{action.name} ({action.unit})"
+        yield "" if i else counted(info.action_dim, kind), f"{action.name} ({action.unit})"
 
 
 def _custom(spec: Spec, origin: str) -> Lines:
@@ -74,10 +109,10 @@ def _custom(spec: Spec, origin: str) -> Lines:
         yield "environments", ", ".join(spec.environments) or "any"
         return
     yield "environment", f"{spec.name} ({spec.title or spec.name}), {origin}"
-    yield "longest episode", f"{spec.episode_cap} steps"
-    for kind, columns in (("sensors", spec.sensors), ("actions", spec.actions)):
+    yield "longest episode", counted(spec.episode_cap, "step(s)")
+    for kind, columns in (("sensor(s)", spec.sensors), ("action(s)", spec.actions)):
         for i, column in enumerate(columns):
-            yield "" if i else f"{len(columns)} {kind}", f"{column.name} ({column.unit})"
+            yield "" if i else counted(len(columns), kind), f"{column.name} ({column.unit})"
     yield "attributes", ", ".join(spec.attributes) or "none"
 
 
@@ -88,10 +123,13 @@ def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
         if text := getattr(facts, key):
             yield key, text
     for part, group in entry["groups"].items():
-        yield part, f"{group['trajectories']} episodes"
+        yield part, counted(group["trajectories"], "episode(s)")
     for kind in ("sensors", "actions"):
         for i, column in enumerate(entry[kind]):
-            yield "" if i else f"{len(entry[kind])} {kind}", f"{column['name']} ({column['unit']})"
+            yield (
+                "" if i else counted(len(entry[kind]), f"{kind[:-1]}(s)"),
+                f"{column['name']} ({column['unit']})",
+            )
     yield "more", f"oodd-eval data info {split}"
 
 
@@ -111,6 +149,27 @@ def _anomaly(info: AnomalyInfo) -> Lines:
         strongest = [*rungs][-1]
         text = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
         yield f"strength in {environment}", text
+
+
+_BETTER: Final = {"higher": "higher is better", "lower": "lower is better", "": "neither"}
+_UNITS: Final = {"percent": "a share, printed in percent", "steps": "rows", "rate": "a number"}
+_CELLS: Final = {"paired": "with twins", "unpaired": "without twins", "": "with and without twins"}
+
+
+def _metric(info: MetricInfo) -> Lines:
+    low, high = info.range
+    yield "metric", f"{info.name} ({info.title})"
+    yield "what it says", info.summary
+    yield "unit", f"{_UNITS[info.unit]}, from {low:g} to {high:g}"
+    yield "better side", _BETTER[info.better]
+    if info.level:
+        yield "alarms", f"guaranteed, in at most {info.level} of nominal episodes"
+    if info.null:
+        yield "by chance", f"{info.null}: {metric_info(info.null).summary}"
+    yield "cells", _CELLS[info.cells]
+    if info.request:
+        yield "computed", "when asked for (--row-metrics)"
+    yield "more", "docs/metrics.md"
 
 
 _TRAINING: Final[Mapping[Training, str]] = {

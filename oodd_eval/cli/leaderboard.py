@@ -22,6 +22,7 @@ from oodd_eval.leaderboard.entry import GRANTS, read_entries, read_entry, suite_
 from oodd_eval.leaderboard.verify import EntryVerdict, grant
 from oodd_eval.leaderboard.verify import verify as check
 from oodd_eval.leaderboard.verify import verify_changed as check_changed
+from oodd_eval.names import counted
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
 
@@ -211,7 +212,7 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
             1,
         )
     if refused:
-        return say(f"{refused} of {len(entries)} entries are refused", 1)
+        return say(f"refused: {refused} of {counted(len(entries), 'entr(y/ies)')}", 1)
     with temporary_directory() as fresh:
         build_board(read_entries(results), fresh, suite_sections(results.parent))
     console.print(f"{', '.join(entries)}: may be merged, the board builds with it")
@@ -230,12 +231,12 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     """Print what was found for one entry, every problem with its entry, position and field."""
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
-        cells = f"{len(verdict.records)} cells of {', '.join(entry.detectors)}"
+        cells = f"{counted(len(verdict.records), 'cell(s)')} of {', '.join(entry.detectors)}"
         console.print(f"{verdict.name}: valid, {cells} on {entry.split}, trust {verdict.trust}")
         if verdict.rerun is not None or verdict.rescored:
             console.print(f"  trust level established here: {verdict.reached}")
     else:
-        console.print(f"{verdict.name}: refused, {findings.count} problems")
+        console.print(f"{verdict.name}: refused, {counted(findings.count, 'problem(s)')}")
     problems = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
     lines = [f"{verdict.name}: {problem.text}" for problem in problems]
     if findings.count > len(problems):

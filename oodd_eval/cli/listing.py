@@ -11,7 +11,7 @@ from oodd_eval.cli import Options, command
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
-from oodd_eval.names import check_known
+from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.plugins.discovery import Plugins, discover
 
@@ -43,7 +43,7 @@ def rows(kind: str, plugins: Plugins) -> Rows:
             for e in ENVIRONMENTS.values():
                 yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
             for env, origin in _custom(plugins, EnvironmentSpec):
-                yield env.name, origin, f"{len(env.sensors)} sensors, its own policy"
+                yield env.name, origin, f"{counted(len(env.sensors), 'sensor(s)')}, its own policy"
             yield from _imported()
         case "anomalies":
             for a in ANOMALIES.values():
@@ -68,7 +68,11 @@ def _imported() -> Rows:
     from oodd_eval.data.split import imported_environments
 
     for name, split, entry in imported_environments():
-        yield name, f"split {split}", f"{len(entry['sensors'])} sensors, imported from logs"
+        yield (
+            name,
+            f"split {split}",
+            f"{counted(len(entry['sensors']), 'sensor(s)')}, imported from logs",
+        )
 
 
 def _detectors(plugins: Plugins) -> Rows:
@@ -93,7 +97,7 @@ def _splits() -> Rows:
         if name in here:
             manifest = read_manifest(here[name])
             sizes, digest = part_sizes(manifest), manifest["digest"][:12]
-            where = f"{len(manifest['environments'])} environments, digest {digest}"
+            where = f"{counted(len(manifest['environments']), 'environment(s)')}, digest {digest}"
         else:
             sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"
         text = "{train} train, {calibration} calibration, {test} test seeds"

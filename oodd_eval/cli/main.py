@@ -75,7 +75,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
     },
     "Look up": {
         "list": ("list what there is, one line each", "oodd_eval.cli.listing:list_names"),
-        "info": ("describe a detector, environment or anomaly", "oodd_eval.cli.info:info"),
+        "info": ("describe a detector, environment, split, ...", "oodd_eval.cli.info:info"),
         "leaderboard": ("show, submit and verify entries of the board", LEADERBOARD),
     },
     "Add your own": {

@@ -29,10 +29,11 @@ from oodd_eval.cli import (
 from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
+from oodd_eval.data.layout import log_facts
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.promise import PromiseFinding
-from oodd_eval.names import expression
+from oodd_eval.names import counted, expression
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
@@ -43,6 +44,7 @@ from oodd_eval.results.report import Report
 from oodd_eval.scoring.doubts import doubts_after, doubts_before
 from oodd_eval.scoring.executors import LOCAL, RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
+from oodd_eval.scoring.runner import RunOutcome
 from oodd_eval.scoring.runner import run as run_plan
 
 
@@ -101,6 +103,8 @@ def run(options: Options) -> int:
     limits = Limits(options.timeout, options.memory, hidden)
     plugins = discovered(options, limits)
     environments, anomalies = split.select(options.env, options.anomaly)
+    if options.row_metrics and not any(_lacks_twins(split, name) for name in environments):
+        raise UsageError(f"--row-metrics is for splits without twins, unlike split {split.name}")
     plan = make_plan(
         plugins,
         split=split,
@@ -121,7 +125,8 @@ def run(options: Options) -> int:
     if options.collect_only:
         if options.verbosity >= 0:
             console.print("\n".join(map(str, plan.cells)))
-        console.print(f"{len(plan.cells)} cells in {len(plan.units)} fits")
+        cells, fits = counted(len(plan.cells), "cell(s)"), counted(len(plan.units), "fit(s)")
+        console.print(f"{cells} in {fits}")
         return 0
     settings = RunSettings(
         jobs=options.jobs,
@@ -141,7 +146,8 @@ def run(options: Options) -> int:
         units=split.units,
     )
     doubts = _Doubts(make_console(quiet=options.verbosity < 0), split)
-    done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
+    with reporter:
+        done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
     doubts.print(doubts_after(plan, split, results))
     say_notes(results.notes)
     if done.records:
@@ -150,9 +156,33 @@ def run(options: Options) -> int:
         write_text(path, FORMATS["markdown"].render(report))
         if options.verbosity >= 0:
             console.print(f"results in {results.path}, tables in {path}")
+    if left := _left(plan, done, fresh=options.fresh):
+        console.print(left)
     if done.interrupted:
         return 2
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
+
+
+def _lacks_twins(split: Split, environment: str) -> bool:
+    """Tell whether an environment is of logs whose anomalous episodes have no nominal twins."""
+    facts = log_facts(split.manifest["environments"][environment])
+    return facts is not None and not facts.paired
+
+
+def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:
+    """Return how a run goes on that has not done all: which fits are kept, and by which command."""
+    kept, every = (
+        len({(r.environment, r.cell.label) for r in done.records if r.ok}),
+        len(plan.units),
+    )
+    if kept == every:
+        return ""
+    again = "the same command without --fresh" if fresh and kept else "the same command"
+    does = (
+        "continues" if done.left else f"fits the {'others' if every > kept + 1 else 'other'} again"
+    )
+    are = "is" if 1 in (kept, every) else "are"
+    return f"{kept} of {counted(every, 'fit(s)')} {are} kept; {again} {does}"
 
 
 class _Doubts:

@@ -9,7 +9,7 @@ import click
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, FILE, PARAMETER, Name, Options, command
+from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
 from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
@@ -18,6 +18,8 @@ from oodd_eval.live.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
 from oodd_eval.live.scan_page import NUMBERS, cells, page, summary, titles
 from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
+from oodd_eval.names import counted
+from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.results.render.text import print_prose
 
 _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
@@ -45,7 +47,7 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
 )
 @click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
 @click.option("--detector", default=SCANNER, type=Name("detectors"), help="that judges")
-@click.option("--param", multiple=True, type=PARAMETER, help="a parameter; V is JSON or text")
+@click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
 @click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
 @click.option(
     "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
@@ -62,6 +64,11 @@ def scan(options: Options) -> int:
     that its files are relative to. Each episode is judged by a fit on the others, whatever labels
     say. Most have to be nominal. The exit code is 1 when an episode is odd.
     """
+    if options.watchdog:
+        judges = "is for fits, and --watchdog judges without one: leave out one of them"
+        refuse(options, ["detector", "param", "jobs"], judges)
+    if options.recipe:
+        refuse(options, ["format", "read"], "is said by the recipe: write it there")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
     logs = read_logs(options.logs, recipe, options.format or "", dict(options.read), options.window)
@@ -72,7 +79,9 @@ def scan(options: Options) -> int:
         watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
         fdr=options.fdr,
         baseline=logs.baseline,
-        parameters=dict(options.param),
+        parameters=parameters_by_detector([options.detector], dict(options.param))[
+            options.detector
+        ],
         jobs=options.jobs,
     )
     _print(result, logs.notes, options)
@@ -115,7 +124,7 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         console.print("")
         left = len(result.episodes) - len(listed)
         for note in [
-            *([f"Not listed: {left} episodes that are less odd (-v lists all)."] if left else []),
+            *([f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."] * (left > 0)),
             *notes,
             *result.notes,
             *_on_labels(result, fitted=not options.watchdog),
@@ -133,8 +142,9 @@ def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
         return
     odd = sum(one.odd for one in labelled)
     many = fitted and len(labelled) > len(result.episodes) * _LARGEST_SHARE
+    anomalous = counted(len(labelled), "episode(s)")
     yield (
-        f"{len(labelled)} episodes are anomalous by their labels, {odd} of them odd here."
+        f"Anomalous by their labels: {anomalous}, {odd} of them odd here."
         + " Where more than a fifth are, they pass for nominal: scan nominal logs alone, or judge "
         "by a watchdog that was fitted on these (--watchdog FILE)." * many
     )

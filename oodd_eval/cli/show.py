@@ -13,6 +13,7 @@ from oodd_eval.cli import (
     Options,
     command,
     expression_option,
+    refuse,
     row_metrics_option,
     say,
     say_notes,
@@ -20,7 +21,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
-from oodd_eval.data.split import Split, load_split
+from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.accumulation import STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
@@ -28,7 +29,7 @@ from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
-from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
 
@@ -75,6 +76,17 @@ def show(options: Options) -> int:
         )
     if options.metric:
         check_known("metric", NAMES, options.metric)
+    layout = _format(options)
+    if options.stored:
+        refuse(options, ["split", "row_metrics"], "is for computing, and --stored computes nothing")
+    if not options.detector:
+        refuse(options, ["metric"], "is of the table of one detector: name it with --detector")
+    if layout:
+        refuse(options, ["wide"], "is for the terminal: a format has all metrics")
+    if options.detector:
+        refuse(options, ["wide"], "prints tables of all detectors: leave out --detector")
+    if layout and not layout.tables:
+        refuse(options, ["metric"], "is of a table, and that format has all metrics of a cell")
     results = ResultsDirectory(options.directory)
     records = results.records()
     known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
@@ -82,19 +94,23 @@ def show(options: Options) -> int:
     passes = expression(options.expression)
     records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
     units: dict[str, str] = {}
+    splits: dict[str, Split] = {}
     if not options.stored:
         if options.alarm:
             records = [replace(record, alarm=options.alarm) for record in records]
-        splits = _splits(records, options.split)
+        splits = _splits(records, results, options.split)
         records = _recomputed(records, results, splits, rows=options.row_metrics)
         units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}
     say_notes(results.notes)
+    if options.row_metrics and records and all(r.paired for r in records):
+        raise UsageError("--row-metrics is for splits without twins, and these results have twins")
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))
     if options.detector:
         check_known("detector of these results", {r.detector for r in records}, options.detector)
-    layout = next((FORMATS[name] for name in FORMATS if getattr(options, name)), None)
+        if layout and not layout.tables:
+            records = [r for r in records if r.detector == options.detector]
     report = Report(
         records,
         intervals=options.intervals,
@@ -107,6 +123,11 @@ def show(options: Options) -> int:
         print(layout.render(report), end="")
         return code
     reporter = TerminalReporter(make_console())
+    for split in splits.values() if options.verbosity >= 0 else ():
+        if split.path not in split_directories().values():
+            reporter.console.print(
+                f"split {split.name}, digest {split.digest[:12]}, in {split.path}\n"
+            )
     print_sections(report.sections, reporter.console)
     if not options.detector:
         reporter.failures(records)
@@ -114,11 +135,18 @@ def show(options: Options) -> int:
     return code
 
 
-def _splits(records: list[Record], at: str | None) -> dict[str, Split]:
+def _format(options: Options) -> Format | None:
+    """Return the format that is asked for, if one is."""
+    names = [name for name in FORMATS if getattr(options, name)]
+    if len(names) > 1:
+        raise UsageError(f"--{names[0]} and --{names[1]} are two formats: leave out one")
+    return FORMATS[names[0]] if names else None
+
+
+def _splits(records: list[Record], results: ResultsDirectory, at: str | None) -> dict[str, Split]:
     """Open the splits of records, by their digests."""
-    # A split that is not the published one carries its digest behind its name.
-    names = {r.split_digest: at or r.split.partition("@")[0] for r in records}
-    return {digest: load_split(name) for digest, name in names.items()}
+    of_digest = {r.split_digest: r for r in records}
+    return {d: load_split(at) if at else results.split_of(r) for d, r in of_digest.items()}
 
 
 def _recomputed(

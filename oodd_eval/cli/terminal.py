@@ -1,14 +1,27 @@
 """The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
+import contextlib
 import math
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
 
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.console import Console, ConsoleOptions, Group, RenderableType
+from rich.live import Live
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.segment import Segment
 from rich.text import Text
 
@@ -20,6 +33,7 @@ from oodd_eval.data.logs import register_readers
 from oodd_eval.data.registry import Spec, register
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.plugins.isolation.child import Limits
@@ -30,6 +44,12 @@ from oodd_eval.results.render.text import print_prose, print_sections
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import NO_UNITS
 from oodd_eval.scoring.plan import Plan, Unit
+
+SILENCE: Final = 30.0
+"""Seconds without a line after which a run says what it is at, where it is no terminal."""
+
+_PART: Final = "trajector(y/ies) of each part"
+_MOST_RUNNING: Final = 8  # units that are named at a time
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
@@ -83,9 +103,25 @@ def register_formats(options: Options) -> None:
     register_readers(reader for reader, _ in discovered(options).readers.values())
 
 
-class TerminalReporter:
-    """Print a header, a line per fit, tables, failures and a summary.
+@dataclass(slots=True)
+class _Running:
+    """A unit that is being fitted or scored, since when, and how far the fit is if that is told."""
 
+    name: str
+    share: float | None = None
+    start: float = field(default_factory=time.perf_counter)
+
+    def __str__(self) -> str:
+        """Return a line such as ``riqn on acrobot: fitting 40 %, 32 s``."""
+        doing = "scoring" if self.share == 1 else "fitting"
+        done = f" {self.share:.0%}".replace("%", " %") if self.share and self.share < 1 else ""
+        return f"{self.name}: {doing}{done}, {time.perf_counter() - self.start:.0f} s"
+
+
+class TerminalReporter:
+    """Print a header, a line per fit, tables, failures and a summary; as a context, until its end.
+
+    On a terminal, what runs stands below a bar; elsewhere a line says so after some `SILENCE`.
     `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
     `units` are those of strengths by kind of anomaly.
     """
@@ -106,7 +142,25 @@ class TerminalReporter:
         self._sizes: dict[tuple[str, str], int] = {}
         self._resumed = 0
         self._progress: Progress | None = None
-        self._running: list[tuple[str, str]] = []
+        self._live: Live | None = None
+        self._running: dict[tuple[str, str], _Running] = {}
+        self._several_seeds = False
+        self._ended, self._latest = threading.Event(), self._start
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Take away what stands below the lines, however the run has ended."""
+        self._ended.set()
+        if self._live:
+            self._live.stop()
 
     @hookimpl
     def oodd_run_started(self, plan: Plan) -> None:
@@ -115,39 +169,73 @@ class TerminalReporter:
         self._sizes = {
             (u.environment, u.setting.label(u.seed)): len(u.conditions) for u in plan.units
         }
+        self._several_seeds = len({u.seed for u in plan.units}) > 1
         if self.verbosity < 0:
             return
         names = dict.fromkeys(u.setting.detector for u in plan.units)
-        limited = f", first {plan.limit} trajectories of each part" if plan.limit else ""
+        limited = f", first {counted(plan.limit, _PART)}" if plan.limit else ""
         self._print(f"oodd-eval {__version__}, protocol {PROTOCOL}")
         self._print(f"split {plan.split}, digest {plan.split_digest[:12]}{limited}")
         self._print(f"detectors: {', '.join(names)}")
-        self._print(f"{len(plan.units)} fits, {len(plan.cells)} cells\n")
-        if self.console.is_terminal:
-            columns = (
-                BarColumn(20),
-                MofNCompleteColumn(),
-                TextColumn("cells, left"),
-                TimeRemainingColumn(),
-                TextColumn("{task.description}"),
-            )
-            # A fit may take minutes: the speed is that of the whole run.
-            self._progress = Progress(
-                *columns, console=self.console, transient=True, speed_estimate_period=1e9
-            )
-            self._progress.add_task("", total=len(plan.cells))
-            self._progress.start()
+        fits, cells = counted(len(plan.units), "fit(s)"), counted(len(plan.cells), "cell(s)")
+        self._print(f"{fits}, {cells}\n")
+        if not self.console.is_terminal:
+            threading.Thread(target=self._break_silence, daemon=True).start()
+            return
+        columns = (
+            BarColumn(20),
+            MofNCompleteColumn(),
+            TextColumn("cells,"),
+            TimeElapsedColumn(),
+            TextColumn("so far,"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+        )
+        # A fit may take minutes: the speed is that of the whole run.
+        self._progress = Progress(*columns, console=self.console, speed_estimate_period=1e9)
+        self._progress.add_task("", total=len(plan.cells))
+        self._live = Live(
+            get_renderable=self._state, console=self.console, transient=True, refresh_per_second=2
+        )
+        self._live.start()
+
+    def _state(self) -> RenderableType:
+        """Return the bar, with what runs below it."""
+        running = (Text(line, no_wrap=True, overflow="ellipsis") for line in self._at_work())
+        return Group(*([self._progress] if self._progress else []), *running)
+
+    def _at_work(self) -> list[str]:
+        """Return a line on each unit that runs, of many on the first ones."""
+        running = list(self._running.values())
+        more = len(running) - _MOST_RUNNING
+        return [
+            *map(str, running[:_MOST_RUNNING]),
+            *([f"and {counted(more, 'more fit(s)')}"] if more > 0 else []),
+        ]
+
+    def _break_silence(self) -> None:
+        """Print what runs after every `SILENCE`, in a thread, until the run has ended."""
+        while not self._ended.wait(self._latest + SILENCE - time.perf_counter()):
+            if time.perf_counter() < self._latest + SILENCE:
+                continue  # A line has come.
+            self._latest = time.perf_counter()
+            # What reads may be gone: the next line of the run says so.
+            with contextlib.suppress(OSError, ValueError):
+                if lines := self._at_work():
+                    self._print("; ".join(lines))
 
     @hookimpl
     def oodd_unit_started(self, unit: Unit) -> None:
-        """Name what runs beside the bar."""
-        self._running.append((unit.environment, unit.setting.label(unit.seed)))
-        self._name_running()
+        """Name what runs."""
+        label = unit.setting.label(unit.seed)
+        name = label if self._several_seeds else str(unit.setting)
+        self._running[unit.environment, label] = _Running(f"{name} on {unit.environment}")
 
-    def _name_running(self) -> None:
-        if self._progress:
-            text = ", ".join("/".join(unit) for unit in self._running)
-            self._progress.update(self._progress.task_ids[0], description=text)
+    @hookimpl
+    def oodd_fit_progressed(self, unit: Unit, share: float) -> None:
+        """Say how far a fit is."""
+        if running := self._running.get((unit.environment, unit.setting.label(unit.seed))):
+            running.share = share
 
     @hookimpl
     def oodd_cell_finished(self, record: Record, resumed: bool) -> None:
@@ -158,9 +246,8 @@ class TerminalReporter:
         unit = record.environment, record.cell.label
         finished = self._open.setdefault(unit, [])
         finished.append(record)
-        if len(finished) == self._sizes.get(unit) and unit in self._running:
-            self._running.remove(unit)
-            self._name_running()
+        if len(finished) == self._sizes.get(unit):
+            self._running.pop(unit, None)
         if self.verbosity > 0:
             self._line(record, str(record.cell), [record], resumed=resumed)
         elif self.verbosity == 0 and len(finished) == self._sizes[unit]:
@@ -169,8 +256,7 @@ class TerminalReporter:
     @hookimpl
     def oodd_run_finished(self, records: list[Record], interrupted: bool) -> None:
         """Print the tables, the failures and the summary."""
-        if self._progress:
-            self._progress.stop()
+        self.__exit__(None, None, None)
         if self.verbosity >= 0 and any(r.ok for r in records):
             self._print("")
             self.tables(records)
@@ -215,6 +301,7 @@ class TerminalReporter:
         self._print("  ".join(parts), _COLOURS.get(last.status, "red"))
 
     def _print(self, text: str, style: str = "") -> None:
+        self._latest = time.perf_counter()
         self.console.print(Text(text, style))
 
 

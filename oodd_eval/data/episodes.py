@@ -707,7 +707,7 @@ class _Maker:
         lines = [f"read {counted(self._recordings, 'recording(s)')}: {sizes}"]
         for part, episodes in source.parts.items():
             rows = sum(facts.rows for facts in episodes)
-            line = f"{part}: {counted(len(episodes), 'episode(s)')}, {rows} rows"
+            line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
             if part not in _SHARED:
                 intervals = [i for facts in episodes for i in facts.intervals]
                 anomalous = sum(stop - max(start, 0) for start, stop in intervals)

@@ -24,6 +24,7 @@ from oodd_eval.leaderboard.entry import (
     sections,
 )
 from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
+from oodd_eval.names import counted
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
@@ -164,9 +165,9 @@ def _contents(sections: Sequence[LeaderboardSection]) -> str:
         slug = re.sub(r"[^a-z0-9 _-]", "", title.lower()).replace(" ", "-")
         address = f"{slug}-{seen[slug]}" if seen[slug] else slug
         seen[slug] += 1
-        rows = len(section.ranks.standings)
+        rows = counted(len(section.ranks.standings), "row(s)")
         digest = section.ranks.board.digest[:12]
-        lines.append(f"- [{escape(title)}](#{address}), digest {digest}: {rows} rows")
+        lines.append(f"- [{escape(title)}](#{address}), digest {digest}: {rows}")
     return "\n".join([*lines, ""])
 
 

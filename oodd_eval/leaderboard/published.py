@@ -16,6 +16,7 @@ from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import LeaderboardSection, SuiteSection
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
+from oodd_eval.names import counted
 from oodd_eval.results.board import (
     Board,
     Conditions,
@@ -292,7 +293,7 @@ def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
         if named:
             count = sum(map(len, missing.values()))
             of = f" with seed {seed}" if len(seeds) > 1 else ""
-            parts.append(f"{count} of {len(expected)} cells{of} ({', '.join(named)})")
+            parts.append(f"{count} of {counted(len(expected), 'cell(s)')}{of} ({', '.join(named)})")
     if has_few_seeds(records):
         parts.append(f"{SEEDS - len(seeds)} of {SEEDS} detector seeds")
     return " and ".join(parts)

@@ -16,7 +16,7 @@ from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.leaderboard import entry as stored
 from oodd_eval.leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
 from oodd_eval.leaderboard.verify import EntryVerdict, Neighbours, find_split, formats, verify_entry
-from oodd_eval.names import expression, select
+from oodd_eval.names import counted, expression, select
 from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Setting
@@ -139,7 +139,10 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
             f"--complete: no row of these results has all {len(every)} cells that occur in them; "
             "run the rest, or choose cells that all rows have with -k"
         )
-    left_out = [f"{label}, which has {n} of {len(every)} cells" for label, n in partial.items()]
+    left_out = [
+        f"{label}, which has {n} of {counted(len(every), 'cell(s)')}"
+        for label, n in partial.items()
+    ]
     return [r for r in records if r.cell.label not in partial], left_out
 
 

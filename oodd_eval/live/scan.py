@@ -42,6 +42,7 @@ from oodd_eval.metrics.outliers import (
     rank_p,
     rank_threshold,
 )
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_eval.results.record import without_nan
@@ -295,7 +296,7 @@ def scan_episodes(
     usable = [one for one in recorded if len(one.observations) >= shortest]
     if len(usable) < len(recorded):
         count = len(recorded) - len(usable)
-        notes.append(f"Left out: {count} episodes of fewer than {shortest} rows.")
+        notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
     if not usable:
         raise UsageError(f"no episode of at least {shortest} rows: nothing to judge")
     if watchdog is not None:
@@ -333,7 +334,7 @@ def scan_episodes(
         for i, one in enumerate(usable)
     ]
     how = "each episode is judged by a fit that has not seen it."
-    notes.insert(0, f"{len(usable)} episodes, {len(folds)} fits: {how}")
+    notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
     name = handle.state["name"] or type(handle.detector).__name__
     return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
 
@@ -392,7 +393,9 @@ def _scan_with(
         _watched(watchdog.copy(), one, float(longest), rows.trajectory)
         for one, longest, rows in zip(episodes, breaks, clean(episodes)[0], strict=True)
     ]
-    notes.insert(0, f"{len(episodes)} episodes, judged by a watchdog: {watchdog.promise}.")
+    notes.insert(
+        0, f"{counted(len(episodes), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
+    )
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
     if (known := watchdog.calibration) is not None:
         enough = (len(known.largest) + 1) * fdr >= len(episodes)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.marks import runs_of
 from oodd_eval.live.scan import Scan, ScannedEpisode
+from oodd_eval.names import counted
 
 Floats = NDArray[np.float64]
 
@@ -152,8 +153,9 @@ def _section(one: ScannedEpisode, number: int, names: Sequence[str]) -> str:
 def summary(scan: Scan) -> str:
     """Return how many episodes are odd, in a sentence."""
     rate = f"false discovery rate {scan.fdr:g}"
-    verb = "is" if len(scan.odd) == 1 else "are"
-    return f"{len(scan.odd)} of {len(scan.episodes)} episodes {verb} odd ({rate})."
+    episodes = counted(len(scan.episodes), "episode(s)")
+    verb = "is" if 1 in (len(scan.odd), len(scan.episodes)) else "are"
+    return f"{len(scan.odd)} of {episodes} {verb} odd ({rate})."
 
 
 def describe(one: ScannedEpisode) -> str:

@@ -31,6 +31,7 @@ OFFER_HOOKS: Final = (
 OBSERVER_HOOKS: Final = (
     "oodd_run_started",
     "oodd_unit_started",
+    "oodd_fit_progressed",
     "oodd_cell_finished",
     "oodd_run_finished",
 )

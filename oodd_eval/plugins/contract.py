@@ -14,7 +14,10 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import (
@@ -56,8 +59,14 @@ Summation orders, and so the last digits, depend on it. The same computation giv
 ROLLOUT_TOLERANCE: Final = 5e-3
 """The same at larger horizons: ten steps in single precision have reached 1.4e-3."""
 
+PROGRESS_SECONDS: Final = 0.5
+"""Between two shares of a fit that are passed on, at least."""
+
 Scores: TypeAlias = "NDArray[np.float64]"
 Copied = TypeVar("Copied")
+
+Progress: TypeAlias = Callable[[float], object]
+"""A function that a long fit may call with the share of it that is done, from 0 to 1."""
 
 Alarm = Literal["cusum", "score", "ewma", "shiryaev-roberts", "e-detector"]
 """Statistic of a detector's guaranteed alarms, see `oodd_eval.metrics.alarms.GuaranteedAlarm`."""
@@ -87,6 +96,8 @@ class Detector(Protocol):
 
     - ``score_many(trajectories) -> list of score arrays``: the same scores, for many trajectories
       at once, where batching is faster;
+    - ``fit(nominal, progress=None)``: `progress` is then a function, or None, which a long fit
+      calls now and then with the share that is done, from 0 to 1; it decides nothing;
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
     - ``state()`` and ``restore(state)``: see `StorableDetector`;
@@ -350,6 +361,46 @@ def _fails(attribute: tuple[str, object]) -> bool:
     except Exception:  # noqa: BLE001  whatever it raises
         return True
     return False
+
+
+def ignore_progress(share: float) -> None:
+    """Ignore which share of a fit is done: a `Progress` for those who do not ask."""
+    del share
+
+
+def takes_progress(detector: Detector) -> bool:
+    """Tell whether a detector's `fit` has a parameter ``progress``."""
+    try:
+        return "progress" in inspect.signature(detector.fit).parameters
+    except (TypeError, ValueError):  # of a compiled function, say
+        return False
+
+
+def fit_detector(
+    detector: Detector, nominal: Sequence[Trajectory], progress: Progress | None = None
+) -> None:
+    """Fit a detector; if it can tell, `progress` hears now and then which share is done.
+
+    Shares are heard in this process and during the fit only. `ContractError`: the detector calls
+    what it is handed with something else than a share.
+    """
+    if progress is None or not takes_progress(detector):
+        detector.fit(nominal)
+        return
+    latest, lock = -math.inf, threading.Lock()
+
+    def report(share: float) -> None:
+        nonlocal latest
+        if not 0 <= share <= 1:
+            raise ContractError(f"fit called progress with {share!r:.80}, expected 0 to 1")
+        with lock:
+            if (now := time.monotonic()) - latest >= PROGRESS_SECONDS:
+                latest = now
+                progress(float(share))
+
+    detector.fit(nominal, progress=report)  # type: ignore[call-arg]
+    with lock:
+        latest = math.inf  # A detector may keep the function, and call it later.
 
 
 def score_chunk(detector: Detector, chunk: Sequence[Trajectory]) -> list[object]:

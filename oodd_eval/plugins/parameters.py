@@ -8,11 +8,12 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.names import check_known
 
 Decides = Literal["fit", "scores", "nothing"]
 Declared = TypeVar("Declared")
@@ -145,6 +146,34 @@ def resolve_parameters(
         if name in known and (problem := known[name].problem(value)):
             raise UsageError(f"parameter {name!r} of {detector} is {value!r}, {problem}")
     return dict(sorted({**{n: p.default for n, p in known.items()}, **values}.items()))
+
+
+def parameters_by_detector(
+    detectors: Collection[str], values: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each detector, of values that may be for one alone.
+
+    A value under ``NAME`` is for all. One under ``DETECTOR.NAME``, or in a mapping under
+    ``DETECTOR``, is for that detector, and wins there. Raises `UnknownNameError` for a detector
+    that is not among them.
+
+    Examples
+    --------
+    >>> parameters_by_detector(["pe", "rf"], {"seed": 1, "rf.trees": 5, "pe": {"width": 8}})
+    {'pe': {'seed': 1, 'width': 8}, 'rf': {'seed': 1, 'trees': 5}}
+    """
+    shared: dict[str, Any] = {}
+    alone: dict[str, dict[str, Any]] = {name: {} for name in detectors}
+    for key, value in values.items():
+        detector, dot, name = key.rpartition(".")
+        if dot:
+            check_known("detector", alone, detector)
+            alone[detector][name] = value
+        elif key in alone and isinstance(value, Mapping):
+            alone[key] |= value
+        else:
+            shared[key] = value
+    return {name: shared | of_one for name, of_one in alone.items()}
 
 
 def declared_by(defaults: Mapping[str, Any], base: type = object) -> type:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, LabelledSet
-from oodd_eval.data.split import Split, load_split
+from oodd_eval.data.split import Split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.catalogue import LEVELS, metric_info
@@ -370,7 +370,7 @@ class Results(Sequence[Record]):
             for record in records:
                 if self._directory is None:
                     raise ResultsError(f"{record.cell}: the scores of these results were not kept")
-                split = self._split or load_split(record.split.partition("@")[0])
+                split = self._split or self._directory.split_of(record)
                 must_be_of(split, record)
                 data: EnvironmentData = opened(split)(record.environment)
                 file = stored_scores([record], self._directory, data)

@@ -7,6 +7,7 @@
     scores/<key>.sha256  SHA-256 and size of that file, and of the one before it
     fitted/<key>.npz   the state of a fitted detector that can hand it over, see `FitStore`
     logs/<key>.txt     the end of the output of a failing detector, with its traceback
+    splits.json        the paths of splits that are not found by their names, by digest
     report.md
 
 Every file is whole or absent, see `oodd_eval.data.files`. A score file that is not the one that was
@@ -30,14 +31,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data import files
-from oodd_eval.data.bounded import SCORES, open_plain
+from oodd_eval.data.bounded import SCORES, open_plain, read_json
+from oodd_eval.data.layout import MANIFEST
+from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.data.stored import child
-from oodd_eval.errors import FittedStateError, OutputError, ResultsError
+from oodd_eval.errors import (
+    FittedStateError,
+    OutputError,
+    ResultsError,
+    SplitNotFoundError,
+    UnknownNameError,
+)
 from oodd_eval.plugins.state import PackedState, read_state, write_state
 from oodd_eval.results.record import Record
 
 RECORDS: Final = "records.jsonl"
 REPORT: Final = "report.md"
+SPLITS: Final = "splits.json"
+
+MOST_PATHS: Final = 2**20  # bytes of the file of splits
 
 WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next one may take
 
@@ -106,6 +118,47 @@ class ResultsDirectory:
                 f"{len(old)} directories in {str(self.fits.path)!r}, such as {old[0].name}, hold "
                 "fits of an earlier version and are not read: they can be deleted"
             )
+
+    def note_split(self, split: Split) -> None:
+        """Keep the path of a split that is not found by its name."""
+        path = str(split.path.absolute())
+        by_name = split_directories().get(str(split.manifest["name"]))
+        if by_name is not None and by_name.absolute() == split.path.absolute():
+            return
+        with files.lock(self.path):
+            paths = self._split_paths() | {split.digest: path}
+            files.write_text(self.path / SPLITS, json.dumps(paths, indent=1) + "\n")
+
+    def _split_paths(self) -> dict[str, str]:
+        """Return the paths of splits by digest, as far as they can be read."""
+        content = None
+        with contextlib.suppress(ResultsError):
+            content = read_json(self.path / SPLITS, MOST_PATHS, ResultsError)
+        entries = content.items() if isinstance(content, dict) else ()
+        return {digest: path for digest, path in entries if isinstance(path, str)}
+
+    def split_of(self, record: Record) -> Split:
+        """Open the split of a record: where it was when it was evaluated, or by its name.
+
+        `SplitNotFoundError`, `UnknownNameError`: it is not there.
+        """
+        path = self._split_paths().get(record.split_digest)
+        if path is not None and (Path(path) / MANIFEST).is_file():
+            split = Split(Path(path))
+            if split.digest == record.split_digest:
+                return split
+        # A split that is not the published one carries its digest behind its name.
+        name = record.split.partition("@")[0]
+        try:
+            return load_split(name)
+        except (SplitNotFoundError, UnknownNameError) as error:
+            if path is None and isinstance(error, SplitNotFoundError):
+                raise
+            was = f"{error}" if path is None else f"it was in {path!r}, and is not there any more"
+            raise SplitNotFoundError(
+                f"the split {name!r} of these results is not found: {was}; pass --split PATH with "
+                "the directory where it is"
+            ) from None
 
     def records(self) -> list[Record]:
         """Read all records, also compressed ones; `ResultsError` without any, or a damaged one.

@@ -13,6 +13,7 @@ from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import ALPHA, Lead, Position, Ranking, Row, leads, rank, win_rates
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training, training_mark
 from oodd_eval.results.board import (
     Board,
@@ -337,14 +338,15 @@ def _state(
         return f"no cell has {metric_info(metric).title}"
     seeds = len({r.seed for r in records}) or 1
     expected = len(cells) * seeds
+    all_cells = counted(expected, "cell(s)")
     failed = Counter(r.status for r in records if not r.ok)
-    reasons = [f"{status} in {n} of {expected} cells" for status, n in failed.items()]
+    reasons = [f"{status} in {n} of {all_cells}" for status, n in failed.items()]
     if len(records) < expected:
-        reasons.append(f"{expected - len(records)} of {expected} cells missing")
+        reasons.append(f"{expected - len(records)} of {all_cells} missing")
     values = (c.value for cell in terms_of(records, metric).values() for c in cell.values())
     defined = sum(not math.isnan(value) for value in values)
     if undefined := sum(r.ok for r in records) - defined:
-        reasons.append(f"undefined in {undefined} of {expected} cells")
+        reasons.append(f"undefined in {undefined} of {all_cells}")
     reasons += sorted({training_mark(r.training) for r in records} - {""})
     if primary and has_few_seeds(records):
         reasons.append(f"{seeds} of {SEEDS} detector seeds")
@@ -410,8 +412,8 @@ class PairedComparison:
         unit = " %" if info.unit == "percent" else ""
         return (
             f"{info.title}: {self.first} {first}, {self.second} {second}{unit}, difference "
-            f"{difference} [{low}, {high}], p = {self.p:.2g}, {self.cells} "
-            f"cell{'s' * (self.cells != 1)}: {self.verdict}"
+            f"{difference} [{low}, {high}], p = {self.p:.2g}, "
+            f"{counted(self.cells, 'cell(s)')}: {self.verdict}"
         )
 
 

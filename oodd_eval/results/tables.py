@@ -366,7 +366,7 @@ def findings(board: Board) -> list[str]:
             if value > beaten:
                 sentences.append(
                     f"{simple} beats {entry} in mean {info.title}: {info.text(value)} against "
-                    f"{info.text(beaten)} over {cells} cell{'s' if cells != 1 else ''}."
+                    f"{info.text(beaten)} over {counted(cells, 'cell(s)')}."
                 )
     return sentences
 
@@ -409,7 +409,8 @@ def notes(board: Board) -> list[str]:
     if not board.paired:
         lines = [f"Split {board.split}, {facts}, episodes without twins.", *_episodes(board)]
     if board.limit is not None:
-        lines.append(f"Limited to the first {board.limit} trajectories of each part: for trying.")
+        first = counted(board.limit, "trajector(y/ies)")
+        lines.append(f"Limited to the first {first} of each part: for trying.")
     cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
     if len(cells) > len({cell[:2] for cell in cells}):
         lines.append(

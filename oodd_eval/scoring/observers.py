@@ -41,6 +41,22 @@ def oodd_unit_started(unit: Unit) -> None:
 
 
 @hookspec
+def oodd_fit_progressed(unit: Unit, share: float) -> None:
+    """Observe how far the fit of a unit is. Called at most twice a second for each unit.
+
+    Detectors whose `fit` has a parameter ``progress`` tell; of others only the end is known. Scores
+    of an earlier run have no fit, and from a Dask cluster nothing is heard.
+
+    Parameters
+    ----------
+    unit
+        The unit that is being fitted.
+    share
+        The part of the fit that is done, from 0 to 1; 1 at its end, when scoring begins.
+    """
+
+
+@hookspec
 def oodd_cell_finished(record: Record, resumed: bool) -> None:
     """Observe a finished cell. Called in the harness's process, once for every cell.
 

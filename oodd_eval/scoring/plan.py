@@ -23,7 +23,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate
 from oodd_eval.plugins.contract import CONTRACT, Alarm, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
-from oodd_eval.plugins.parameters import parameters_of, resolve_parameters
+from oodd_eval.plugins.parameters import parameters_by_detector, parameters_of, resolve_parameters
 from oodd_eval.results.identity import Cell, Setting
 from oodd_eval.results.record import Record
 
@@ -67,7 +67,7 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All units of a run, in the order in which they are begun and recorded.
+    """All units of a run, in the order in which they are recorded.
 
     Of each part the first `limit` trajectories are used; None means all. `groups` are those of
     anomalies by name, `strengths` the numbers of the split's strengths by environment.
@@ -145,13 +145,14 @@ def make_plan(
 
     `anomalies` are kinds or conditions, as `Split.anomalies` has them; by default all. `device` is
     the value of the parameter ``device`` for those detectors that have it. With `rolling`
-    calibration, nominal test episodes in recorded order join it once they are judged. What is
+    calibration, nominal test episodes in recorded order join it once they are judged. `parameters`
+    are for all detectors or for one (`parameters_by_detector`). What is
     unknown or refused, and a device that no detector has, raises `UsageError`.
     """
     if rolling:
         _check_rolling(split, environments)
     offers = [plugins.offer(name) for name in detectors]
-    values = [dict(parameters or {}) for _ in offers]
+    values = _parameters(offers, parameters or {})
     if device is not None:
         _set_device(device, offers, values)
     units = tuple(
@@ -176,6 +177,29 @@ def _check_rolling(split: Split, environments: Sequence[str]) -> None:
                 "which a rolling calibration needs: expected logs that were imported without twins "
                 'and with order = "recorded"'
             )
+
+
+def _parameters(offers: Sequence[Offer], parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the parameters of each detector; refuse one for all that only some of them have."""
+    specs = [offer.spec for offer in offers]
+    by_detector = parameters_by_detector([spec.name for spec in specs], parameters)
+    having = {spec.name: parameters_of(spec.parameters) for spec in specs}
+    for name in parameters:
+        lacking = [
+            spec.name
+            for spec in specs
+            if name in by_detector[spec.name]
+            and name not in having[spec.name]
+            and not spec.other_parameters
+        ]
+        if lacking and len(lacking) < len(specs):
+            first = next(spec.name for spec in specs if spec.name not in lacking)
+            raise UsageError(
+                f"parameter {name!r} is for all detectors, but {', '.join(lacking)} "
+                f"{'has' if len(lacking) == 1 else 'have'} none of that name: write "
+                f"{first}.{name}, such as --param {first}.{name}=VALUE, to set it for {first} alone"
+            )
+    return [by_detector[spec.name] for spec in specs]
 
 
 def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str, Any]]) -> None:

@@ -6,10 +6,11 @@ results are the same bytes for any number of jobs.
 
 import math
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
 from graphlib import TopologicalSorter
 from queue import SimpleQueue
 from typing import Any
@@ -17,13 +18,14 @@ from typing import Any
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
+from oodd_eval.plugins.contract import Progress
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
 from oodd_eval.results.evaluate import counts_of, evaluated
 from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
-from oodd_eval.scoring.plan import Plan
+from oodd_eval.scoring.plan import Plan, Unit
 from oodd_eval.scoring.unit import COSTS, Scored, UnitJob
 
 
@@ -60,6 +62,7 @@ def run(
         raise UsageError("rows are streamed to detectors of plug-ins only: name one")
     if results:
         results.prepare()
+        results.note_split(split)
     executor = open_executor(settings, split, results)
     writer = RecordWriter(results)
     notify = Observers(plugins, observers).notify
@@ -67,6 +70,7 @@ def run(
     opened = ExitStack()
     try:
         data = opened.enter_context(split.opened())
+        order = sorted(range(len(plan.units)), key=lambda i: _slow(plan.units[i], plugins))
         jobs = [
             UnitJob(
                 plan,
@@ -76,18 +80,23 @@ def run(
                 plugins.offer(unit.setting.detector),
                 settings.streamed,
             )
-            for unit in plan.units
+            for unit in map(plan.units.__getitem__, order)
         ]
         notify("oodd_run_started", plan=plan)
         origin = gather(settings.command)
-        with closing(_as_they_finish(jobs, executor, settings, results)) as finished:
-            for index, scored in finished:
+
+        def progressed(job: int, share: float) -> None:
+            notify("oodd_fit_progressed", unit=plan.units[order[job]], share=share)
+
+        waiting = _as_they_finish(jobs, executor, settings, results, progressed)
+        with closing(waiting) as finished:
+            for job, scored in finished:
                 if scored is None:
-                    notify("oodd_unit_started", unit=plan.units[index])
+                    notify("oodd_unit_started", unit=plan.units[order[job]])
                     continue
                 done += 1
-                records = _records(jobs[index], scored, origin, settings)
-                writer.add(index, records)
+                records = _records(jobs[job], scored, origin, settings)
+                writer.add(order[job], records)
                 for record in records:
                     notify("oodd_cell_finished", record=record, resumed=scored.resumed)
                 if settings.stop_on_failure and scored.status != "ok":
@@ -103,14 +112,25 @@ def run(
     return RunOutcome(records, interrupted, len(plan.units) - done)
 
 
+def _slow(unit: Unit, plugins: Plugins) -> bool:
+    """Tell whether a unit may wait for others, whose figures can be seen early.
+
+    Detectors that need further libraries train networks and forests. What runs in this thread keeps
+    others from being begun.
+    """
+    return unit.local or bool(plugins.offer(unit.setting.detector).spec.requires)
+
+
 def _as_they_finish(
     jobs: Sequence[UnitJob],
     executor: Executor,
     settings: RunSettings,
     results: ResultsDirectory | None,
+    progressed: Callable[[int, float], None],
 ) -> Generator[tuple[int, Scored | None], None, None]:
     """Yield places of jobs, with None as they begin, and with their scores as they finish.
 
+    In between `progressed` is called with places and shares of their fits, in this thread, too.
     Only a few more units are begun than are taken, so that few scores are in memory.
     """
     end = math.inf if settings.deadline is None else time.monotonic() + settings.deadline
@@ -120,12 +140,12 @@ def _as_they_finish(
     waiting = _in_dependence(jobs, executor, settings, results)
     waiting.prepare()
     ready: list[int] = []
-    events: SimpleQueue[int | Future[tuple[int, Scored]]] = SimpleQueue()
+    events: SimpleQueue[int | tuple[int, float] | Future[tuple[int, Scored]]] = SimpleQueue()
     running = 0
 
-    def score(index: int) -> Scored:
+    def score(index: int, progress: Progress) -> Scored:
         job = jobs[index]
-        scored = executor(job)
+        scored = executor(job, progress)
         if results:
             if scored.status == "ok" and not scored.resumed:
                 results.write_scores(job.unit.scores_key, scored.file)
@@ -135,7 +155,7 @@ def _as_they_finish(
 
     def begin(index: int) -> tuple[int, Scored]:
         events.put(index)
-        return index, score(index)
+        return index, score(index, lambda share: events.put((index, share)))
 
     pool = ThreadPoolExecutor(max_workers=executor.jobs)
     try:
@@ -145,7 +165,8 @@ def _as_they_finish(
                 index = ready.pop(0)
                 if jobs[index].unit.local:
                     yield index, None
-                    yield index, score(index)  # in this thread, where it can be interrupted
+                    # In this thread, where it can be interrupted.
+                    yield index, score(index, partial(progressed, index))
                     waiting.done(index)
                     ready = sorted([*ready, *waiting.get_ready()])
                 else:
@@ -156,6 +177,9 @@ def _as_they_finish(
             event = events.get()
             if isinstance(event, int):
                 yield event, None
+                continue
+            if isinstance(event, tuple):
+                progressed(*event)
                 continue
             running -= 1
             index, scored = event.result()

@@ -22,6 +22,7 @@ from oodd_eval.data.parts import (
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, OutputError, ResultsError, SplitError, UsageError
 from oodd_eval.plugins import contract, explanations
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import Offer, describe, printable
 from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.isolation.child import Limits, Stop
@@ -75,26 +76,41 @@ class UnitJob:
     streamed: bool = False
 
     def __call__(
-        self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
+        self,
+        limits: Limits,
+        stop: Stop,
+        results: ResultsDirectory | None,
+        *,
+        fresh: bool,
+        progress: Progress = ignore_progress,
     ) -> Scored:
-        """Return the unit's scores, or how it failed: only what the user can mend is raised."""
+        """Return the unit's scores, or how it failed: only what the user can mend is raised.
+
+        `progress` hears which share of the fit is done, in the thread that calls.
+        """
         if self.unit.local:
-            return GroupedScoring(self).in_process()
+            return GroupedScoring(self, progress).in_process()
         try:
-            return self._isolated(limits, stop, results, fresh=fresh)
+            return self._isolated(limits, stop, results, progress, fresh=fresh)
         except (SplitError, OutputError, ResultsError, UsageError):
             raise
         except Exception as error:  # noqa: BLE001  a plug-in that nobody thought of is one unit's
             return Scored("error", f"oodd-eval: {describe(error)}", log=traceback.format_exc())
 
     def _isolated(
-        self, limits: Limits, stop: Stop, results: ResultsDirectory | None, *, fresh: bool
+        self,
+        limits: Limits,
+        stop: Stop,
+        results: ResultsDirectory | None,
+        progress: Progress,
+        *,
+        fresh: bool,
     ) -> Scored:
         if reason := self.offer.unavailable():
             return Scored("unavailable", reason)
         if not fresh and (kept := self.kept(results)):
             return kept
-        work = GroupedScoring(self)
+        work = GroupedScoring(self, progress)
         if results is None:
             return work.checked(work.isolated(limits, stop))
         fits, key = results.fits, self.unit.fit_key
@@ -128,7 +144,8 @@ class GroupedScoring:
     trajectories. Where rows are streamed, groups hold all parts, see `mixed`.
     """
 
-    def __init__(self, job: UnitJob) -> None:
+    def __init__(self, job: UnitJob, progress: Progress = ignore_progress) -> None:
+        self._progress = progress
         self._job, self._sets = job, parts_of(job.data, job.unit.conditions)
         self._lengths = lengths_of(self._sets, job.plan.limit)
         self._adapts = bool(job.unit.adapts)
@@ -170,6 +187,7 @@ class GroupedScoring:
             state=state,
             keep=keep,
             streamed=self._job.streamed,
+            progress=self._progress,
         )
 
     def checked(self, outcome: Outcome) -> Scored:
@@ -212,7 +230,8 @@ class GroupedScoring:
             parameters=unit.parameters,
             baseline=self._adapting,
         )
-        detector.fit([*self._train])
+        contract.fit_detector(detector, [*self._train], self._progress)
+        self._progress(1.0)
         return detector
 
     def _another(self, detector: contract.Detector) -> contract.Detector:

@@ -1,13 +1,25 @@
 """``oodd-eval reproduce``: compute the paper's tables, figures and claims."""
 
+from typing import Final
+
 import click
 
-from oodd_eval.cli import DIRECTORY, TIME, Name, Options, command, fit_options, load, say_notes
+from oodd_eval.cli import (
+    DIRECTORY,
+    TIME,
+    Name,
+    Options,
+    command,
+    fit_options,
+    load,
+    refuse,
+    say_notes,
+)
 from oodd_eval.cli.terminal import discovered, make_console
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
-from oodd_eval.names import check_known, select
+from oodd_eval.names import check_known, counted, select
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
@@ -19,6 +31,11 @@ from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
 from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
 from oodd_paper.page import publish
 from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
+
+_OF_RUNS: Final = (
+    *("tier", "split", "only", "plan", "budget", "fresh", "build"),
+    *("jobs", "device", "timeout", "memory"),
+)
 
 
 @command(
@@ -71,6 +88,7 @@ def reproduce(options: Options) -> int:
     """
     check_known("tier", TIERS, options.tier)
     if options.render_only:
+        refuse(options, _OF_RUNS, "is for a run, and --render-only runs nothing: leave out one")
         header = Reproduction.load(options.output)
         records = load_records(header, options.records or [options.output])
         return _render(options, header, records)
@@ -122,7 +140,9 @@ def _run(options: Options) -> int:
     code = _render(options, header, results.records() if (directory / RECORDS).exists() else [])
     if outcome.left:
         why = "interrupted" if outcome.interrupted else "the budget is used up"
-        left_over = f"{outcome.left} units left, about {duration(progress.remaining())}"
+        left_over = (
+            f"{counted(outcome.left, 'unit(s)')} left, about {duration(progress.remaining())}"
+        )
         console.print(f"{why}: {left_over}; the same command goes on")
     return 2 if outcome.left else code
 

@@ -13,6 +13,7 @@ from typing import Final
 
 from oodd_eval.data.parts import TWINS
 from oodd_eval.data.split import Split
+from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.parameters import parameters_of
@@ -132,7 +133,7 @@ def stages(
         if units or stage is None:
             counts = map(str, (len(units), len(units) - len(to_do), len(to_do)))
             lines.append([title, *counts, duration(seconds) if to_do else ""])
-    on = f"time on {jobs} core{'s' if jobs > 1 else ''}"
+    on = f"time on {counted(jobs, 'core(s)')}"
     return Table("What remains", ["", "units", "done", "to do", on], lines)
 
 

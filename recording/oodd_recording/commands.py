@@ -21,6 +21,7 @@ from oodd_eval.cli import (
     Options,
     command,
     jobs_option,
+    refuse,
     say,
 )
 from oodd_eval.cli.check import STYLES
@@ -31,7 +32,7 @@ from oodd_eval.data.files import temporary_directory
 from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, inner_of
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import Predicate, assignment, select
+from oodd_eval.names import Predicate, assignment, counted, select
 from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
@@ -235,10 +236,9 @@ def calibrate(options: Options) -> int:
         jobs=options.jobs,
         progress=notes.print,
     )
-    count = sum(map(len, strengths.values()))
-    make_console().print(
-        f"strengths of {count} kinds in {len(strengths)} environments: {options.output}"
-    )
+    kinds_measured = counted(sum(map(len, strengths.values())), "kind(s)")
+    of = counted(len(strengths), "environment(s)")
+    make_console().print(f"strengths of {kinds_measured} in {of}: {options.output}")
     return 0
 
 
@@ -317,7 +317,7 @@ def import_policy(options: Options) -> int:
         returns = evaluate_policy(options.env, load_policy(options.env, partial), episodes=TRIED)
     write_policy(options.path, options.tensor, arrays, options.output)
     policy = load_policy(options.env, options.output)
-    steps = "onnxruntime" if arrays is None else f"{len(arrays['steps'])} operations"
+    steps = "onnxruntime" if arrays is None else counted(len(arrays["steps"]), "operation(s)")
     make_console().print(
         f"policy in {options.output}, {steps}, digest {policy.digest[:12]}: mean return "
         f"{returns.mean():.1f} in {TRIED} episodes of {options.env}"
@@ -345,7 +345,9 @@ def evaluate(options: Options) -> int:
     )
     paper = f" (paper: {ENVIRONMENTS[name].paper_return})" if name in ENVIRONMENTS else ""
     mean = f"{returns.mean():.1f} ± {returns.std():.1f}"
-    make_console().print(f"{name}: return {mean} over {options.episodes} episodes{paper}")
+    make_console().print(
+        f"{name}: return {mean} over {counted(options.episodes, 'episode(s)')}{paper}"
+    )
     return 0
 
 
@@ -370,6 +372,8 @@ def check_custom(options: Options, selects: Predicate) -> int:
             if isinstance(s, EnvironmentSpec) and _package_of(s) == _package_of(spec)
         )
         environment = options.env or next(iter([*spec.environments, *beside, "cartpole"]))
+    else:
+        refuse(options, ["env"], f"is for anomalies, and {spec.name} is an environment")
     console, results = make_console(), []
     console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
     for name, check in custom_checks(spec, environment):

@@ -229,9 +229,10 @@ def _run(
         command=options.invocation,
         streamed=True,
     )
-    reporter = TerminalReporter(make_console(), verbosity=options.verbosity, log=results.log_path)
-    plan = plan_of(records, split, plugins)
-    return not run(plan, split, plugins, settings, results, observers=[reporter]).interrupted
+    plan, console = plan_of(records, split, plugins), make_console()
+    with TerminalReporter(console, verbosity=options.verbosity, log=results.log_path) as reporter:
+        done = run(plan, split, plugins, settings, results, observers=[reporter])
+    return not done.interrupted
 
 
 def plan_of(records: Sequence[Record], split: Split, plugins: Plugins) -> Plan:

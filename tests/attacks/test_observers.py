@@ -104,7 +104,8 @@ def test_each_observer_gets_a_copy_of_its_own(tiny_split, monkeypatch, tmp_path)
     assert all(sys.modules["oodd_late"].SEEN)
 
 
-HOOKS = ("oodd_run_started", "oodd_unit_started", "oodd_cell_finished", "oodd_run_finished")
+HOOKS = ("oodd_run_started", "oodd_unit_started", "oodd_fit_progressed", "oodd_cell_finished",
+         "oodd_run_finished")  # fmt: skip
 ENDS = ("sys.exit(0)", "sys.exit()", "raise GeneratorExit", "raise BaseException('x')",
         "raise ValueError('x')")  # fmt: skip
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError
-from oodd_eval.plugins.contract import Scores
+from oodd_eval.plugins.contract import Progress, Scores, ignore_progress
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.parameters import checked, parameter
 from oodd_eval.plugins.state import Arrays, State, labelled, unlabelled
@@ -235,3 +235,17 @@ class StorableWindowDetector(WindowDetector):
     @abstractmethod
     def _restore(self, arrays: Arrays, sensors: int) -> None:
         """Take over the fit from arrays that `_arrays` returned."""
+
+
+class LongFitDetector(StorableWindowDetector):
+    """A `StorableWindowDetector` whose fit takes long, and tells how far it is.
+
+    `_learn` calls `progress` with the share that is done.
+    """
+
+    progress: Progress
+
+    def fit(self, nominal: Sequence[Trajectory], progress: Progress | None = None) -> Self:
+        """Learn from nominal trajectories, see `WindowDetector.fit`, and tell `progress`."""
+        self.progress = progress or ignore_progress
+        return super().fit(nominal)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from oodd_common.windows import StorableWindowDetector
+from oodd_common.windows import LongFitDetector
 from torch import Tensor
 
 from oodd_eval import Trajectory
@@ -48,7 +48,7 @@ WEIGHTS: Final = "weights."
 """Prefix of the names of weights in a state."""
 
 
-class NetworkDetector(StorableWindowDetector):
+class NetworkDetector(LongFitDetector):
     r"""Mean absolute distance between an observation and its sampled forecasts.
 
     .. math:: A_t = \frac{1}{M e D} \sum_{i=1}^{M e} \sum_{d=1}^{D}
@@ -162,7 +162,7 @@ class NetworkDetector(StorableWindowDetector):
         base = linear_forecast(training, self.window)
         network = Ensemble(architecture, generators, *base).to(self.device)
         rngs = [np.random.default_rng([self.seed, 1, i]) for i in members]
-        history = train(network, training, held_out, self.schedule, rngs)
+        history = train(network, training, held_out, self.schedule, rngs, self.progress)
         self._take(network, history, self._residual(network, held_out))
         return scale
 

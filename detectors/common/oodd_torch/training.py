@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from oodd_common.windows import windows
 from torch import Tensor
 
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_torch.network import Ensemble
 from oodd_torch.optimizers import Adam, Average, Muon
 
@@ -290,10 +291,12 @@ def train(
     held_out: Sequence[NDArray[np.float32]],
     schedule: Schedule,
     rngs: Sequence[np.random.Generator],
+    progress: Progress = ignore_progress,
 ) -> list[list[float]]:
     """Train all members in place; each ends at the mean of its last weights.
 
-    Returns held-out losses, K values before the training and K after it.
+    `progress` is called with the share of the updates that is done. Returns held-out losses, K
+    values before the training and K after it.
     """
     a, device, share = network.architecture, network.device, schedule.scheduled_sampling
     kappa = torch.tensor(schedule.widths, device=device)
@@ -316,6 +319,7 @@ def train(
         adam.step(every * ADAM_RATE * rate)
         muon.step(every * MUON_RATE * rate)
         average.update()
+        progress(done)
     average.apply()
     return [*history, evaluate(network, held_out, schedule.levels, kappa, share).tolist()]
 

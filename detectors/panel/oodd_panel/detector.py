@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, product
-from oodd_common.windows import StorableWindowDetector
+from oodd_common.windows import LongFitDetector
 from oodd_pe import make_pe
 
 from oodd_eval import Explanation, Trajectory
@@ -93,7 +93,7 @@ REFERENCE: Final = 4.6
 """Surprise that a row must exceed to count as anomalous in the estimate of the onset: 1 in 100."""
 
 
-class PanelDetector(StorableWindowDetector):
+class PanelDetector(LongFitDetector):
     r"""Surprises of calibrated members that see different things, as one statistic.
 
     .. math:: e_t = \frac{o_t - B^\top x_t}{\rho}, \quad
@@ -474,7 +474,8 @@ class PanelDetector(StorableWindowDetector):
         self.charts_ = self._fitted_charts(episodes, total, varies=varies)
         self.ensemble_ = None
         if self._wants_ensemble(usable):
-            self.ensemble_ = self._new_ensemble().fit([self._visible(x) for x in usable])
+            visible = [self._visible(x) for x in usable]
+            self.ensemble_ = self._new_ensemble().fit(visible, self.progress)
             self.ensemble_tail_.fit(self.ensemble_.nominal_statistics_)
         return scale
 

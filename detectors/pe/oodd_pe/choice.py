@@ -10,6 +10,7 @@ import numpy as np
 from oodd_common.charts import Floats
 
 from oodd_eval.errors import FittedStateError
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
 from oodd_pe.density import DensityForecaster
@@ -45,8 +46,9 @@ class ChosenForecaster:
     def __init__(self, parameters: PeParameters, *, seed: int, horizon: int, device: str) -> None:
         self.parameters, self.horizon = parameters, horizon
         self.processes = GaussianForecaster(seed=seed)
+        self.ensemble = DensityForecaster(parameters, seed=seed, device=device)
         self._all: dict[str, DensityForecaster | GaussianForecaster | KalmanForecaster] = {
-            "ensemble": DensityForecaster(parameters, seed=seed, device=device),
+            "ensemble": self.ensemble,
             "processes": self.processes,
             "filter": KalmanForecaster(seed=seed, updates=min(UPDATES, parameters.updates)),
         }
@@ -59,11 +61,19 @@ class ChosenForecaster:
         return self._all[self.name_]
 
     def fit(
-        self, units: Units, pieces: Sequence[Transitions], folds: Sequence[int]
+        self,
+        units: Units,
+        pieces: Sequence[Transitions],
+        folds: Sequence[int],
+        progress: Progress = ignore_progress,
     ) -> list[Assessment | None]:
-        """Fit those that are worth it, and keep the likeliest: see `EpisodeForecaster.fit`."""
-        judged = {}
-        for name in self._candidates(units, pieces, folds):
+        """Fit those that are worth it, and keep the likeliest: see `EpisodeForecaster.fit`.
+
+        `progress` hears of the ensemble's updates, which take most of the time.
+        """
+        _, *others = self._candidates(units, pieces, folds)
+        judged = {"ensemble": self.ensemble.fit(units, pieces, folds, progress)}
+        for name in others:
             judged[name] = self._all[name].fit(units, pieces, folds)
         self.log_densities_ = {name: self._all[name].log_density_ for name in judged}
         self.name_ = "ensemble"
@@ -97,7 +107,7 @@ class ChosenForecaster:
     def _candidates(
         self, units: Units, pieces: Sequence[Transitions], folds: Sequence[int]
     ) -> list[str]:
-        """Return the names of the forecasters that are worth a fit."""
+        """Return the names of the forecasters that are worth a fit, the ensemble's first."""
         names = ["ensemble"]
         # Without other folds nothing is held out, and likelihoods say nothing.
         comparable = max(folds) > 0 and 0 < len(units.varying) <= SENSORS

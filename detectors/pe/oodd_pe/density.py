@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
 
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.forecasting import CONSTANT
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
@@ -45,11 +46,15 @@ class DensityForecaster:
         self.log_density_ = -math.inf
 
     def fit(
-        self, units: Units, pieces: Sequence[Transitions], folds: Sequence[int]
+        self,
+        units: Units,
+        pieces: Sequence[Transitions],
+        folds: Sequence[int],
+        progress: Progress = ignore_progress,
     ) -> list[Assessment | None]:
         """Learn from nominal pieces: see `oodd_pe.forecaster.EpisodeForecaster.fit`.
 
-        Each member leaves one fold out, in turn.
+        Each member leaves one fold out, in turn. `progress` hears of the updates.
         """
         self.units_ = units
         p, k = self.parameters, max(folds) + 1
@@ -72,6 +77,7 @@ class DensityForecaster:
                 batch=p.batch,
                 seed=self.seed,
                 device=self.device,
+                progress=progress,
             )
         self.ensemble_ = DensityEnsemble(network.arrays())
         first = [piece for piece, fold in zip(pieces, folds, strict=True) if not fold]

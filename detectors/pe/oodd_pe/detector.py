@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
-from oodd_common.windows import StorableWindowDetector, windows
+from oodd_common.windows import LongFitDetector, windows
 from oodd_torch.device import resolved_device
 
 from oodd_eval import Explanation, Trajectory
@@ -21,7 +21,7 @@ from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_pe import PeParameters
 from oodd_pe.choice import ChosenForecaster
-from oodd_pe.forecaster import Assessment, EpisodeForecaster, Judge, Known, Transitions, Units
+from oodd_pe.forecaster import Assessment, Judge, Known, Transitions, Units
 from oodd_pe.rare import RareEvents
 from oodd_pe.statistic import Charts, Evidence, Onsets, Running
 
@@ -38,7 +38,7 @@ MANY: Final = 30
 """Episodes from which half of them, in folds of half the size, are enough to learn charts from."""
 
 
-class ProbabilisticEnsemble(StorableWindowDetector):
+class ProbabilisticEnsemble(LongFitDetector):
     r"""Residuals of forecast distributions, accumulated with several memories.
 
     .. math:: e_t = \frac{1}{M} \sum_m s_m(x_t) \, (I + U_m(x_t)) \, (y_t - \mu_m(x_t)), \quad
@@ -87,7 +87,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
             name, seed=seed, horizon=horizon, window=parameters.window, actions=actions
         )
         self.parameters, self.accumulate = parameters, accumulate
-        self.forecaster: EpisodeForecaster = ChosenForecaster(
+        self.forecaster = ChosenForecaster(
             parameters, seed=seed, horizon=horizon, device=resolved_device(name, parameters.device)
         )
         self.units_: Units
@@ -178,7 +178,7 @@ class ProbabilisticEnsemble(StorableWindowDetector):
         self._take(Units.fit(scale, rows, commands, self.window))
         self.largest_change_ = float(np.sqrt(2.0 * np.log1p(len(usable))))
         pieces, folds = self.pieces(usable)
-        self.chart(pieces, self.forecaster.fit(self.units_, pieces, folds))
+        self.chart(pieces, self.forecaster.fit(self.units_, pieces, folds, self.progress))
         return scale
 
     def chart(self, pieces: Sequence[Transitions], judged: Sequence[Assessment | None]) -> None:

@@ -7,7 +7,7 @@ means, scales, a triangular matrix of dependences, and how heavy each tail is, a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import silu, smooth_l1_loss
 
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.state import Arrays
 
 LAYERS: Final = 3
@@ -196,6 +197,7 @@ def train(
     batch: int,
     seed: int,
     device: str,
+    progress: Progress = ignore_progress,
 ) -> None:
     """Maximize the likelihood of outcomes given inputs, in place.
 
@@ -223,13 +225,24 @@ def train(
         Decides the batches.
     device
         Where torch computes.
+    progress
+        Called after each update with the share of the updates that is done.
     """
     random = np.random.default_rng([seed, 1])
     network.to(device)
     inputs, outcomes = (torch.from_numpy(v).to(device) for v in (x, y))
     best, kept, done = network.likelihood(inputs, outcomes, held_out), _copied(network), 0
     for total in rounds(updates):
-        _round(network, inputs, outcomes, rows, range(done, total), batch=batch, random=random)
+        _round(
+            network,
+            inputs,
+            outcomes,
+            rows,
+            range(done, total),
+            batch=batch,
+            random=random,
+            progress=lambda done: progress(done / updates),
+        )
         done, likelihood = total, network.likelihood(inputs, outcomes, held_out)
         # No comparison is true of what is not a number, where nothing is held out.
         if not likelihood <= best:
@@ -264,6 +277,7 @@ def _round(
     *,
     batch: int,
     random: np.random.Generator,
+    progress: Callable[[int], object],
 ) -> None:
     """Train by some updates, numbered from the beginning, over which the rates fall to nothing."""
     rest = [*network.biases, network.out, network.out_bias]
@@ -287,4 +301,5 @@ def _round(
         others.step(RATE * rate * one)
         hidden.step(HIDDEN_RATE * rate * one)
         average.update()
+        progress(update + 1)
     average.apply()

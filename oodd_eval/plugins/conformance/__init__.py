@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from oodd_eval.names import counted
+
 STATUSES: Final = {
     "passed": "passed",
     "failed": "failed",
@@ -103,8 +105,8 @@ class CheckReport:
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[s]} {meaning}" for s, meaning in STATUSES.items() if counts[s]]
         seconds = sum(result.seconds for result in self.results)
-        checks = "check" if len(self.results) == 1 else "checks"
-        return f"{len(self.results)} {checks}: {', '.join(parts) or 'none ran'} in {seconds:.1f} s"
+        checks = counted(len(self.results), "check(s)")
+        return f"{checks}: {', '.join(parts) or 'none ran'} in {seconds:.1f} s"
 
     def __str__(self) -> str:
         width = max((len(result.name) for result in self.results), default=0)

@@ -9,6 +9,7 @@ import contextlib
 import re
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import pytest
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.metrics.auc import auc
+from oodd_eval.names import counted
 from oodd_eval.plugins.conformance.side_effects import DAEMON, outside, seeded_generators
 from oodd_eval.plugins.conformance.trial import (
     SENSORS,
@@ -39,6 +41,7 @@ from oodd_eval.plugins.contract import (
     StreamingDetector,
     check_scores,
     difference,
+    takes_progress,
 )
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 from oodd_eval.plugins.isolation.worker import reason_of
@@ -216,6 +219,23 @@ def test_same_seed(trial: Trial) -> None:
         trial.must_agree(trial.fit(), f"{second} has other scores", advice)
 
 
+def test_progress(trial: Trial) -> None:
+    """Telling how far the fit is changes no score; shares rise, from 0 to 1."""
+    trial.fitted()
+    detector: Any = trial.make()
+    if not takes_progress(detector):
+        pytest.skip("its fit has no parameter progress")
+    shares: list[float] = []
+    with doing("fit with progress"):
+        detector.fit(tuple(trial.training()), progress=shares.append)
+    trial.must_agree(detector, "a detector whose fit told its progress has other scores")
+    rising = [0.0, *shares, 1.0]
+    problem = next((s for before, s in pairwise(rising) if not before <= s), None)
+    assert problem is None, (
+        f"fit called progress with {problem!r:.80}: expected shares that rise from 0 to 1"
+    )
+
+
 def test_deterministic(trial: Trial) -> None:
     """Another seed gives the same scores where the spec says that the detector is deterministic."""
     trial.fitted()
@@ -352,7 +372,7 @@ def _rows(trial: Trial) -> tuple[int, ...]:
 def test_short_trajectories(trial: Trial) -> None:
     """Episodes of one and two observations, and as short as the horizon, are scored."""
     for n in sorted({1, 2, trial.horizon, trial.horizon + 1}):
-        what = f"an episode of {n} observation{'s' if n > 1 else ''}"
+        what = f"an episode of {counted(n, 'observation(s)')}"
         _must_be_finite(trial, trial.fitted(), trial.episode(7, n), what)
 
 

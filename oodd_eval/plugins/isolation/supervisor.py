@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.plugins.contract import PROGRESS_SECONDS, Progress, ignore_progress
 from oodd_eval.plugins.isolation import (
     CHUNK,
     CLOSED_SECONDS,
@@ -68,6 +69,7 @@ def run_isolated(
     state: PackedState | None = None,
     keep: bool = False,
     streamed: bool = False,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
 
@@ -79,13 +81,14 @@ def run_isolated(
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
     perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
     fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row at a time,
-    and waits for its score before the next; then nothing is explained.
+    and waits for its score before the next; then nothing is explained. `progress` is called with
+    the share of the fit that is done, as far as the detector tells, and with 1 at its end.
 
     Groups are read once and lazily. Scores come back in their order. When `stop` says True, the
     worker is killed and the status is ``"error"``. Only errors of reading the trajectories are
     raised.
     """
-    unit = _UnitRun(request, train, limits, stop, state, keep, streamed)
+    unit = _UnitRun(request, train, limits, stop, state, keep, streamed, progress)
     try:
         unit.run(groups, explained)
     except GivenUpError as error:
@@ -104,6 +107,7 @@ class _UnitRun:
     state: PackedState | None
     keep: bool
     streamed: bool
+    progress: Progress
     outcome: Outcome = field(default_factory=Outcome)
     start: float = field(default_factory=time.monotonic)
     seconds: float = 0.0
@@ -183,8 +187,16 @@ class _UnitRun:
                 channel.send_state(state)
             for trajectory in train:
                 channel.send_trajectory(trajectory)
-        message = _receive(channel)
+        message, latest = _receive(channel), -math.inf
+        while "progress" in message:
+            share = _number(message, "progress", 1.0)
+            # An honest worker does not tell more often.
+            if time.monotonic() - latest > PROGRESS_SECONDS / 2:
+                latest = time.monotonic()
+                self.progress(share)
+            message = _receive(channel)
         seconds = _number(message, "seconds_fit", child.elapsed)
+        self.progress(1.0)
         outcome.seconds_fit = seconds if outcome.seconds_fit is None else outcome.seconds_fit
         outcome.warm_up = _value(message, "warm_up", object)
         self.explains, self.updates, can_fork, follows = (

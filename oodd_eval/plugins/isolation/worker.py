@@ -39,6 +39,7 @@ from oodd_eval.plugins.contract import (
     Detector,
     StorableDetector,
     StreamingDetector,
+    fit_detector,
     float_scores,
     make_detector,
     score_chunk,
@@ -134,7 +135,7 @@ def serve(channel: Channel) -> None:
     else:
         train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
         start = time.perf_counter()
-        detector.fit(train)
+        fit_detector(detector, train, lambda share: _tell(channel, pid, share))
     if os.getpid() != pid:
         os._exit(1)  # The fit has forked, and one process answers.
     seconds = time.perf_counter() - start
@@ -154,6 +155,12 @@ def serve(channel: Channel) -> None:
     if state is not None:
         channel.send_state(state)
     _obey(channel, detector)
+
+
+def _tell(channel: Channel, pid: int, share: float) -> None:
+    """Tell the harness which share of the fit is done; a process that the fit started is silent."""
+    if os.getpid() == pid:
+        channel.send({"progress": share})
 
 
 def _obey(channel: Channel, detector: Detector) -> None:

@@ -15,21 +15,25 @@ Render = Callable[[Report], str]
 
 
 class Format(NamedTuple):
-    """A format: what it is, in a few words that follow "print", and its function."""
+    """A format: what it is, in a few words that follow "print", and its function.
+
+    It has `tables`, or else a line for each cell with all metrics.
+    """
 
     summary: str
     render: Render
+    tables: bool
 
 
 FORMATS: Final[dict[str, Format]] = {}
 """All formats by name: the option of ``oodd-eval show`` that asks for one."""
 
 
-def renders(name: str, summary: str) -> Callable[[Render], Render]:
+def renders(name: str, summary: str, *, tables: bool = True) -> Callable[[Render], Render]:
     """Return a decorator that makes a function known as a format."""
 
     def add(function: Render) -> Render:
-        FORMATS[name] = Format(summary, function)
+        FORMATS[name] = Format(summary, function, tables)
         return function
 
     return add

@@ -19,13 +19,13 @@ from oodd_eval.results.report import Report, by_suite, flat, message
 from oodd_eval.results.standings import RankedBoard, cost_of
 
 
-@renders("csv", "a line per cell with all metrics")
+@renders("csv", "a line per cell with all metrics", tables=False)
 def cells_as_csv(report: Report) -> str:
     """Return a report's cells as CSV, their columns first."""
     return csv_rows(without_nan(flat(report.records)))
 
 
-@renders("json", "the same as a JSON array")
+@renders("json", "the same as a JSON array", tables=False)
 def cells_as_json(report: Report) -> str:
     """Return a report's cells as a JSON array."""
     return json.dumps(without_nan(flat(report.records)), indent=1) + "\n"

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.unit import Scored, UnitJob
@@ -52,10 +53,14 @@ class Executor:
         self.keeps_fits = results is not None
         self._settings, self._results, self._stopping = settings, results, stopping
 
-    def __call__(self, job: UnitJob) -> Scored:
-        """Score a unit, or find its scores in an earlier run's results."""
-        fresh = self._settings.fresh
-        return job(self._settings.limits, self._stopping.is_set, self._results, fresh=fresh)
+    def __call__(self, job: UnitJob, progress: Progress = ignore_progress) -> Scored:
+        """Score a unit, or find its scores in an earlier run's results.
+
+        `progress` hears which share of the fit is done, in the thread that calls.
+        """
+        limits, fresh = self._settings.limits, self._settings.fresh
+        stop = self._stopping.is_set
+        return job(limits, stop, self._results, fresh=fresh, progress=progress)
 
     def stop(self) -> None:
         """Give up what is under way: calls return soon, or raise, and no process is left."""

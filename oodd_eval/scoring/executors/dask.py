@@ -24,6 +24,7 @@ from oodd_eval._version import __version__
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import ExecutorError, MissingExtraError, OoddError, PluginError, SplitError
+from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import offer_of
 from oodd_eval.plugins.isolation.child import Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -74,8 +75,9 @@ class DaskExecutor(Executor):
                 f"{address}`"
             )
 
-    def __call__(self, job: UnitJob) -> Scored:
-        """Score a unit on the cluster."""
+    def __call__(self, job: UnitJob, progress: Progress = ignore_progress) -> Scored:
+        """Score a unit on the cluster, from which no `progress` comes back."""
+        del progress
         if not self._settings.fresh and (kept := job.kept(self._results)):
             return kept
         future: Any = None
