@@ -239,7 +239,12 @@ function verdictOf(part, other) {
   return found[4] <= 0.05 ? "better" : part.worse_than.includes(other) ? "worse" : "not told apart";
 }
 
-const signed = (share) => isNumber(share) ? `${share < 0 ? "\u2212" : "+"}${Math.abs(100 * share).toFixed(1)}` : UNDEFINED;
+/** A difference in percentage points with its sign; what is rounded to nothing has none. */
+function signed(share) {
+  if (!isNumber(share)) return UNDEFINED;
+  const size = Math.abs(100 * share).toFixed(1);
+  return size === "0.0" ? size : `${share < 0 ? "\u2212" : "+"}${size}`;
+}
 
 /** Ours beside the digits of the paper's Table 5, where it has them. */
 function paperPart(board, row) {

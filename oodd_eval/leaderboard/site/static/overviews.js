@@ -67,17 +67,18 @@ const ruler = document.createElement("canvas").getContext("2d");
 function labelPlace(x, y, text, plot, taken) {
   ruler.font = "12px system-ui, 'DejaVu Sans', sans-serif";
   const wide = 1.1 * ruler.measureText(text).width;
-  const heights = [4, ...Array.from({ length: 16 }, (_, i) => 4 + 7 * Math.ceil((i + 1) / 2) * (i % 2 ? 1 : -1))];
+  const heights = [4, ...Array.from({ length: 40 }, (_, i) => 4 + 7 * Math.ceil((i + 1) / 2) * (i % 2 ? 1 : -1))];
   const boxes = [9, 30, 60].flatMap((gap) => heights.flatMap((dy) => ["start", "end"].map((anchor) => {
     const at = x + (anchor === "end" ? -gap : gap);
     const left = anchor === "end" ? at - wide : at;
     return { left, right: left + wide, top: y + dy - 11, bottom: y + dy + 3, x: at, y: y + dy, anchor, far: gap > 9 || Math.abs(dy - 4) > 14 };
-  }))).filter((box) => box.left > plot.left && box.right < plot.right && box.top > plot.top - 8 && box.bottom < plot.bottom);
+  }))).filter((box) => box.left > plot.left && box.right < plot.right && box.top > plot.top - 8 && box.bottom < plot.bottom)
+    .sort((a, b) => Math.hypot(a.x - x, a.y - y - 4) - Math.hypot(b.x - x, b.y - y - 4));
   const covered = (box) => taken.reduce((sum, other) => sum +
     Math.max(0, Math.min(box.right, other.right) - Math.max(box.left, other.left)) *
     Math.max(0, Math.min(box.bottom, other.bottom) - Math.max(box.top, other.top)), 0);
   const chosen = boxes.find((box) => covered(box) === 0) ?? boxes.reduce((a, b) => covered(b) < covered(a) ? b : a);
-  taken.push(chosen);
+  taken.push({ ...chosen, left: chosen.left - 6, right: chosen.right + 6 });
   return chosen;
 }
 
