@@ -268,11 +268,14 @@ def test_every_page_can_be_read_on_a_telephone(site, pages, tmp_path):
     dark = [(site / name).with_suffix(".html") for name in IN_DARK]
     defects = {}
     with helpers_browser.launch(tmp_path) as browser, browser.narrow(390):
-        for theme, paths in (("light", pages), ("dark", dark)):
+        for theme, scheme, paths in (("light", "default", pages), ("dark", "slate", dark)):
             with browser.colours(theme):
+                browser.open((site / "index.html").as_uri())
+                browser.run("localStorage.clear()")  # the theme keeps the colours of the first page
                 for path in paths:
                     browser.open(path.as_uri())
                     browser.wait_for("document.querySelector('.md-search[aria-label]')")
+                    assert browser.run("return document.body.dataset.mdColorScheme") == scheme
                     if lines := browser.defects(390):
                         defects[theme, str(path.relative_to(site))] = lines
     assert defects == {}

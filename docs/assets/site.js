@@ -1,9 +1,8 @@
-// What the theme leaves open for those who use no pointer: a name of the search, and code and tables
-// that scroll sideways by keyboard.
+// For those who use no pointer: the search has a name, and what scrolls sideways does so by keyboard.
 document.querySelector(".md-search")?.setAttribute("aria-label", "Search");
 
 function reachScrolling() {
-  for (const box of document.querySelectorAll(".md-typeset pre > code, .md-typeset__scrollwrap")) {
+  for (const box of document.querySelectorAll(".md-typeset pre > code, .md-typeset__scrollwrap, .md-typeset p:has(> img)")) {
     if (box.scrollWidth > box.clientWidth) box.tabIndex = 0;
     else box.removeAttribute("tabindex");
   }

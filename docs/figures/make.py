@@ -283,13 +283,13 @@ def draw_shutdown(data: EnvironmentData, mewma: Scored) -> Figure:
     delays = [int(first or 0) - int(at) for first, at in zip(firsts, anomaly.effects, strict=True)]
     episode = int(np.argsort(delays, kind="stable")[(len(delays) - 1) // 2])
     effect, sensor = int(anomaly.effects[episode]), widest_gap(anomaly, data, episode)
-    figure = Figure(figsize=(7.6, 4.8), layout="constrained")
+    figure = Figure(figsize=(5, 4.6), layout="constrained")  # read on a telephone, too
     above, below = figure.subplots(2, 1, sharex=True)
     shown = slice(effect - 60, effect + 40)
     times = np.arange(shown.start, shown.stop)
     for trajectory, scores, colour, label in (
-        (data.twins[episode], mewma.twins[episode], NOMINAL, "the same episode without the fault"),
-        (anomaly[episode], mewma.anomalous[episode], ANOMALOUS, "episode with the fault"),
+        (data.twins[episode], mewma.twins[episode], NOMINAL, "without the fault"),
+        (anomaly[episode], mewma.anomalous[episode], ANOMALOUS, "with the fault"),
     ):
         values = trajectory.observations[shown, sensor]
         above.plot(times[: len(values)], values, color=colour, lw=1.4, label=label)
@@ -303,7 +303,7 @@ def draw_shutdown(data: EnvironmentData, mewma: Scored) -> Figure:
     below.plot(alarm, height, "v", color=ALARM, ms=9, label="first alarm")
     below.axhline(rule.threshold / UNIT, color=ALARM, lw=1, ls=":")
     below.annotate(
-        f"threshold: at most {100 * level:g} % of nominal episodes reach it",
+        f"threshold at {100 * level:g} %",
         (0, rule.threshold / UNIT),
         xycoords=("axes fraction", "data"),
         xytext=(3, 3),
@@ -313,7 +313,7 @@ def draw_shutdown(data: EnvironmentData, mewma: Scored) -> Figure:
     below.set_ylim(0, 3 * rule.threshold / UNIT)
     mark_onset(above, effect, "fault")
     mark_onset(below, effect, "fault")
-    above.set_title(f"Hopper, sensor {data.sensors[sensor].name}: switched off, it reads 0", pad=14)
+    above.set_title(f"Hopper, {data.sensors[sensor].name}: the sensor is off", pad=14)
     above.set_ylabel("observation")
     above.legend(loc="lower left")
     below.set_title(f"The detector mewma: an alarm {delays[episode]} steps after the fault", pad=14)

@@ -7,8 +7,13 @@ const BESIDE = ["auc_null", "auc_placebo", "auc_pool_null", "delay_null", "found
 const isMarked = (metric, kind) =>
   !BESIDE.some((name) => metric.startsWith(name)) && (kind === "percent" || metric.includes("_at_"));
 
+const PAPERS_ALARM = "The paper\u2019s alarm: about one in ten rows is false";
+
 /** Metrics of the paper's alarm. */
 const PAPERS = ["delay", "delay_null", "delay_censored", "missed", "far", "far_twin"];
+
+/** A title where a heading or a tab says that it is of the paper's alarm. */
+const underHeading = (title) => title.replace(/, paper's alarm/, "");
 
 const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
 
@@ -133,7 +138,7 @@ const LISTS = {
   alarms: {
     title: "Paper\u2019s alarms",
     columns: (board) => [
-      ...PAPERS.map((metric) => metricColumn(board, metric, { interval: true })),
+      ...PAPERS.map((metric) => metricColumn(board, metric, { title: underHeading(DATA.metrics[metric].title), interval: true })),
       paperColumn("delay", "Paper\u2019s delay", "steps", "steps"),
       paperColumn("far", "Paper\u2019s FAR", "", "rate"),
     ],

@@ -74,15 +74,15 @@ function withUnit(metric) {
 /** A board's metrics under headings: what separates, guaranteed alarms, the paper's alarm. */
 function headings(board) {
   const of = (metric) => /_at_\d/.test(metric) ? "Guaranteed alarms" : metric.startsWith("auc") ? "Separability"
-    : PAPERS.includes(metric) ? "The paper\u2019s alarm" : "Further metrics";
+    : PAPERS.includes(metric) ? PAPERS_ALARM : "Further metrics";
   const groups = groupedBy(board.metrics, of);
-  return ["Separability", "Guaranteed alarms", "The paper\u2019s alarm", "Further metrics"].filter((title) => groups.has(title)).map((title) => [title, groups.get(title)]);
+  return ["Separability", "Guaranteed alarms", PAPERS_ALARM, "Further metrics"].filter((title) => groups.has(title)).map((title) => [title, groups.get(title)]);
 }
 
 /** Lines of a table for each metric of a board, under headings; `cells` gives those of one metric. */
 const metricLines = (board, columns, cells) => headings(board).map(([title, metrics]) => element("tbody", {},
   element("tr", { class: "heading" }, element("th", { scope: "rowgroup", colspan: columns }, title)),
-  metrics.map((metric) => element("tr", {}, element("th", { scope: "row", title: DATA.metrics[metric].meaning }, withUnit(metric)), cells(metric)))));
+  metrics.map((metric) => element("tr", {}, element("th", { scope: "row", title: DATA.metrics[metric].meaning }, underHeading(withUnit(metric))), cells(metric)))));
 
 /** Colours of an AUC: from the page's own at chance to teal at 1, or to orange at 0. */
 function colours(value) {
