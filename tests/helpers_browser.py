@@ -41,7 +41,8 @@ BROKEN = r"""
 """A script: words and numbers in cells of tables that stand on more than one line."""
 
 SERIOUS = """
-    return axe.run(document, { resultTypes: ["violations"] }).then(({ violations }) => violations
+    const context = arguments[0] ? { exclude: [[arguments[0]]] } : document;
+    return axe.run(context, { resultTypes: ["violations"] }).then(({ violations }) => violations
       .filter(({ impact }) => ["serious", "critical"].includes(impact))
       .map(({ id, nodes }) => `${id}: ${nodes.slice(0, 3).map((n) => n.html.slice(0, 160))}`));
 """
@@ -157,8 +158,11 @@ class Browser:
         finally:
             self._command("Emulation.setEmulatedMedia", {"features": []})
 
-    def defects(self, width):
-        """Sideways scrolling of a page in a window, broken words in cells, findings of axe."""
+    def defects(self, width, alike=""):
+        """Sideways scrolling of a page in a window, broken words in cells, findings of axe.
+
+        The engine passes over elements that `alike` selects.
+        """
         assert self.run("return matchMedia(`(width: ${arguments[0]}px)`).matches", width)
         needed, available = self.run(
             "const e = document.documentElement; return [e.scrollWidth, e.clientWidth]"
@@ -167,7 +171,7 @@ class Browser:
         defects += [f"broken: {word}" for word in self.run(BROKEN)]
         axe = importlib.resources.files("axe_core_python") / "axe.min.js"
         self.run(axe.read_text(encoding="utf-8") + ";window.axe ??= axe;")
-        return defects + self.run(SERIOUS)
+        return defects + self.run(SERIOUS, alike)
 
     def console(self):
         """Messages of the console since the last call."""
