@@ -1,6 +1,7 @@
 """Headless Chromium through its own driver: the W3C WebDriver protocol over HTTP, nothing else."""
 
 import contextlib
+import importlib.resources
 import json
 import os
 import shutil
@@ -19,6 +20,33 @@ SHELL = "chromium-headless-shell"
 
 KEYS = {"tab": "\ue004", "enter": "\ue007", "space": " ", "down": "\ue015", "right": "\ue014",
         "shift": "\ue008"}  # fmt: skip
+
+BROKEN = r"""
+    const broken = [];
+    for (const cell of document.querySelectorAll("th, td")) {
+      if (!cell.checkVisibility()) continue;
+      const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+      for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+        for (const word of node.data.matchAll(/\p{N}+\.\p{N}+|[\p{L}\p{N}]+/gu)) {
+          const range = document.createRange();
+          range.setStart(node, word.index);
+          range.setEnd(node, word.index + word[0].length);
+          const boxes = [...range.getClientRects()].filter((box) => box.width);
+          if (new Set(boxes.map((box) => Math.round(box.top))).size > 1) broken.push(word[0]);
+        }
+      }
+    }
+    return broken;
+"""
+"""A script: words and numbers in cells of tables that stand on more than one line."""
+
+SERIOUS = """
+    const context = arguments[0] ? { exclude: [[arguments[0]]] } : document;
+    return axe.run(context, { resultTypes: ["violations"] }).then(({ violations }) => violations
+      .filter(({ impact }) => ["serious", "critical"].includes(impact))
+      .map(({ id, nodes }) => `${id}: ${nodes.slice(0, 3).map((n) => n.html.slice(0, 160))}`));
+"""
+"""A script: what axe-core finds that keeps somebody from reading or using the page."""
 
 _ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 
@@ -119,6 +147,31 @@ class Browser:
             yield
         finally:
             self._command("Emulation.clearDeviceMetricsOverride")
+
+    @contextlib.contextmanager
+    def colours(self, theme):
+        """Let the system ask pages for light or dark colours."""
+        features = [{"name": "prefers-color-scheme", "value": theme}]
+        self._command("Emulation.setEmulatedMedia", {"features": features})
+        try:
+            yield
+        finally:
+            self._command("Emulation.setEmulatedMedia", {"features": []})
+
+    def defects(self, width, alike=""):
+        """Sideways scrolling of a page in a window, broken words in cells, findings of axe.
+
+        The engine passes over elements that `alike` selects.
+        """
+        assert self.run("return matchMedia(`(width: ${arguments[0]}px)`).matches", width)
+        needed, available = self.run(
+            "const e = document.documentElement; return [e.scrollWidth, e.clientWidth]"
+        )
+        defects = [f"scrolls sideways: {needed}"] if needed > available else []
+        defects += [f"broken: {word}" for word in self.run(BROKEN)]
+        axe = importlib.resources.files("axe_core_python") / "axe.min.js"
+        self.run(axe.read_text(encoding="utf-8") + ";window.axe ??= axe;")
+        return defects + self.run(SERIOUS, alike)
 
     def console(self):
         """Messages of the console since the last call."""

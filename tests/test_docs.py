@@ -208,7 +208,8 @@ def test_figures_are_what_the_script_draws(drawn):
 def test_figures_of_the_protocol_are_all_shown_and_described():
     shown = re.findall(r"!\[([^\]]+)\]\(figures/(\w+)\.svg\)", (DOCS / "protocol.md").read_text())
     drawn = {path.stem for path in FIGURES.glob("*.svg")}
-    assert {figure for _, figure in shown} == drawn - {"power"}
+    assert {figure for _, figure in shown} == drawn - {"power", "shutdown"}
+    assert "(figures/shutdown.svg)" in (DOCS / "index.md").read_text()
     assert "(docs/figures/power.svg)" in (ROOT / "README.md").read_text()
     assert all(len(described) > 30 for described, _ in shown)
 
@@ -276,3 +277,25 @@ def test_site_works_from_disk_in_a_browser(site, tmp_path):
         assert browser.console() == []
         asked = [url for url in browser.requests() if not url.startswith(("file:", "data:"))]
         assert [url for url in asked if not url.startswith(("about:", "chrome:"))] == []
+
+
+IN_DARK = ("index", "tutorial", "metrics", "results", "environments/hopper", "reference/detector")
+"""Pages that between them have everything that has a colour."""
+
+
+@pytest.mark.skipif(helpers_browser.programs() is None, reason="no Chromium and chromedriver")
+def test_every_page_can_be_read_on_a_telephone(site, pages, tmp_path):
+    dark = [(site / name).with_suffix(".html") for name in IN_DARK]
+    defects = {}
+    with helpers_browser.launch(tmp_path) as browser, browser.narrow(390):
+        for theme, scheme, paths in (("light", "default", pages), ("dark", "slate", dark)):
+            with browser.colours(theme):
+                browser.open((site / "index.html").as_uri())
+                browser.run("localStorage.clear()")  # the theme keeps the colours of the first page
+                for path in paths:
+                    browser.open(path.as_uri())
+                    browser.wait_for("document.querySelector('.md-search[aria-label]')")
+                    assert browser.run("return document.body.dataset.mdColorScheme") == scheme
+                    if lines := browser.defects(390, "tbody tr:nth-child(n + 6)"):
+                        defects[theme, str(path.relative_to(site))] = lines
+    assert defects == {}

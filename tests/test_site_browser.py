@@ -12,6 +12,7 @@ from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.leaderboard import site
 from oodd_eval.leaderboard.entry import read_entries, sections
 from oodd_eval.leaderboard.site.data import site_data
+from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.tables import show_value
 
@@ -387,6 +388,33 @@ def test_an_address_that_asks_for_what_is_not_there_is_a_table(browser, url, wro
     assert browser.run("return document.querySelector('#detector').hidden")
 
 
+def test_a_columns_meaning_stands_above_the_table(browser):
+    assert METRICS["auc_matched"].summary in browser.text("#meaning")
+    # The column under the focus, which the keyboard moves, or under the pointer, as a tooltip, too.
+    browser.run("document.querySelector('[data-sort=auc_matched]').focus()")
+    browser.press("tab", "tab", "tab")
+    assert browser.text("#meaning").startswith("Smoothed AUC (%, higher is better): ")
+    assert METRICS["auc_smoothed"].summary in browser.text("#meaning")
+    for button, metric in (("auc_placebo", "auc_placebo"), ("auc", "auc")):
+        title = browser.run(f"return document.querySelector('[data-sort={button}]').title")
+        assert title == METRICS[metric].summary
+    browser.run("document.activeElement.blur()")
+    assert browser.text("#meaning").startswith("Matched AUC")
+    browser.click(".meaning + .reading summary")
+    meanings = browser.texts("#meanings li")
+    assert [line.partition(" (")[0].partition(":")[0] for line in meanings] == [
+        *column_titles(browser), "reported", "re-scored", "re-run"
+    ]  # fmt: skip
+
+
+def test_trust_is_a_word_with_a_legend(browser):
+    words = browser.texts("#ranking .trust")
+    assert "reported" in words
+    assert browser.texts("#ranking .badge") == ["trivial", "trivial"]
+    (legend,) = [line for line in browser.texts("#notes li") if line.startswith("Trust: ")]
+    assert all(f"{word}, " in legend for word in words)
+
+
 # -- the page of a detector -----------------------------------------------------------------------
 
 
@@ -571,6 +599,29 @@ def test_quality_and_cost_are_points_that_lead_to_their_rows(browser, url, entri
     assert browser.text("#detector h1").startswith("riqn")
 
 
+def test_labels_of_the_figure_of_costs_cover_nothing(window, tmp_path):
+    url = helpers_site.write_site(tmp_path, helpers_site.full(tmp_path, 24))
+    window.open("about:blank")
+    window.open(f"{url}#/cost")
+    window.wait_for("document.querySelector('.spot') !== null")
+    outcome = window.run(
+        """
+        const spots = [...document.querySelectorAll(".spot")];
+        const boxes = spots.flatMap((spot) => [...spot.querySelectorAll("circle, text")])
+          .map((node) => [node, node.getBBox()]);
+        const covered = [];
+        for (const [node, a] of boxes) for (const [other, b] of boxes) {
+          if (node === other || node.localName === "circle") continue;
+          const wide = Math.min(a.x + a.width, b.x + b.width) - Math.max(a.x, b.x);
+          const high = Math.min(a.y + a.height, b.y + b.height) - Math.max(a.y, b.y);
+          if (wide > 1 && high > 3) covered.push(node.textContent + " " + other.outerHTML);
+        }
+        return [spots.length, covered];
+        """
+    )
+    assert outcome == [24, []]
+
+
 @pytest.mark.parametrize(("columns", "number"), [("anomaly", 4), ("environment", 2), ("cell", 8)])
 def test_the_map_of_cells_has_the_boards_numbers(browser, url, entries, columns, number):
     open_view(browser, url, "heat")
@@ -604,6 +655,13 @@ def test_two_rows_side_by_side_have_their_test_and_differences(browser, url, ent
     text = browser.text("#difference p").replace("\N{MINUS SIGN}", "-")
     assert f"differs by {100 * test.difference:+.1f} points" in text
     assert ("is significantly better" in text) == test.better
+    # A picture and five figures come before everything else.
+    first = "return document.querySelector('#detector :is(figure, tbody)').localName"
+    assert browser.run(first) == "figure"
+    assert len(browser.texts("#short tbody tr")) == 5
+    headings = browser.texts("#detector h2")
+    assert headings[0] == "Difference"
+    assert headings[-1] == "All metrics"
     board = section.ranks.board
     one, other = (s.entry for s in section.ranks.standings if str(s.entry) in ("riqn", "rf"))
     values = [board.mean(row, ["hopper"], ["gravity"], "auc_matched").value for row in (one, other)]
@@ -664,8 +722,12 @@ def test_a_row_is_cited_by_its_entry(browser):
 
 VIEWS = [
     "",
+    "?view=aucs",
     "?view=guaranteed",
+    "?view=alarms",
     "?view=environments",
+    "?view=anomalies",
+    "?view=cost",
     "power",
     "cost",
     "heat",
@@ -687,15 +749,39 @@ def open_view(browser, url, view):
     browser.wait_for(f"!document.querySelector('[aria-busy], [role=status]') && {shown}")
 
 
-@pytest.mark.parametrize("width", [390, 900])
-@pytest.mark.parametrize("view", VIEWS)
-def test_nothing_but_tables_scrolls_sideways_in_a_narrow_window(browser, url, view, width):
-    with browser.narrow(width):
-        open_view(browser, url, view)
-        wide = browser.run(
-            "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
-        )
-        assert wide <= 0
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_every_page_can_be_read_at_every_width_and_in_every_colour(browser, url, width, theme):
+    rows = {
+        row["id"]
+        for board in browser.run("return JSON.parse(document.getElementById('data').text).boards")
+        for row in board["rows"]
+    }
+    assert any("window=3" in row for row in rows)
+    cards = [f"detector/{urllib.parse.quote(row, safe='')}" for row in sorted(rows)]
+    defects = {}
+    with browser.colours(theme), browser.narrow(width):
+        for view in (*VIEWS, *cards):
+            open_view(browser, url, view)
+            assert browser.run(THEME) == theme
+            if lines := browser.defects(width):
+                defects[view] = lines
+            browser.open(url)  # so that the next view finds the rows
+            browser.wait_for("document.querySelector('[data-row]') !== null")
+    assert defects == {}
+
+
+def test_the_reader_of_defects_sees_them(window, tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(
+        "<!doctype html><html><title>t</title><meta name='viewport' content='width=device-width'>"
+        "<table><tr><td style='width: 2em; overflow-wrap: anywhere'>unbreakable</td></tr></table>"
+        "<p style='width: 500px; color: #bbb'>pale</p></html>"
+    )
+    with window.narrow(390):
+        window.open(page.as_uri())
+        kinds = {defect.partition(":")[0] for defect in window.defects(390)}
+    assert kinds == {"scrolls sideways", "broken", "color-contrast", "html-has-lang"}
 
 
 @pytest.mark.parametrize("view", VIEWS)

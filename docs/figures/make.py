@@ -1,9 +1,9 @@
-"""Draw the README's figure and those of docs/protocol.md.
+"""Draw the figures of the README, of the home page and of docs/protocol.md.
 
 ``python docs/figures/make.py [DIRECTORY]`` writes the SVG files, here unless told otherwise. The
-README's is drawn from the committed results on the ladder. One episode of Hopper, from the split
-that comes with the package, goes through the others. They have no background, and colours that can
-be read on white and on black.
+README's is drawn from the committed results on the ladder, the others from Hopper in the split that
+comes with the package: one episode goes through those of docs/protocol.md. They have no background,
+and colours that can be read on white and on black.
 """
 
 import argparse
@@ -86,7 +86,7 @@ class Scored:
         return level, GuaranteedAlarm.fit(self.calibration, level)
 
 
-def scored(name: str, data: EnvironmentData) -> Scored:
+def scored(name: str, data: EnvironmentData, anomaly: str = DYNAMICS) -> Scored:
     """Fit an installed detector on the train part and score the others."""
     detector: Detector = discover().offer(name).spec.factory(seed=0, horizon=1)
     detector.fit(list(data.train))
@@ -94,7 +94,7 @@ def scored(name: str, data: EnvironmentData) -> Scored:
     return Scored(
         calibration,
         [detector.score(x) for x in data.twins],
-        [detector.score(x) for x in data.anomalous(DYNAMICS)],
+        [detector.score(x) for x in data.anomalous(anomaly)],
         AlarmRule(Standardization.fit(calibration)),
     )
 
@@ -112,13 +112,13 @@ def mark_onset(axes: Axes, onset: int, name: str = "onset") -> None:
     )
 
 
-def widest_gap(found: AnomalousSet, data: EnvironmentData) -> int:
+def widest_gap(found: AnomalousSet, data: EnvironmentData, episode: int = EPISODE) -> int:
     """Return the (corrupted) sensor that differs most from the twin's, in standard deviations."""
-    anomalous, twin = found[EPISODE].observations, data.twins[EPISODE].observations
+    anomalous, twin = found[episode].observations, data.twins[episode].observations
     both = min(len(anomalous), len(twin))
     spread = np.maximum(twin.std(axis=0), 0.1)
     gap = np.abs(anomalous[:both] - twin[:both]).mean(axis=0) / spread
-    among = found.parameters[EPISODE].get("sensors", range(len(gap)))
+    among = found.parameters[episode].get("sensors", range(len(gap)))
     return int(max(among, key=gap.__getitem__))
 
 
@@ -273,6 +273,56 @@ def draw_guaranteed(data: EnvironmentData, mewma: Scored) -> Figure:
     return figure
 
 
+def draw_shutdown(data: EnvironmentData, mewma: Scored) -> Figure:
+    """Draw a sensor that is switched off, and the alarm of the episode with the median delay."""
+    anomaly = data.anomalous(SENSOR)
+    level, rule = mewma.guaranteed()
+    firsts = [rule.first(scores) for scores in mewma.anomalous]
+    if None in firsts or any(rule.first(scores) is not None for scores in mewma.twins):
+        raise ValueError("an episode has no alarm, or a twin has one: the caption would be wrong")
+    delays = [int(first or 0) - int(at) for first, at in zip(firsts, anomaly.effects, strict=True)]
+    episode = int(np.argsort(delays, kind="stable")[(len(delays) - 1) // 2])
+    effect, sensor = int(anomaly.effects[episode]), widest_gap(anomaly, data, episode)
+    figure = Figure(figsize=(5, 4.6), layout="constrained")  # read on a telephone, too
+    above, below = figure.subplots(2, 1, sharex=True)
+    shown = slice(effect - 60, effect + 40)
+    times = np.arange(shown.start, shown.stop)
+    for trajectory, scores, colour, label in (
+        (data.twins[episode], mewma.twins[episode], NOMINAL, "without the fault"),
+        (anomaly[episode], mewma.anomalous[episode], ANOMALOUS, "with the fault"),
+    ):
+        values = trajectory.observations[shown, sensor]
+        above.plot(times[: len(values)], values, color=colour, lw=1.4, label=label)
+        statistic = rule.statistic(scores)[shown] / UNIT
+        below.plot(times[: len(statistic)], statistic, color=colour, lw=1.4)
+    if (end := len(anomaly[episode])) < shown.stop:
+        last = anomaly[episode].observations[-1, sensor]
+        above.annotate("episode ends", (end, last), xytext=(4, -3), textcoords="offset points")
+    alarm = effect + delays[episode]
+    height = float(rule.statistic(mewma.anomalous[episode])[alarm]) / UNIT
+    below.plot(alarm, height, "v", color=ALARM, ms=9, label="first alarm")
+    below.axhline(rule.threshold / UNIT, color=ALARM, lw=1, ls=":")
+    below.annotate(
+        f"threshold at {100 * level:g} %",
+        (0, rule.threshold / UNIT),
+        xycoords=("axes fraction", "data"),
+        xytext=(3, 3),
+        textcoords="offset points",
+        fontsize=8,
+    )
+    below.set_ylim(0, 3 * rule.threshold / UNIT)
+    mark_onset(above, effect, "fault")
+    mark_onset(below, effect, "fault")
+    above.set_title(f"Hopper, {data.sensors[sensor].name}: the sensor is off", pad=14)
+    above.set_ylabel("observation")
+    above.legend(loc="lower left")
+    below.set_title(f"The detector mewma: an alarm {delays[episode]} steps after the fault", pad=14)
+    below.set_ylabel("CUSUM (standard deviations)")
+    below.set_xlabel("time t (steps)")
+    below.legend(loc="upper left")
+    return figure
+
+
 def draw_power() -> Figure:
     """Draw how many anomalies some rows find, from the weakest rung of the ladder on."""
     figure = Figure(figsize=(7.6, 3.6), layout="constrained")
@@ -315,6 +365,7 @@ def draw_all(directory: Path) -> None:
         "alarms": lambda: draw_alarms(data, mewma),
         "clock": lambda: draw_clock(data, mewma),
         "guaranteed": lambda: draw_guaranteed(data, mewma),
+        "shutdown": lambda: draw_shutdown(data, scored("mewma", data, SENSOR)),
         "power": draw_power,
     }
     with mpl.rc_context(STYLE):

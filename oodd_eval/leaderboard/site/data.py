@@ -158,8 +158,7 @@ def _fields(thing: object, *names: str) -> Json:
 def _metric(name: str) -> Json:
     info = metric_info(name)
     title = info.title[0].upper() + info.title[1:]
-    higher = info.better == "higher"
-    return {"title": title, "meaning": info.summary, "kind": info.unit, "higher": higher}
+    return {"title": title, "meaning": info.summary, "kind": info.unit, "better": info.better}
 
 
 def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) -> Json:

@@ -7,18 +7,26 @@ const BESIDE = ["auc_null", "auc_placebo", "auc_pool_null", "delay_null", "found
 const isMarked = (metric, kind) =>
   !BESIDE.some((name) => metric.startsWith(name)) && (kind === "percent" || metric.includes("_at_"));
 
+const PAPERS_ALARM = "The paper\u2019s alarm: about one in ten rows is false";
+
+/** Metrics of the paper's alarm. */
+const PAPERS = ["delay", "delay_null", "delay_censored", "missed", "far", "far_twin"];
+
+/** A title where a heading or a tab says that it is of the paper's alarm. */
+const underHeading = (title) => title.replace(/, paper's alarm/, "");
+
 const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
 
 /** A column of a metric's mean; `within` narrows the selection. */
 function metricColumn(board, metric, options = {}) {
-  const { title, kind, higher, meaning } = DATA.metrics[metric];
+  const { title, kind, better, meaning } = DATA.metrics[metric];
   const unit = titleOfUnit[kind];
   return {
     key: options.key ?? metric,
     title: options.title ?? title,
     unit: kind === "rate" ? "" : unit,
     hint: options.hint ?? meaning,
-    better: higher ? "higher" : "lower",
+    better,
     marked: isMarked(metric, kind),
     kind,
     interval: options.interval ?? false,
@@ -130,12 +138,7 @@ const LISTS = {
   alarms: {
     title: "Paper\u2019s alarms",
     columns: (board) => [
-      metricColumn(board, "delay", { interval: true }),
-      metricColumn(board, "delay_null", { interval: true }),
-      metricColumn(board, "delay_censored", { interval: true }),
-      metricColumn(board, "missed", { interval: true }),
-      metricColumn(board, "far", { interval: true }),
-      metricColumn(board, "far_twin", { interval: true }),
+      ...PAPERS.map((metric) => metricColumn(board, metric, { title: underHeading(DATA.metrics[metric].title), interval: true })),
       paperColumn("delay", "Paper\u2019s delay", "steps", "steps"),
       paperColumn("far", "Paper\u2019s FAR", "", "rate"),
     ],

@@ -29,6 +29,12 @@ function build(node, attributes, children) {
 /** A table's caption. It stays in sight where the table is wider than the window. */
 const captionOf = (text) => element("caption", {}, element("span", {}, text));
 
+/** A name of parts that may stand on two lines: it breaks behind punctuation, never within a word or number. */
+const breakable = (text) => text.split(/(?<=[[\](),=:_/]|\.(?!\d))/).flatMap((piece, i) => i ? [element("wbr"), piece] : [piece]);
+
+/** A text as a sentence. */
+const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".");
+
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 
 /** Mean of the numbers among some values; null when there is none. */

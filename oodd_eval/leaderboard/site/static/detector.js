@@ -4,8 +4,8 @@ function detectorPage(board, row, chosen) {
   const others = board.rows.filter((other) => other !== row).map((other) => [other.id, other.label]);
   return [
     element("p", { class: "back" }, element("a", { href: tableAddress() }, "\u2190 All detectors")),
-    element("h1", { tabindex: "-1" }, row.label, " ", badges(row)),
-    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${underLabel(row)}`),
+    element("h1", { tabindex: "-1" }, breakable(row.label), " ", badges(row)),
+    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 `, underLabel(row)),
     summary(board, row),
     others.length ? element("form", { class: "choices", autocomplete: "off" },
       dropdown("against", "Beside", [["", "choose a detector"], ...others], "", (id) => { if (id) location.hash = address("compare", row.id, id); })) : null,
@@ -50,27 +50,39 @@ function summary(board, row) {
       ? "would have: not run again by maintainers"
       : `of ${board.rows.filter((r) => r.rank && !r.below).length} ranked${row.ties && `, tie groups ${row.ties}`}`);
   const cost = card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`);
-  if (!board.paired) return element("dl", { class: "cards" }, cardsOfLogs(board, card, text, interval), rank, cost);
-  return element("dl", { class: "cards" },
-    card("Matched AUC (%)", text("auc_matched"), interval("auc_matched"), DATA.metrics.auc_matched.meaning),
-    rank,
-    card("AUC (%)", text("auc"), `on the twins ${text("auc_null")}`, DATA.metrics.auc.meaning),
-    card("Delay (steps)", text("delay"), `false alarms alone ${text("delay_null")}`, DATA.metrics.delay.meaning),
-    card("False-alarm rate", text("far_twin"), interval("far_twin"), DATA.metrics.far_twin.meaning),
-    cost);
-}
-
-/** Cards of a row whose episodes have no twins: what it separates, and its guaranteed alarms. */
-function cardsOfLogs(board, card, text, interval) {
   const clock = board.rows.find((r) => r.label === "clock");
   const beside = (metric) => metric === "auc_rows" && clock
     ? `the time alone ${meanText(mean(board, clock, metric), "percent")}` : interval(metric);
-  const alarms = ["delay", "missed", "false_episodes"].map((metric) => `${metric}_${board.level}`);
-  return known(board, ["auc_pool", "auc_rows", "auc_outcome", ...alarms]).map((metric) => {
-    const { title, kind, meaning } = DATA.metrics[metric];
-    return card(kind === "rate" ? title : `${title} (${titleOfUnit[kind]})`, text(metric), beside(metric), meaning);
-  });
+  const numbers = shortList(board).map((metric) =>
+    card(withUnit(metric), text(metric), beside(metric), DATA.metrics[metric].meaning));
+  return element("dl", { class: "cards" }, numbers[0], rank, numbers.slice(1), cost);
 }
+
+/** Metrics that describe a row in short: what it separates, then its guaranteed alarms, or else the paper's. */
+function shortList(board) {
+  const separability = board.paired ? [board.ranking] : [board.ranking, "auc_rows", "auc_outcome"];
+  const guaranteed = known(board, ["found_within_20", "delay_censored", "false_episodes"].map((metric) => `${metric}_${board.level}`));
+  return [...known(board, [...new Set(separability)]), ...guaranteed.length ? guaranteed : known(board, ["delay_censored", "missed", "far_twin"])];
+}
+
+/** A metric's title with its unit. */
+function withUnit(metric) {
+  const { title, kind } = DATA.metrics[metric];
+  return (kind === "rate" ? title : `${title} (${titleOfUnit[kind]})`).replace(/ %/g, "\u00a0%");
+}
+
+/** A board's metrics under headings: what separates, guaranteed alarms, the paper's alarm. */
+function headings(board) {
+  const of = (metric) => /_at_\d/.test(metric) ? "Guaranteed alarms" : metric.startsWith("auc") ? "Separability"
+    : PAPERS.includes(metric) ? PAPERS_ALARM : "Further metrics";
+  const groups = groupedBy(board.metrics, of);
+  return ["Separability", "Guaranteed alarms", PAPERS_ALARM, "Further metrics"].filter((title) => groups.has(title)).map((title) => [title, groups.get(title)]);
+}
+
+/** Lines of a table for each metric of a board, under headings; `cells` gives those of one metric. */
+const metricLines = (board, columns, cells) => headings(board).map(([title, metrics]) => element("tbody", {},
+  element("tr", { class: "heading" }, element("th", { scope: "rowgroup", colspan: columns }, title)),
+  metrics.map((metric) => element("tr", {}, element("th", { scope: "row", title: DATA.metrics[metric].meaning }, underHeading(withUnit(metric))), cells(metric)))));
 
 /** Colours of an AUC: from the page's own at chance to teal at 1, or to orange at 0. */
 function colours(value) {
@@ -213,7 +225,7 @@ function comparisons(board, row) {
     element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
       element("th", { scope: "col", class: i ? null : "left" }, t)))),
     element("tbody", {}, found.sort((a, b) => a[1] - b[1]).map(([other, difference, low, high]) => element("tr", {},
-      element("th", { scope: "row" }, element("a", { href: address("compare", row.id, links.get(other)) }, other)),
+      element("th", { scope: "row" }, element("a", { href: address("compare", row.id, links.get(other)) }, breakable(other))),
       element("td", {}, signed(difference)),
       element("td", {}, `[${signed(low)}, ${signed(high)}]`),
       element("td", { class: verdictOf(part, other).split(" ")[0] }, verdictOf(part, other)),
@@ -227,7 +239,12 @@ function verdictOf(part, other) {
   return found[4] <= 0.05 ? "better" : part.worse_than.includes(other) ? "worse" : "not told apart";
 }
 
-const signed = (share) => isNumber(share) ? `${share < 0 ? "\u2212" : "+"}${Math.abs(100 * share).toFixed(1)}` : UNDEFINED;
+/** A difference in percentage points with its sign; what is rounded to nothing has none. */
+function signed(share) {
+  if (!isNumber(share)) return UNDEFINED;
+  const size = Math.abs(100 * share).toFixed(1);
+  return size === "0.0" ? size : `${share < 0 ? "\u2212" : "+"}${size}`;
+}
 
 /** Ours beside the digits of the paper's Table 5, where it has them. */
 function paperPart(board, row) {
@@ -256,14 +273,13 @@ function metricsTable(board, row) {
     captionOf("Means over all cells"),
     element("thead", {}, element("tr", {}, ["Metric", "Mean", "95 % interval", "Meaning"].map((t, i) =>
       element("th", { scope: "col", class: i % 3 ? null : "left" }, t)))),
-    element("tbody", {}, board.metrics.map((metric) => {
-      const { title, kind, meaning } = DATA.metrics[metric];
+    metricLines(board, 4, (metric) => {
+      const { kind, meaning } = DATA.metrics[metric];
       const found = mean(board, row, metric);
-      const unit = kind === "rate" ? "" : ` (${titleOfUnit[kind]})`;
-      return element("tr", {}, element("th", { scope: "row" }, title + unit), element("td", {}, meanText(found, kind)),
+      return [element("td", {}, meanText(found, kind)),
         element("td", {}, isNumber(found.low) ? `[${show(found.low, kind)}, ${show(found.high, kind)}]` : ""),
-        element("td", { class: "text" }, meaning));
-    }))));
+        element("td", { class: "text" }, meaning)];
+    })));
 }
 
 /** What the entry says of itself. Only http addresses become links. */
@@ -282,7 +298,7 @@ function facts(row) {
     list([
       ["Entry", entry.id],
       ["Submitted by", entry.submitter],
-      ["Trust", `${row.trust}: ${(TRUST[row.trust] ?? "").toLowerCase()}`],
+      ["Trust", `${row.trust}: ${TRUST[row.trust]}`],
       ["Granted by", entry.grant && `${entry.grant.by} on ${entry.grant.day}: ${entry.grant.how}`],
       ["Date", entry.created],
       ["To run it again", element("code", {}, command)],

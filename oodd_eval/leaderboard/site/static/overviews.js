@@ -9,7 +9,7 @@ const COSTS = {
 };
 
 /** A row's first line: its name as a link, and whether it is trivial. */
-const rowLink = (row) => element("a", { href: address("detector", row.id) }, row.label);
+const rowLink = (row) => element("a", { href: address("detector", row.id) }, breakable(row.label));
 
 /** Rows that stand for their detectors: the primary ones, best first. */
 const primaries = (board) => board.rows.filter((row) => row.primary);
@@ -30,12 +30,14 @@ function costPage(board) {
     { range, ticks: [-3, -2, -1, 0, 1, 2, 3, 4, 5].map((p) => 10 ** p).filter((t) => t >= range[0] && t <= range[1]), label: cost.label, bend: Math.log10 },
     { range: [low, 100], ticks: ticks(low, 100), label: `${rankingName(board)} (%)` }, { width: 860, height: 480, class: "wide" });
   plot.drawing.setAttribute("role", "group");
-  const taken = [];
-  for (const { row, x, y } of drawn) {
-    const [left, top] = [plot.sx(x), plot.sy(100 * y.value)];
+  const spots = drawn.map(({ row, x, y }) => ({ row, x, y, left: plot.sx(x), top: plot.sy(100 * y.value) }));
+  const taken = spots.map(({ left, top }) => boxAbout(left, top));
+  for (const { row, x, y, left, top } of spots) {
+    const label = labelPlace(left, top, row.label, plot, taken);
     plot.drawing.append(shape("a", { href: address("detector", row.id), class: row.trivial ? "spot trivial" : "spot", "aria-label": `${row.label}: ${rankingName(board)} ${show(y.value, "percent")} %, ${costText(x)} ${cost.label}` },
+      label.far && shape("line", { class: "leader", x1: left, y1: top, x2: label.x, y2: label.y - 4 }),
       shape("circle", { cx: left, cy: top, r: 5 }),
-      shape("text", labelPlace(left, top, row.label, plot, taken), row.label)));
+      shape("text", { x: label.x, y: label.y, "text-anchor": label.anchor }, row.label)));
   }
   return [
     element("h1", { tabindex: "-1" }, "Quality and cost"),
@@ -53,27 +55,38 @@ function costPage(board) {
   ];
 }
 
-/** Where a label stands beside its point without covering one that is there already. */
+/** The room of a point in the figure of costs. */
+const boxAbout = (x, y) => ({ left: x - 6, right: x + 6, top: y - 6, bottom: y + 6 });
+
+const ruler = document.createElement("canvas").getContext("2d");
+
+/**
+ * Where a label stands beside its point: at the nearest place where it covers no point and no label before
+ * it. `far` asks for a line from the point to it. With no such place it stands where it covers least.
+ */
 function labelPlace(x, y, text, plot, taken) {
-  const wide = 6.6 * text.length;
-  const rings = [4, -10, 18, -24, 32, -38, 46];
-  const sides = rings.flatMap((dy) => [[9, dy, "start"], [-9, dy, "end"]]);
-  const boxes = sides.map(([dx, dy, anchor]) => {
-    const left = x + dx - (anchor === "end" ? wide : anchor === "middle" ? wide / 2 : 0);
-    return { left, right: left + wide, top: y + dy - 10, bottom: y + dy + 2, dx, dy, anchor };
-  });
-  const free = (box) => box.left > plot.left && box.right < plot.right &&
-    taken.every((other) => box.right < other.left || box.left > other.right || box.bottom < other.top || box.top > other.bottom);
-  const chosen = boxes.find(free) ?? boxes[0];
-  taken.push(chosen, { left: x - 5, right: x + 5, top: y - 5, bottom: y + 5 });
-  return { x: x + chosen.dx, y: y + chosen.dy, "text-anchor": chosen.anchor };
+  ruler.font = "12px system-ui, 'DejaVu Sans', sans-serif";
+  const wide = 1.1 * ruler.measureText(text).width;
+  const heights = [4, ...Array.from({ length: 40 }, (_, i) => 4 + 7 * Math.ceil((i + 1) / 2) * (i % 2 ? 1 : -1))];
+  const boxes = [9, 30, 60].flatMap((gap) => heights.flatMap((dy) => ["start", "end"].map((anchor) => {
+    const at = x + (anchor === "end" ? -gap : gap);
+    const left = anchor === "end" ? at - wide : at;
+    return { left, right: left + wide, top: y + dy - 11, bottom: y + dy + 3, x: at, y: y + dy, anchor, far: gap > 9 || Math.abs(dy - 4) > 14 };
+  }))).filter((box) => box.left > plot.left && box.right < plot.right && box.top > plot.top - 8 && box.bottom < plot.bottom)
+    .sort((a, b) => Math.hypot(a.x - x, a.y - y - 4) - Math.hypot(b.x - x, b.y - y - 4));
+  const covered = (box) => taken.reduce((sum, other) => sum +
+    Math.max(0, Math.min(box.right, other.right) - Math.max(box.left, other.left)) *
+    Math.max(0, Math.min(box.bottom, other.bottom) - Math.max(box.top, other.top)), 0);
+  const chosen = boxes.find((box) => covered(box) === 0) ?? boxes.reduce((a, b) => covered(b) < covered(a) ? b : a);
+  taken.push({ ...chosen, left: chosen.left - 6, right: chosen.right + 6 });
+  return chosen;
 }
 
 /** The metric that ranks of every detector by anomaly, environment or cell. */
 function heatPage(board) {
   const again = (value) => { overview.columns = value; redraw(heatPage(board)); };
   const columns = {
-    anomaly: board.anomalies.map((anomaly) => ({ title: anomalyOf(board, anomaly).title, selection: { ...EVERYTHING, anomaly } })),
+    anomaly: board.anomalies.map((anomaly) => ({ title: anomalyOf(board, anomaly).title, hint: anomalyOf(board, anomaly).summary, selection: { ...EVERYTHING, anomaly } })),
     environment: board.environments.map((environment) => ({ title: environmentOf(board, environment).title, selection: { ...EVERYTHING, environment } })),
     cell: board.cells.map(([environment, anomaly]) => ({
       title: cellTitle(board, { environment, anomaly }), selection: { environment, group: "all", anomaly }, cell: [environment, anomaly],
@@ -90,7 +103,7 @@ function heatPage(board) {
       element("table", { class: overview.columns === "cell" ? "heat tight" : "heat", id: "heatmap" },
         captionOf("The colour of the page is 50, chance; teal is better, orange is worse than chance"),
         element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Detector"),
-          columns.map(({ title }) => element("th", { scope: "col" }, element("span", {}, title))), element("th", { scope: "col" }, "Mean"))),
+          columns.map(({ title, hint }) => element("th", { scope: "col", title: hint }, element("span", {}, title))), element("th", { scope: "col" }, "Mean"))),
         element("tbody", {}, rows.map((row) => element("tr", { class: row.trivial ? "trivial" : null },
           element("th", { scope: "row" }, rowLink(row)),
           columns.map(({ selection, cell }) => heatCell(mean(board, row, board.ranking, selection), cell && address("detector", row.id, ...cell))),

@@ -1,4 +1,4 @@
-// Two detectors side by side: their numbers, the difference, all cells of both, one cell's curves.
+// Two detectors side by side: a picture and their figures in short, all cells, one cell's curves, all numbers.
 
 function pairPage(board, rows, chosen) {
   const [first, second] = rows;
@@ -8,12 +8,12 @@ function pairPage(board, rows, chosen) {
   const link = (...place) => address("compare", first.id, second.id, ...place);
   return [
     element("p", { class: "back" }, element("a", { href: tableAddress() }, "\u2190 All detectors")),
-    element("h1", { tabindex: "-1" }, `${first.label} and ${second.label}`),
+    element("h1", { tabindex: "-1" }, breakable(`${first.label} and ${second.label}`)),
     element("p", { class: "lead" }, boardTitle(board)),
     element("form", { class: "choices", autocomplete: "off" },
       dropdown("first", "First", options(second), first.id, go(0)), dropdown("second", "Second", options(first), second.id, go(1))),
-    section("Difference", "difference", verdictText(board, first, second)),
-    section("Numbers", "numbers", pairTable(board, rows)),
+    section("Difference", "difference", verdictText(board, first, second),
+      element("div", { class: "figures" }, pairFigure(board, rows), shortTable(board, rows))),
     section("Cells", "cells",
       heat(board, first, cell, (selection) => difference(board, rows, selection), link,
         `${first.label} minus ${second.label}: ${rankingName(board)} in points of per cent; teal is where ${first.label} finds more`),
@@ -22,6 +22,7 @@ function pairPage(board, rows, chosen) {
       element("div", { class: "pair" }, rows.map((row) => element("div", {},
         element("h3", {}, element("a", { href: address("detector", row.id, cell.environment, cell.anomaly) }, row.label)),
         cellPart(board, row, PARTS.get(row.part).cells.find((c) => c.environment === cell.environment && c.anomaly === cell.anomaly) ?? cell))))),
+    section("All metrics", "numbers", pairTable(board, rows)),
   ];
 }
 
@@ -43,17 +44,53 @@ function difference(board, rows, selection) {
   return { ...one, value: defined ? one.value - other.value : null, state: one.state || other.state, low: null, high: null, gap: true };
 }
 
+/** Both rows' means of the metric that ranks with their intervals, by environment or, where there is one, by anomaly. */
+function pairFigure(board, rows) {
+  const byEnvironment = board.environments.length > 1;
+  const lines = [
+    ...byEnvironment ? board.environments.map((environment) => [environmentOf(board, environment).title, { environment }])
+      : board.anomalies.map((anomaly) => [anomalyOf(board, anomaly).title, { anomaly }]),
+    ["Mean", {}],
+  ].map(([title, selection]) => ({ title, means: rows.map((row) => meanOfRow(board, row, board.ranking, { ...EVERYTHING, ...selection })) }));
+  const lows = lines.flatMap(({ means }) => means.map((m) => m.low ?? m.value)).filter(isNumber);
+  const low = Math.floor(10 * Math.min(0.9, ...lows)) * 10;
+  const [step, left, height] = [30, 112, 30 * lines.length + 56];
+  const plot = chart(`${rankingTitle(board)} of both`, { range: [low, 100], ticks: ticks(low, 100), label: `${rankingName(board)} (%)` },
+    { range: [0, 1], ticks: [], label: "" }, { width: 400, height, left });
+  lines.forEach(({ title, means }, i) => {
+    const y = plot.top + step * (i + 0.5);
+    plot.drawing.append(shape("text", { class: "label", x: left - 10, y: y + 4, "text-anchor": "end" }, title));
+    means.forEach(({ value, low: from, high: to }, k) => {
+      if (!isNumber(value)) return;
+      const at = y + (k ? 5 : -5);
+      if (isNumber(from)) plot.drawing.append(shape("line", { class: `line series-${k}`, x1: plot.sx(100 * from), x2: plot.sx(100 * to), y1: at, y2: at }));
+      plot.drawing.append(shape("circle", { class: `dot series-${k}`, cx: plot.sx(100 * value), cy: at, r: 4 }));
+    });
+  });
+  return figure([plot.drawing], rows.map((row, k) => [`series-${k}`, row.label]),
+    `Further to the right is better. Bars are 95 % intervals${byEnvironment ? " of an environment\u2019s mean over its anomalies" : ""}.`);
+}
+
+/** Five figures of both rows, or as many of them as the board has. */
+function shortTable(board, rows) {
+  const metrics = shortList(board).slice(0, 4);
+  const line = (title, meaning, texts) => element("tr", {}, element("th", { scope: "row", title: meaning }, title,
+    element("span", { class: "under" }, sentence(meaning))), texts.map((text) => element("td", {}, text)));
+  return scroller(element("table", { class: "plain short", id: "short" }, captionOf("In short: means over all cells"),
+    element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Metric"), rows.map((row) => element("th", { scope: "col" }, breakable(row.label))))),
+    element("tbody", {},
+      metrics.map((metric) => line(withUnit(metric), DATA.metrics[metric].meaning, rows.map((row) => meanText(mean(board, row, metric), DATA.metrics[metric].kind)))),
+      line("Score (\u00b5s per step)", "Microseconds per scored step", rows.map((row) => costText(row.cost.step))))));
+}
+
 function pairTable(board, rows) {
   return scroller(csvButton("side-by-side", () => document.getElementById("pair")),
     element("table", { class: "plain", id: "pair" }, captionOf("Means over all cells with 95 % intervals"),
-      element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Metric"), rows.map((row) => element("th", { scope: "col" }, row.label)))),
-      element("tbody", {}, board.metrics.map((metric) => {
-        const { title, kind, meaning } = DATA.metrics[metric];
-        const unit = kind === "rate" ? "" : ` (${titleOfUnit[kind]})`;
-        return element("tr", {}, element("th", { scope: "row", title: meaning }, title + unit), rows.map((row) => {
-          const found = mean(board, row, metric);
-          const ends = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
-          return element("td", {}, meanText(found, kind) + ends);
-        }));
+      element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Metric"), rows.map((row) => element("th", { scope: "col" }, breakable(row.label))))),
+      metricLines(board, 3, (metric) => rows.map((row) => {
+        const { kind } = DATA.metrics[metric];
+        const found = mean(board, row, metric);
+        const ends = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
+        return element("td", {}, meanText(found, kind) + ends);
       }))));
 }

@@ -129,13 +129,11 @@ async function drawTable() {
   const key = JSON.stringify([shown, [...unfolded], whole || lines.map(({ row }) => row.id)]);
   if (body?.key !== key) body = { key, lines: linesOf(board, rows, lines, columns) };
   const focused = document.activeElement?.dataset?.key;
+  const all = [{ ...rankOfView(), class: "rank" }, DETECTOR, ...columns];
+  explain(board, all);
   const table = element("table", { id: "ranking", class: "board" },
     captionOf(what(board, rows)),
-    element("thead", {}, element("tr", {}, [
-      header({ ...rankOfView(), class: "rank" }),
-      header({ key: "label", title: "Detector", unit: "", hint: "Name, and settings that are not defaults", class: "left", better: "lower" }),
-      ...columns.map(header),
-    ])),
+    element("thead", {}, element("tr", {}, all.map((column) => header(column, all)))),
     element("tbody", {}, lines.map(({ row }) => body.lines.get(row))),
   );
   const detectors = new Set(rows.map((row) => row.detector)).size;
@@ -163,14 +161,44 @@ function bestOf(column, values) {
   return column.better === "higher" ? Math.max(...numbers) : Math.min(...numbers);
 }
 
-function header(column) {
+const DETECTOR = {
+  key: "label", title: "Detector", unit: "", class: "left",
+  hint: "Name, and settings that are not defaults; below it horizon, inputs, seeds and trust",
+};
+
+/** A column's title, which ends its lines before a number and its unit, not between. */
+const columnTitle = (column) => column.title.replace(/ %/g, "\u00a0%");
+
+/** A column's title with unit and meaning. */
+function meaningOf(column) {
+  const better = column.better && !["rank", "alarm_rank"].includes(column.key) ? `${column.better} is better` : "";
+  const about = [column.unit, better].filter(Boolean).join(", ");
+  return [element("strong", {}, columnTitle(column)), about && ` (${about})`, `: ${column.hint}.`];
+}
+
+/** Say above the table what a column means: the one that it is sorted by, or the one under pointer or focus. */
+function sayMeaning(columns, column) {
+  const sorted = columns.find((c) => c.key === sortKey(currentBoard())) ?? columns[0];
+  document.getElementById("meaning").replaceChildren(...meaningOf(column ?? sorted).filter(Boolean));
+}
+
+/** What all columns and marks of the table mean, to be unfolded above it. */
+function explain(board, columns) {
+  sayMeaning(columns, null);
+  const lines = [...columns.map(meaningOf), ...trustsOf(board).map((trust) => [element("strong", {}, trust), `: ${TRUST[trust]}.`])];
+  document.getElementById("meanings").replaceChildren(...lines.map((line) => element("li", {}, line)));
+}
+
+function header(column, columns) {
   const active = sortKey(currentBoard()) === column.key;
   const order = active ? (state.ascending ? "ascending" : "descending") : "none";
   return element("th", { scope: "col", "aria-sort": order, class: column.class },
     element("button", {
       type: "button", "data-sort": column.key, "data-key": column.key, title: column.hint,
       onclick: () => sortBy(column.key, column.better),
-    }, column.title, element("span", { class: "arrow", "aria-hidden": "true" },
+      onfocus: () => sayMeaning(columns, column), onblur: () => sayMeaning(columns, null),
+      onpointerenter: () => sayMeaning(columns, column), onpointerleave: () => sayMeaning(columns, null),
+    }, columnTitle(column), element("span", { class: "arrow", "aria-hidden": "true" },
       active ? (state.ascending ? "\u25b2" : "\u25bc") : "\u2195")),
     column.unit && element("span", { class: "unit" }, column.unit));
 }
@@ -181,7 +209,7 @@ function tableRow({ row, others, open, variant }, columns, values, best, start) 
     element("td", { class: "rank" }, isNumber(rank) ? rankText(row, rank) : element("span", { title: row.state }, UNDEFINED),
       rankOfView() === RANK && row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
     element("th", { scope: "row" },
-      element("a", { href: address("detector", row.id) }, row.label), " ", badges(row),
+      element("a", { href: address("detector", row.id) }, breakable(row.label)), " ", badges(row),
       element("span", { class: "under" }, underLabel(row)),
       others ? foldButton(row, others, open) : null),
     columns.map((column, i) => {
@@ -208,19 +236,22 @@ function foldButton(row, others, open) {
   }, open ? `\u2212 hide ${text}` : `+ ${text}`);
 }
 
-/** What stands under a label: inputs, horizon, seeds. */
+/** What stands under a label: horizon, inputs, seeds, trust. */
 function underLabel(row) {
   const parts = [`\u0394\u202f=\u202f${row.horizon}`];
   if (row.inputs) parts.push(row.inputs.replace("+", " + "));
   if (row.seeds.length > 1) parts.push(`${row.seeds.length} seeds`);
-  return parts.join(" \u00b7 ");
+  return [...parts.map((part) => `${part} \u00b7 `), element("span", { class: "trust", title: TRUST[row.trust] }, row.trust)];
 }
 
 const TRUST = {
-  "reported": "Numbers as submitted, checked for consistency",
-  "re-scored": "Recomputed here from the submitted scores",
-  "re-run": "Fitted and scored again",
+  "reported": "numbers as submitted, checked for consistency",
+  "re-scored": "numbers computed by maintainers from the submitted scores",
+  "re-run": "fitted and scored again by maintainers",
 };
+
+/** Levels of trust that rows of a board have, the lowest first. */
+const trustsOf = (board) => Object.keys(TRUST).filter((trust) => board.rows.some((row) => row.trust === trust));
 
 /** True for a row that learns from more than nominal trajectories of the split. */
 function isTrainedOnMore(row) {
@@ -230,10 +261,9 @@ function isTrainedOnMore(row) {
 function badges(row) {
   return [
     row.trivial && element("span", { class: "badge", title: "Knows nothing of the dynamics: what a detector has to beat" }, "trivial"),
-    row.clone_of && element("span", { class: "badge", title: "Has the scores of that row, and pushes no other row down" }, `= ${row.clone_of}`),
+    row.clone_of && element("span", { class: "badge", title: "Has the scores of that row, and pushes no other row down" }, breakable(`= ${row.clone_of}`)),
     isTrainedOnMore(row) && element("span", { class: "badge", title: "Learns from more than nominal trajectories of the split: not ranked" }, `trained on ${row.training}`),
     row.training === "oracle" && element("span", { class: "badge", title: "Has the true equations of the environment: not ranked" }, "oracle"),
-    " ", element("span", { class: `badge ${row.trust}`, title: TRUST[row.trust] ?? "" }, row.trust),
   ];
 }
 
@@ -278,6 +308,7 @@ function notesOf(board, rows) {
   const lines = [
     `Split ${board.split}, digest ${board.digest.slice(0, 12)}, protocol ${board.protocol}, ` +
     `${board.paired ? `${board.tests.join(", ")} test seeds per environment` : "episodes without twins"}${limit}. Tables never mix splits or protocols.`,
+    `Trust: ${trustsOf(board).map((trust) => `${trust}, ${TRUST[trust]}`).join("; ")}.`,
     ...board.about,
   ];
   if (selectsLess(state)) {
