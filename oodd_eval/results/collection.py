@@ -86,18 +86,11 @@ class Results(Sequence[Record]):
         splits = ", ".join(dict.fromkeys(r.split for r in self)) or "nothing"
         return f"Results({len(self)} cells of {splits}: {', '.join(self.rows)}; {states or 'none'})"
 
-    def __str__(self) -> str:
-        """Return the verdict and the tables that ``oodd-eval run`` prints, below the one line."""
-        return f"{self!r}\n\n{self._report()}" if self.records else repr(self)
-
-    def _report(self) -> Report:
-        units = self._split.units if self._split else NO_UNITS
-        return Report(self.records, detail="brief", units=units)
-
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""
         failures = (f"{r.status}: {r.cell}: {r.reason}" for b in boards(self) for r in b.failures())
-        tables = FORMATS["html"].render(self._report())
+        units = self._split.units if self._split else NO_UNITS
+        tables = FORMATS["html"].render(Report(self.records, detail="brief", units=units))
         return "".join(f"<p>{escape(text)}</p>\n" for text in (repr(self), *failures)) + tables
 
     @property

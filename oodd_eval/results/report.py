@@ -92,7 +92,8 @@ class Report:
     def __str__(self) -> str:
         """Return the report as plain text, its verdicts first."""
         # Renderers are made of reports.
-        return str(import_module("oodd_eval.results.render.text").plain(self))
+        text = import_module("oodd_eval.results.render.text").terminal_text(self.sections)
+        return str(text).rstrip("\n")
 
     @functools.cached_property
     def sections(self) -> list[Section]:

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from html import escape as escape_html
-from typing import Final
+from typing import Any, Final
 
 from rich.console import Console
 from rich.text import Text
@@ -130,14 +130,6 @@ def _latex(text: str) -> str:
     return " ".join(text.split()).translate(_LATEX)
 
 
-def plain(report: Report) -> str:
-    """Return a report as it stands on a terminal of 100 columns, without colours."""
-    console = Console(file=io.StringIO(), width=100, highlight=False, markup=False)
-    with console.capture() as capture:
-        print_sections(report.sections, console)
-    return capture.get().rstrip() + "\n"
-
-
 def print_sections(sections: Sequence[Section], console: Console) -> None:
     """Print the verdict, tables, findings and notes of sections: what is read last stands last."""
     for section in sections:
@@ -151,6 +143,14 @@ def print_sections(sections: Sequence[Section], console: Console) -> None:
             print_prose(line, console, "dim")
         if section.notes:
             console.print("")
+
+
+def terminal_text(sections: Sequence[Section]) -> str:
+    """Return what `print_sections` prints, as wide as the terminal, without colours."""
+    text = io.StringIO()
+    plain: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
+    print_sections(sections, Console(file=text, color_system=None, force_jupyter=False, **plain))
+    return text.getvalue()
 
 
 def print_table(table: Table, console: Console, width: int = 0) -> None:
