@@ -21,6 +21,7 @@ from oodd_eval.cli import listing, terminal
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
 from oodd_eval.errors import MissingExtraError
+from oodd_eval.metrics.catalogue import PAPER
 
 
 @pytest.fixture
@@ -377,10 +378,15 @@ def test_show_prints_what_the_run_printed(run, clock):
     code, shown, _ = run("show", clock)
     assert code == 0
     tables = shown[: shown.index("Split tiny")]
-    assert len(tables) > 500
+    assert "Separability" in tables
+    assert "4 calibration episodes; 38 needed at 5 %: guaranteed alarms at 5 % (clock)." in tables
     assert tables in printed
+    assert printed.count(tables.splitlines()[0]) == 1  # the verdict
     assert "All metrics" not in shown
-    assert "All metrics" in run("show", clock, "--wide")[1]
+    wide = run("show", clock, "--wide")[1]
+    assert "All metrics" in wide
+    assert PAPER not in shown + wide
+    assert PAPER in run("show", clock, "--paper")[1]
     assert "50.0 [50.0, 50.0]" in run("show", clock, "--intervals")[1]
 
 
@@ -468,7 +474,8 @@ def test_two_rows_of_one_run_are_compared(run):
     code, out, _ = run("compare", "oodd-results", "range", "clock")
     assert code == 0
     assert re.search(r"matched AUC: range \S+, clock 50.0 %, difference \S+ \[.*\], p = ", out)
-    assert "16 cells: " in out
+    assert out.startswith(("range beats clock by ", "No difference is shown "))
+    assert "16 cells\n" in out
     code, _, err = run("compare", "oodd-results", "range")
     assert code == 4
     assert "rows 'range', expected two" in err

@@ -4,8 +4,10 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from helpers_records import example, make_record
 from hypothesis import given
@@ -15,12 +17,16 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
+from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
+from oodd_eval.results.evaluate import Rules, cell_metrics
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.text import print_prose, print_table
-from oodd_eval.results.report import Report
+from oodd_eval.results.report import Report, findings_of
+from oodd_eval.results.standings import compare_rows, verdict_of
 from oodd_eval.results.tables import Table
+from oodd_eval.results.undefined import why_undefined
 
 
 def rendered(records, name="markdown", **settings):
@@ -44,10 +50,17 @@ def cells(table, row):
 
 TITLES = {  # by the start of a title: columns of labels, and one number: row, column, text
     "Separability": (1, "riqn", "mean", "67.5"),
-    "Guaranteed alarms at 5 %": (1, "riqn", "found within 20", "50.0"),
-    "AUC (%), delay (steps), false-alarm rate, sensor": (2, "Hopper", "AVG", "85.0"),
-    "AUC (%), delay (steps), false-alarm rate, dynamics": (2, "Hopper", "riqn", "80.0"),
-    "All metrics, mean over cells": (1, "riqn", "Delay", "3.2"),
+    "Guaranteed alarms at 5 % (%)": (1, "riqn", "found within 20", "50.0"),
+    "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
+    f"{PAPER} (delays in steps)": (1, "riqn", "delay", "3.2"),
+    f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sensor": (
+        2,
+        "Hopper",
+        "AVG",
+        "85.0",
+    ),
+    f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), dyn": (2, "Hopper", "riqn", "80.0"),
+    "All metrics of separability (%), mean over cells": (1, "riqn", "AUC", "85.0"),
     "riqn: matched AUC": (1, "Hopper", "gravity", "65.0"),
     "rf: matched AUC": (1, "Ant", "iid", "timeout"),
     "persistence: matched AUC": (1, "Ant", "gravity", "50.0"),
@@ -59,7 +72,10 @@ TITLES = {  # by the start of a title: columns of labels, and one number: row, c
 def test_markdown_has_every_table_with_its_columns_and_numbers():
     text = rendered(example())
     tables = markdown_tables(text)
-    assert text.startswith("# Results\n\n## Split mini\n\nCells: 16, of which 14 ok and 2 failed.")
+    assert text.startswith(
+        "# Results\n\n## Split mini\n\n**No difference is shown between riqn and"
+    )
+    assert "\n\nCells: 16, of which 14 ok and 2 failed.\n\n" in text
     assert len(tables) == len(TITLES)
     for start, (labels, label, column, number) in TITLES.items():
         ((header, sides, *rows),) = [t for title, t in tables.items() if title.startswith(start)]
@@ -301,6 +317,7 @@ def test_notes_name_the_split_and_what_is_missing():
 
 ALARMS = {
     "false_episodes_at_5pct": [0, 1], "early_at_5pct": [0, 0], "delay_at_5pct": [4, None],
+    "delay_censored_at_5pct": [4, 36],
     "missed_at_5pct": [0, 1], "found_within_20_at_5pct": [1, 0],
     "found_within_100_at_5pct": [1, 0], "found_within_100_null_at_5pct": [0, 1],
 }  # fmt: skip
@@ -310,11 +327,13 @@ def test_guaranteed_alarms_stand_beside_false_episodes_with_their_interval():
     board = Board([make_record(anomaly=a, values=ALARMS) for a in ("iid", "drift")])
     table = tables.guaranteed(board)
     assert cells(table, 0) == {
-        "detector": "riqn", "delay": "4.0", "missed": "50.0", "found within 20": "50.0",
+        "detector": "riqn", "delay censored": "20.0", "missed": "50.0", "found within 20": "50.0",
         "found within 100": "50.0", "found within 100 null": "50.0",
         "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
     }  # fmt: skip
+    assert "whole remainder" in table.note
     nulls = tables.guaranteed(board, nulls=True)
+    assert cells(nulls, 0)["delay if found"] == "4.0"
     assert nulls.header[-2:] == ["found within 100", "found within 100 null"]
 
 
@@ -334,6 +353,195 @@ def test_brief_cells_are_marked_and_named():
     assert row == ["Hopper", "50.0\N{DAGGER}", "50.0"]
     (note,) = [line for line in tables.notes(board) if "Brief" in line]
     assert "hopper/iid" in note
+
+
+# The verdict
+
+
+def rows(metric="auc_matched", environment="cartpole", **values):
+    """One record a detector, `values` being those of twelve episodes."""
+    return [make_record(d, environment, values={metric: v}) for d, v in values.items()]
+
+
+def test_the_verdict_names_the_better_row_and_by_how_much():
+    # All twelve episodes differ by a tenth, so that every resample does.
+    base = [0.5 + i / 100 for i in range(12)]
+    records = rows(mewma=base, rf=[v + 0.1 for v in base], clock=[0.5] * 12)
+    sentence = "rf beats mewma by 10.0 points [10.0, 10.0] in matched AUC on CartPole."
+    (section,) = Report(records).sections
+    assert section.verdict == sentence
+    assert str(Report(records)).splitlines()[0] == sentence
+    for first, second in (("rf", "mewma"), ("mewma", "rf")):
+        assert compare_rows(records, first, second).verdict == sentence
+    both = [*records, *rows(environment="ant", mewma=base, rf=[v + 0.3 for v in base])]
+    (section,) = Report([r for r in both if r.detector != "clock"]).sections
+    assert section.verdict.startswith("rf beats mewma by 20.0 points [")
+    assert section.verdict.endswith("] in matched AUC on CartPole and Ant.")
+
+
+def test_the_verdict_has_the_numbers_of_the_comparison():
+    values = {"mewma": [0.5, 0.6, 0.7] * 4, "rf": [0.75, 0.7, 0.7, 0.8] * 3}
+    compared = compare_rows(records := rows(**values), "mewma", "rf")
+    assert compared.difference < 0
+    ends = f"{-100 * compared.high:.1f}, {-100 * compared.low:.1f}"
+    amount = f"{-100 * compared.difference:.1f}"
+    expected = f"rf beats mewma by {amount} points [{ends}] in matched AUC on CartPole."
+    assert verdict_of(Board(records)) == compared.verdict == expected
+    # Where lower is better, the row with the smaller mean is.
+    steps = {d: [10 * v for v in of_row] for d, of_row in values.items()}
+    sooner = compare_rows(rows("delay_censored_at_5pct", **steps), *steps, "delay_censored_at_5pct")
+    assert sooner.verdict.startswith("mewma beats rf by 1.4 steps [0.")
+    assert sooner.verdict.endswith("] in delay censored at 5 % on CartPole.")
+
+
+def test_compare_says_first_who_is_better_by_scores_and_by_alarms(tmp_path, capsys):
+    values = {"mewma": [0.5, 0.6] * 6, "rf": [0.7, 0.8] * 6}
+    records = [
+        make_record(d, values={"auc_matched": v, "delay_censored_at_5pct": [10 * x for x in v]})
+        for d, v in values.items()
+    ]
+    (tmp_path / "records.jsonl").write_text("".join(r.to_json() + "\n" for r in records))
+    assert main(["compare", str(tmp_path), "mewma", "rf"]) == 0
+    first, figures, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == "rf beats mewma by 20.0 points [20.0, 20.0] in matched AUC on Hopper."
+    assert figures.startswith("matched AUC: mewma 55.0, rf 75.0 %, difference -20.0 [-20.0, -20.0]")
+    assert second.startswith("mewma beats rf by 2.0 steps [2.0, 2.0] in delay censored at 5 % on")
+
+
+def test_no_difference_is_shown_where_the_interval_includes_zero():
+    # Half of the episodes are a tenth better, the others a tenth worse: the mean difference is 0.
+    records = rows(mewma=[0.6, 0.7] * 6, rf=[0.7, 0.6] * 6)
+    compared = compare_rows(records, "rf", "mewma")
+    assert compared.low < 0 < compared.high
+    text = verdict_of(Board(records))
+    assert text.startswith("No difference is shown between mewma and rf in matched AUC on CartPole")
+    assert f": 0.0 points [-{100 * compared.high:.1f}, {100 * compared.high:.1f}], p = 1." in text
+
+
+def test_the_verdict_on_one_row_is_its_headline_in_words():
+    values = {
+        "auc_matched": [0.8, 0.9],
+        "missed_at_5pct": [0, 1],
+        "delay_censored_at_5pct": [4, 36],
+    }
+    board = Board([make_record(values=values | {"false_episodes_at_5pct": [0, 0]})])
+    assert verdict_of(board) == (
+        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes delay "
+        "censored 20.0 steps, missed 50.0 %, false episodes 0.0 %."
+    )
+    assert verdict_of(Board([make_record(status="oom")])) == ""
+
+
+def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_second_best():
+    values = {"mewma": [0.5] * 12, "rf": [0.6] * 12}
+    oracle = make_record(
+        "oracle", "cartpole", values={"auc_matched": [0.9] * 12}, training="oracle"
+    )
+    failed = make_record("pe", "cartpole", status="timeout")
+    text = verdict_of(Board([oracle, failed, *rows(**values)]))
+    assert text.startswith("rf beats mewma by 10.0 points")
+
+
+@pytest.mark.parametrize("name", ["markdown", "html", "latex"])
+def test_the_verdict_is_the_first_sentence_of_every_format(name):
+    records = rows(mewma=[0.5] * 12, rf=[0.6] * 12)
+    text = rendered(records, name)
+    assert text.index("rf beats mewma by 10.0 points") < text.index("Cells: 2")
+
+
+# Figures that are undefined
+
+
+def calibrated(detector, episodes, alarm="cusum", level="5", environment="hopper", **more):
+    values = {f"{name}_at_{level}pct": v for name, v in (("missed", [0, 1]), ("early", [0, 0]))}
+    values |= {f"false_episodes_at_{level}pct": [0, 0], **more}
+    record = make_record(detector, environment, values=values, alarm=alarm)
+    return replace(record, counts={"test": 2, "calibration": episodes})
+
+
+def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
+    # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
+    reason = "30 calibration episodes; 38 needed at 5 %, or --level 10"
+    few = calibrated("rf", 30, level="10")
+    assert f"{reason}: guaranteed alarms at 5 % (rf)." in tables.guaranteed(Board([few])).note
+    mixed = Board([few, calibrated("pe", 30, "score")])
+    table = tables.guaranteed(mixed)
+    assert "at 5 %" in table.title
+    assert cells(table, 0) == dict.fromkeys(table.header, "") | {"detector": "rf"}
+    assert f"{reason}: missed, false episodes, early (rf)." in table.note
+    chosen = next(
+        t for t in Report([few], level="at_10pct").sections[0].tables if "Guar" in t.title
+    )
+    assert "at 10 %" in chosen.title
+    assert "calibration" not in chosen.note
+    # Without any level there is no table, and the report says why.
+    none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
+    assert tables.guaranteed(Board([none])) is None
+    assert "17 calibration episodes; 38 needed at 5 %: " in " ".join(findings_of(Board([none])))
+
+
+def test_enough_calibration_episodes_leave_no_reason():
+    for episodes, alarm in ((38, "cusum"), (19, "score")):
+        assert (
+            "calibration" not in tables.guaranteed(Board([calibrated("pe", episodes, alarm)])).note
+        )
+    for episodes, alarm, needed in ((37, "cusum", 38), (18, "score", 19)):
+        record = replace(calibrated("pe", episodes, alarm), metrics={}, per_trajectory={})
+        text = why_undefined(record, "missed_at_5pct")
+        assert text.startswith(f"{episodes} calibration episodes; {needed} needed at 5 %")
+
+
+@pytest.mark.parametrize(
+    ("metric", "reason"),
+    [
+        (
+            "delay_at_5pct",
+            "No episode has its first alarm from the effect on: delay if found (pe).",
+        ),
+        ("auc_placebo", "No two twins both have a defined score from the effect on: placebo (pe)."),
+        ("delay", "No episode has an alarm from the onset on: delay (pe)."),
+    ],
+)
+def test_the_reason_of_a_dash_stands_below_its_table(metric, reason):
+    records = [calibrated("pe", 40, **{metric: [None, None]}), calibrated("rf", 40)]
+    notes = [t.note for t in Report(records).sections[0].tables]
+    assert any(reason in note for note in notes)
+    assert "(pe, rf)" not in " ".join(notes)
+
+
+NOTHING, RISING = np.full(60, np.nan), np.linspace(0, 1, 60)
+
+
+@pytest.mark.parametrize(
+    ("anomalous", "twin", "effect"),
+    [
+        (NOTHING, NOTHING, 30),
+        (RISING, RISING, 30),
+        (RISING * 0, RISING * 0, 30),  # no alarm
+        (RISING + 9, RISING + 9, 30),  # an alarm before the effect
+        (RISING, RISING[:20], 30),  # the twin ends before the effect
+        (RISING, RISING, 0),
+    ],
+)
+def test_all_that_a_cell_leaves_undefined_has_its_reason(anomalous, twin, effect):
+    rules = Rules.fit([RISING] * 40)
+    metrics, _ = cell_metrics([anomalous], [twin], [effect], [effect], rules, environment="arm")
+    record = replace(make_record(), metrics=metrics)
+    undefined = [name for name in metrics if np.isnan(metrics[name].value)]
+    assert undefined
+    assert all(why_undefined(record, name) for name in undefined)
+    assert not any(why_undefined(record, name) for name in metrics.keys() - {*undefined})
+
+
+def test_metrics_of_other_cells_say_which_episodes_they_need():
+    record = make_record()
+    assert why_undefined(record, "auc_pool") == "it is for episodes without nominal twins"
+    logs = replace(record, paired=False, metrics={})
+    assert why_undefined(logs, "auc_matched") == "the episodes have no nominal twins"
+    assert why_undefined(logs, "vus_pr") == "it is computed with --row-metrics alone"
+    assert "explain" in why_undefined(record, "sensor_named_at_5pct")
+    noted = replace(record, note="auc_matched, auc_smoothed are withheld: no twins", metrics={})
+    assert why_undefined(noted, "auc_smoothed") == "no twins"
 
 
 # The terminal
@@ -368,8 +576,13 @@ def test_piped_output_has_no_escapes_and_fits_80_columns():
     assert "\x1b" not in text
     assert max(map(len, text.splitlines())) <= 80
     assert "TIMEOUT ant/rf[h=1,seed=0]: not done after 5 s (--timeout)" in text
-    order = [text.index(t) for t in ("Separability", "Guaranteed alarms", "AUC (%), delay")]
+    order = [text.index(t) for t in ("No difference is", "Separability", "Guaranteed alarms")]
     assert order == sorted(order)
+    assert order[0] == 0
+    assert PAPER not in text
+    one = TerminalReporter(console(), paper=True)
+    one.tables(example())
+    assert PAPER in printed(one)
     screen = reporter(terminal=True)
     screen.failures(example())
     assert "\x1b[31m" in printed(screen)

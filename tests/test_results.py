@@ -355,10 +355,13 @@ def test_a_comparison_says_which_row_is_better_and_turns_with_its_sides(results)
     assert one.p == other.p
     assert one.cells == 4
     assert one.verdict == other.verdict or one.p > 0.05
-    assert str(one).startswith("matched AUC: mewma ")
+    assert str(one).splitlines()[0] == one.verdict
+    assert str(one).splitlines()[1].startswith("matched AUC: mewma ")
     lower = results.compare("mewma", "size", "delay_censored")
     assert lower.difference == pytest.approx(lower.values[0] - lower.values[1])
-    assert lower.p > 0.05 or lower.verdict.startswith("mewma" if lower.difference < 0 else "size")
+    better = "mewma" if lower.difference < 0 else "size"
+    clear = lower.p <= 0.05 and (lower.low > 0 or lower.high < 0)
+    assert lower.verdict.startswith(f"{better} beats" if clear else "No difference is clear")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from oodd_eval.leaderboard.entry import read_entries, read_grants
+from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
@@ -76,7 +77,8 @@ def cells(values: Iterable[float]) -> str:
 
 def of_board(split: str, *metrics: str) -> Row:
     """Return the row of a detector on a board."""
-    return lambda name: cells(100 * float(ranking(split)[name][metric]) for metric in metrics)
+    units = {m: 1 if metric_info(m).unit == "steps" else 100 for m in metrics}
+    return lambda name: cells(units[m] * float(ranking(split)[name][m]) for m in metrics)
 
 
 def by_environment(name: str) -> str:
@@ -187,7 +189,7 @@ def verdicts(text: str) -> str:
 WHOLE = ("auc_matched", "auc_unpaired", "auc_smoothed", *HEADLINE[1:], "false_episodes_at_5pct")
 
 TABLES: dict[str, Row] = {
-    "headline": of_board("mini", *HEADLINE),
+    "headline": of_board("mini", *HEADLINE, "delay_censored_at_5pct"),
     "board mini": of_board("mini", *WHOLE),
     "board standard": of_board("standard", *WHOLE),
     "environments": by_environment,

@@ -17,6 +17,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
+from oodd_eval.metrics.catalogue import LEVELS
 from oodd_eval.names import memory_bytes, parameter, read, seconds, whole_numbers
 
 PARAM: Final = "a parameter, of one detector as DETECTOR.K=V; V is JSON or text"
@@ -328,6 +329,16 @@ row_metrics_option: Final = click.option(
     "--row-metrics",
     is_flag=True,
     help="add the rows' F1, alarm rates and VUS-PR, of splits without twins",
+)
+
+alarm_options: Final = together(
+    click.option(
+        "--level",
+        type=click.Choice([suffix[3:-3] for suffix in LEVELS]),
+        callback=lambda _ctx, _parameter, percent: f"at_{percent}pct" if percent else "",
+        help="guaranteed alarms at most in this percentage of nominal episodes (default: 5)",
+    ),
+    click.option("--paper", is_flag=True, help="print what the paper's alarm does, too"),
 )
 
 detector_options: Final = together(

@@ -1,5 +1,7 @@
 """``oodd-eval compare``: two rows of results, results against a reference; writing references."""
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -7,15 +9,17 @@ import click
 
 from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, refuse, say
 from oodd_eval.cli.terminal import make_console
-from oodd_eval.errors import OutputError, UnknownNameError, UsageError
+from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, expression, select
 from oodd_eval.results import compare as regression
+from oodd_eval.results.board import ranked_by
 from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
+from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import junit
 from oodd_eval.results.render.text import markdown_section, print_prose, print_table
 from oodd_eval.results.report import comparison_section
-from oodd_eval.results.standings import compare_rows
+from oodd_eval.results.standings import PairedComparison, compare_rows
 
 _AGAINST: Final = ("fail", "two_sided", "by", "junit", "markdown")  # with --against alone
 
@@ -96,19 +100,31 @@ def _rows(now: RecordSet, options: Options) -> int:
     if not now.boards:
         return say(f"no record of {options.results} is selected", 5)
     first, second = options.rows
-    lines = []
+    lines: list[object] = []
     unknown: UnknownNameError | None = None
     for conditions, cells in now.boards.items():
         try:
-            compared = compare_rows(list(cells.values()), first, second, options.metric or "")
-            lines.append(f"{conditions}\n{compared}")
+            lines += [*compared(list(cells.values()), first, second, options.metric), conditions]
         except UnknownNameError as error:
             unknown = unknown or error
     if unknown and not lines:
         raise unknown
     # A directory may also hold boards, runs with --limit say, without these rows.
-    print("\n".join(lines))
+    print("\n".join(map(str, lines)))
     return 0
+
+
+def compared(
+    records: Sequence[Record], first: str, second: str, metric: str | None
+) -> Iterator[PairedComparison]:
+    """Compare two rows by a metric, by default by separability and then by guaranteed alarms."""
+    if metric:
+        yield compare_rows(records, first, second, metric)
+        return
+    by_scores, by_alarms = ranked_by(records)
+    yield compare_rows(records, first, second, by_scores)
+    with contextlib.suppress(ResultsError):  # alarms that not both rows have
+        yield compare_rows(records, first, second, by_alarms)
 
 
 def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:

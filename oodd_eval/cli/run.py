@@ -18,6 +18,7 @@ from oodd_eval.cli import (
     Name,
     Names,
     Options,
+    alarm_options,
     command,
     detector_options,
     expression_option,
@@ -85,6 +86,7 @@ class _Configurable(Command):
     "--rolling", is_flag=True, help="judged nominal test episodes join the calibration, for logs"
 )
 @click.option("--intervals", is_flag=True, help="print 95 % intervals in the tables")
+@alarm_options
 @row_metrics_option
 @click.option("--config", type=FILE, help="TOML file with these options by their long names")
 @click.option("--output", default="oodd-results", type=DIRECTORY, help="results directory")
@@ -144,6 +146,8 @@ def run(options: Options) -> int:
         intervals=options.intervals,
         log=results.log_path,
         units=split.units,
+        level=options.level,
+        paper=options.paper,
     )
     doubts = _Doubts(make_console(quiet=options.verbosity < 0), split)
     with reporter:
@@ -151,7 +155,9 @@ def run(options: Options) -> int:
     doubts.print(doubts_after(plan, split, results))
     say_notes(results.notes)
     if done.records:
-        report = Report(results.records(), intervals=options.intervals, units=split.units)
+        report = Report(
+            results.records(), intervals=options.intervals, units=split.units, level=options.level
+        )
         path = results.path / REPORT
         write_text(path, FORMATS["markdown"].render(report))
         if options.verbosity >= 0:

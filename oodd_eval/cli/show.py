@@ -11,6 +11,7 @@ from oodd_eval.cli import (
     Name,
     Names,
     Options,
+    alarm_options,
     command,
     expression_option,
     refuse,
@@ -57,6 +58,7 @@ _format_options: Final = together(
 )
 @click.option("--metric", type=Name("metrics"), help="metric of that table")
 @click.option("--wide", is_flag=True, help="print all metrics, with nulls and all alarm levels")
+@alarm_options
 @click.option(
     "--alarm",
     type=click.Choice(STATISTICS),
@@ -118,6 +120,8 @@ def show(options: Options) -> int:
         detector=options.detector or "",
         metric=options.metric or "",
         units=units,
+        level=options.level,
+        paper=options.paper,
     )
     if layout:
         print(layout.render(report), end="")

@@ -123,7 +123,7 @@ class TerminalReporter:
 
     On a terminal, what runs stands below a bar; elsewhere a line says so after some `SILENCE`.
     `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
-    `units` are those of strengths by kind of anomaly.
+    `units` are those of strengths by kind of anomaly. `level` and `paper` are those of a `Report`.
     """
 
     def __init__(
@@ -134,9 +134,12 @@ class TerminalReporter:
         intervals: bool = False,
         log: Callable[[str], Path] | None = None,
         units: Mapping[str, str] = NO_UNITS,
+        level: str = "",
+        paper: bool = False,
     ) -> None:
         self.console, self.verbosity, self.intervals = console, verbosity, intervals
         self._log, self._units = log, units
+        self._level, self._paper = level, paper
         self._start = time.perf_counter()
         self._open: dict[tuple[str, str], list[Record]] = {}
         self._sizes: dict[tuple[str, str], int] = {}
@@ -268,7 +271,14 @@ class TerminalReporter:
 
     def tables(self, records: Sequence[Record]) -> None:
         """Print the tables of every board among some records."""
-        report = Report(records, intervals=self.intervals, detail="brief", units=self._units)
+        report = Report(
+            records,
+            intervals=self.intervals,
+            detail="brief",
+            units=self._units,
+            level=self._level,
+            paper=self._paper,
+        )
         print_sections(report.sections, self.console)
 
     def failures(self, records: Sequence[Record]) -> None:

@@ -31,7 +31,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
 from oodd_eval.results.report import Section, findings_of
-from oodd_eval.results.standings import primary_settings
+from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
 from oodd_eval.results.tables import Table
 from oodd_eval.results.unpaired import UnpairedTables
 
@@ -184,7 +184,10 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    of_scores = [tables.separability(board), *tables.alarms(ranks)]
+    of_scores: Sequence[Table | None] = [
+        tables.separability(board),
+        tables.guaranteed(board, intervals=True, standings=ranks.standings),
+    ]
     if not board.paired:
         unpaired = UnpairedTables(board, intervals=True, standings=ranks.standings)
         of_scores = unpaired.overview(whole=True)
@@ -192,14 +195,15 @@ def _section(section: LeaderboardSection) -> str:
         *of_scores,
         tables.attribution(board, intervals=True, standings=ranks.standings),
         tables.cost(ranks),
-        *(_as_in_the_paper(board) if board.paired else ()),
         tables.all_metrics(board),
         *tables.all_alarms(board),
+        *(_of_paper(ranks) if board.paired else ()),
         tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
         tables.failures(board),
     ]
     body = Section(
         _title(board),
+        verdict=verdict_of(board),
         findings=findings_of(board),
         tables=[table for table in body_tables if table],
         notes=tables.notes(board),
@@ -209,6 +213,7 @@ def _section(section: LeaderboardSection) -> str:
         f"{about_split(board)}\n",
         f"{size} As CSV: {files}.\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
+        f"**{escape(body.verdict)}**\n",
         markdown_table(tables.ranking(ranks, section.trust)),
         TEXTS["legend" if board.paired else "unpaired-legend"],
         *markdown_list(tables.ranking_notes(ranks)),
@@ -243,13 +248,14 @@ def about_split(board: Board) -> str:
     return str(TEXTS["published"].format(**asdict(split), **tier, episodes=episodes))
 
 
-def _as_in_the_paper(board: Board) -> list[Table]:
-    """Return the layout of the paper's Table 5 for each horizon and group of anomalies.
+def _of_paper(ranks: RankedBoard) -> list[Table]:
+    """Return what the paper's alarm does: means, and the layout of the paper's Table 5.
 
-    It has a column per row of the board, so that it is kept to rows with default parameters.
+    That has a column per row of the board, so that it is kept to rows with default parameters.
     """
-    records = [r for r in board.records if not r.overrides]
-    return tables.anomaly_groups(Board(records)) if records else []
+    records = [r for r in ranks.board.records if not r.overrides]
+    as_in_the_paper = tables.anomaly_groups(Board(records)) if records else []
+    return [tables.papers(ranks.board, ranks.standings), *as_in_the_paper]
 
 
 def _entry(entry: SubmittedEntry) -> str:

@@ -335,9 +335,9 @@ def rankings(
         names = ranks.board.present(names)
     lines = rows(standings, ranks.alarms, by_alarms.name, *names)
     censored = by_alarms.unit == "steps"
-    what = "censored delay (steps)" if censored else f"{by_alarms.title.removesuffix(level)}(%)"
+    what = f"{by_alarms.noun} (steps)" if censored else f"{by_alarms.title.removesuffix(level)}(%)"
     header = [
-        "delay" if censored else "found",
+        by_alarms.noun if censored else "found",
         *(_BESIDE[n.removesuffix(f"_{suffix}")] for n in names),
     ]
     return [

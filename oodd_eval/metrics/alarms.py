@@ -301,6 +301,36 @@ def too_few(
     )
 
 
+def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
+    """Say how many calibration episodes a level takes, and which weaker level these offer.
+
+    Parameters
+    ----------
+    episodes
+        All calibration episodes, those that standardize the scores included.
+    level
+        Largest share of nominal episodes with an alarm, which they are too few for.
+    kind
+        The statistic.
+
+    Returns
+    -------
+    str
+        A phrase, with the option of commands that shows the weaker level.
+
+    Examples
+    --------
+    >>> missing_level(30, 0.05, "cusum")
+    '30 calibration episodes; 38 needed at 5 %, or --level 10'
+    >>> missing_level(17, 0.10, "cusum")
+    '17 calibration episodes; 18 needed at 10 %'
+    """
+    weaker = [share for share in offered_levels(episodes, kind).values() if share > level]
+    remedy = f", or --level {100 * min(weaker):g}" if weaker else ""
+    needed = f"{least_episodes(level, kind)} needed at {100 * level:g} %"
+    return f"{episodes} calibration episodes; {needed}{remedy}"
+
+
 def rolling_rules(
     calibration: Calibration, nominal: Sequence[Floats], level: float
 ) -> list[GuaranteedAlarm]:

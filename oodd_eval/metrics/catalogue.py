@@ -32,6 +32,9 @@ LEVELS: Final[Mapping[str, float]] = MappingProxyType(
 """Largest share of nominal episodes with an alarm, by the suffix of the metrics at this level."""
 
 HEADLINE: Final = "at_5pct"  # suffix of the level that tables show
+PAPER: Final = "The paper's alarm: about one in ten rows is false"
+"""Heading of all figures of alarms at the paper's threshold."""
+
 FOUND_WITHIN: Final = (20, 100)  # rows from the effect on within which an episode counts as found
 UNDEFINED: Final = "\N{EN DASH}"  # printed for NaN
 
@@ -44,6 +47,12 @@ class MetricInfo:
     ----------
     name, title, summary
         Name in records, heading of a column, and meaning in one line.
+    short
+        The title without the alarm or the level that it is of, for tables whose heading names it.
+    undefined
+        Of a cell without a value, what all its episodes have in common; empty where there is none.
+    paper
+        Whether it is of the paper's alarm, which about one in ten nominal rows raises.
     unit
         ``"percent"`` for a share that is printed in percent, ``"steps"`` for observation rows,
         ``"rate"`` for a plain number, such as alarms per step.
@@ -78,6 +87,19 @@ class MetricInfo:
     median: bool = False
     cells: Cells = ""
     request: bool = False
+    short: str = ""
+    undefined: str = ""
+    paper: bool = False
+
+    @property
+    def noun(self) -> str:
+        """The short title as it stands inside a sentence: abbreviations keep their letters."""
+        return self.short if self.short[:2].isupper() else self.short[0].lower() + self.short[1:]
+
+    @property
+    def phrase(self) -> str:
+        """The title as it stands inside a sentence."""
+        return self.noun + self.title.removeprefix(self.short)
 
     def text(self, value: float) -> str:
         """Return a value as printed: rates below 10 with three decimals, all else with one."""
@@ -95,7 +117,15 @@ _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(enc
 
 def _facts(table: str) -> dict[str, MetricInfo]:
     """Return the metrics of a table of the catalogue by name, in its order."""
-    rows = (row | {"range": tuple(row["range"])} for row in _TABLES[table])
+    rows = (
+        row
+        | {"range": tuple(row["range"]), "short": row["title"]}
+        | {
+            "title": row["title"] + ", paper's alarm" * row.get("paper", False),
+            "summary": "the paper's alarm: " * row.get("paper", False) + row["summary"],
+        }
+        for row in _TABLES[table]
+    )
     return {row["name"]: MetricInfo(**row) for row in rows}
 
 

@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, Final, Literal
 
 from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
@@ -13,6 +14,7 @@ from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, grouped
 from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
+from oodd_eval.results.standings import verdict_of
 from oodd_eval.results.strengths import thresholds
 from oodd_eval.results.tables import Table
 from oodd_eval.results.unpaired import UnpairedTables, phase_findings
@@ -38,6 +40,8 @@ class Section:
         Further tables, which a format that can fold text folds away, under `fold`.
     notes
         Sentences below the tables.
+    verdict
+        The one sentence that comes first, such as which row is better.
     """
 
     title: str
@@ -47,6 +51,7 @@ class Section:
     fold: str = ""
     folded: Sequence[Table] = ()
     notes: Sequence[str] = ()
+    verdict: str = ""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,11 @@ class Report:
         The metric of these cells; by default the one that their board ranks by.
     units
         Units of strengths by kind of anomaly, where the split names them.
+    level
+        Suffix of the level of guaranteed alarms in tables, such as ``"at_10pct"``; by default 5 %,
+        or the strictest weaker one that the records have.
+    paper
+        Whether what the paper's alarm does is in it, too; in a ``"full"`` report it always is.
     """
 
     records: Sequence[Record]
@@ -77,6 +87,14 @@ class Report:
     metric: str = ""
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     title: str = field(default="Results", kw_only=True)
+    level: str = field(default="", kw_only=True)
+    paper: bool = field(default=False, kw_only=True)
+
+    def __str__(self) -> str:
+        """Return the report as plain text, its verdicts first."""
+        # Renderers are made of reports.
+        text = import_module("oodd_eval.results.render.text").terminal_text(self.sections)
+        return str(text).rstrip("\n")
 
     @functools.cached_property
     def sections(self) -> list[Section]:
@@ -93,25 +111,27 @@ class Report:
             findings_of(board),
             [table for table in self._tables(board) if table],
             notes=tables.notes(board),
+            verdict=verdict_of(board, self.level),
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         intervals, full = self.intervals, self.detail == "full"
         if board.paired:
             yield tables.separability(board, intervals=intervals)
-            yield tables.guaranteed(board, intervals=intervals)
+            yield tables.guaranteed(board, self.level, intervals=intervals)
         else:
-            of_board = UnpairedTables(board, intervals)
+            of_board = UnpairedTables(board, intervals, level=self.level)
             yield from of_board.overview(whole=self.detail != "brief")
         yield tables.attribution(board, intervals=intervals)
         yield from strengths.strength_tables(
             board, intervals=intervals, places=full, units=self.units
         )
-        if board.paired:
-            yield from tables.anomaly_groups(board, intervals=intervals)
         if self.detail != "brief":
             yield tables.all_metrics(board, intervals=intervals)
             yield from tables.all_alarms(board, intervals=intervals)
+        if board.paired and (full or self.paper):
+            yield tables.papers(board, intervals=intervals)
+            yield from tables.anomaly_groups(board, intervals=intervals)
         if full:
             if len(board.environments) * len(board.anomalies) > 1:  # one figure stands above
                 yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
@@ -119,7 +139,9 @@ class Report:
 
     def _of_detector(self, board: Board) -> Section:
         title = f"{self.detector} on split {board.split}"
-        return Section(title, tables=list(self._tables_of_detector(board)))
+        rows = [r for r in board.records if r.detector == self.detector]
+        verdict = verdict_of(Board(rows), self.level) if rows else ""
+        return Section(title, tables=list(self._tables_of_detector(board)), verdict=verdict)
 
     def _tables_of_detector(self, board: Board) -> Iterator[Table]:
         for entry in (e for e in board.entries if e.detector == self.detector):
@@ -133,11 +155,12 @@ class Report:
 
 def findings_of(board: Board) -> list[str]:
     """Return the sentences on a board that nobody should miss."""
+    metrics = {name for record in board.records for name in record.metrics}
     return [
         *tables.withheld(board),
         *tables.findings(board),
         *phase_findings(board),
-        *tables.missing_levels(board),
+        *(() if any("false_episodes" in m for m in metrics) else tables.missing_level(board)),
     ]
 
 

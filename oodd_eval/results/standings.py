@@ -1,5 +1,6 @@
 """The rows of a board in order: ranks, tie groups, win rates and cost."""
 
+import contextlib
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -8,10 +9,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from oodd_eval.data.facts import ENVIRONMENTS, in_order, title_of
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import LEVELS, RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import ALPHA, Lead, Position, Ranking, Row, leads, rank, win_rates
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training, training_mark
@@ -382,6 +384,8 @@ class PairedComparison:
         after Holm's correction for both.
     cells
         Cells that both rows have, over which the means are.
+    environments
+        Those of these cells.
     """
 
     first: str
@@ -393,28 +397,53 @@ class PairedComparison:
     high: float
     p: float
     cells: int
+    environments: Sequence[str] = ()
 
     @property
     def verdict(self) -> str:
-        """One sentence: which row is better, or that nothing tells them apart."""
-        if self.p > ALPHA:
-            return f"{self.first} and {self.second} cannot be told apart"
-        sign = -1 if metric_info(self.metric).better == "lower" else 1
-        better = self.difference * sign > 0
-        order = (self.first, self.second) if better else (self.second, self.first)
-        return "{} is better than {}".format(*order)
+        """One sentence: which row is better and by how much, or that no difference is shown.
+
+        A difference is shown where the interval leaves out 0 and the p-value is at most 0.05.
+        """
+        info = metric_info(self.metric)
+        sign = -1 if (self.difference < 0) != (info.better == "lower") else 1
+        rows = (self.first, self.second)[::sign]
+        # The advantage of the better row, whatever the better side.
+        turn = math.copysign(1.0, self.difference)
+        ends = sorted((turn * self.low, turn * self.high))
+        amount, low, high = map(info.text, (abs(self.difference), *ends))
+        unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")
+        where = f"in {info.phrase} {in_words(self.environments)}".rstrip()
+        if ends[0] > 0 and self.p <= ALPHA:
+            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {where}."
+        but = " but" * (ends[0] > 0)
+        return (
+            f"No difference is shown between {rows[0]} and {rows[1]} {where}: "
+            f"{amount}{unit} [{low}, {high}],{but} p = {self.p:.2g}."
+        )
 
     def __str__(self) -> str:
-        """Return the figures and the verdict."""
+        """Return the verdict, and below it the figures."""
         info = metric_info(self.metric)
         figures = *self.values, self.difference, self.low, self.high
         first, second, difference, low, high = map(info.text, figures)
         unit = " %" if info.unit == "percent" else ""
         return (
-            f"{info.title}: {self.first} {first}, {self.second} {second}{unit}, difference "
-            f"{difference} [{low}, {high}], p = {self.p:.2g}, "
-            f"{counted(self.cells, 'cell(s)')}: {self.verdict}"
+            f"{self.verdict}\n{info.title}: {self.first} {first}, {self.second} {second}{unit}, "
+            f"difference {difference} [{low}, {high}], p = {self.p:.2g}, "
+            f"{counted(self.cells, 'cell(s)')}"
         )
+
+
+def in_words(environments: Sequence[str]) -> str:
+    """Return the names of a few environments, or how many they are, after a preposition."""
+    titles = list(map(title_of, environments))
+    if len(titles) > _FEW:
+        return f"over {len(titles)} environments"
+    return "on " + " and ".join(titles) if titles else ""
+
+
+_FEW: Final = 2  # environments that a sentence names
 
 
 def row_named(records: Sequence[Record], name: str) -> Setting:
@@ -482,9 +511,65 @@ def compare_rows(
     )
     # Where lower is better, the terms have their sign turned.
     sign = -1.0 if info.better == "lower" else 1.0
-    low, high = sorted((sign * test.low, sign * test.high))
+    low, high = sorted((float(sign * test.low), float(sign * test.high)))
     values = tuple(sign * mean for mean in means)
     p = min(t.p_holm for t in tests.values())
+    over = in_order((environment for environment, _ in common), ENVIRONMENTS)
     return PairedComparison(
-        one, other, metric, values, sign * test.difference, low, high, p, len(common)
+        one, other, metric, values, sign * test.difference, low, high, p, len(common), over
     )
+
+
+def verdict_of(board: Board, level: str = "") -> str:
+    """Return the sentence that comes first: the best row against the second, or what one row does.
+
+    Rows that have no value in every cell, or know more than nominal trajectories, are passed over
+    where others are left.
+
+    Parameters
+    ----------
+    board
+        The rows.
+    level
+        Suffix of the level of guaranteed alarms, by default the board's.
+
+    Returns
+    -------
+    str
+        Empty where no row has a figure.
+    """
+    over = board.environments, board.anomalies
+    means = {entry: board.mean(entry, *over, board.ranking) for entry in board.entries}
+    defined = [entry for entry, mean in means.items() if not math.isnan(mean.value)]
+    knowing = {r.setting for r in board.records if r.training != "nominal"}
+    whole = [e for e in defined if not means[e].partial and e not in knowing]
+    rows = sorted(whole if len(whole) > 1 else defined, key=lambda e: -means[e].value)
+    if len(rows) > 1:
+        chosen = [r for r in board.records if r.setting in rows[:2] and r.ok]
+        with contextlib.suppress(ResultsError):  # without a cell in common
+            return compare_rows(chosen, str(rows[0]), str(rows[1]), board.ranking).verdict
+    return _in_words(board, (rows or board.entries)[0], level or board.level)
+
+
+def _in_words(board: Board, entry: Setting, level: str) -> str:
+    """Return the headline figures of a row; empty where it has none."""
+    units = {"percent": " %", "steps": " steps"}
+
+    def figures(*names: str) -> str:
+        over = board.environments, board.anomalies
+        means = {metric_info(n): board.mean(entry, *over, n).value for n in names}
+        return ", ".join(
+            f"{info.noun} {info.text(mean)}{units.get(info.unit, '')}"
+            for info, mean in means.items()
+            if not math.isnan(mean)
+        )
+
+    alarms = figures(*(f"{name}_{level}" for name in _IN_WORDS))
+    if alarms:
+        percent = f"{100 * LEVELS[level]:g} %"
+        alarms = f"with alarms in at most {percent} of nominal episodes {alarms}"
+    parts = "; ".join(filter(None, [figures(board.ranking), alarms]))
+    return f"{entry} {in_words(board.environments)}: {parts}." if parts else ""
+
+
+_IN_WORDS: Final = ("delay_censored", "missed", "false_episodes")

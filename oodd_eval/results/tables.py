@@ -9,9 +9,8 @@ from typing import Final, NamedTuple
 from oodd_eval.data.condition import NOMINAL
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
-from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
 from oodd_eval.metrics.promise import enough_episodes
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
@@ -19,6 +18,7 @@ from oodd_eval.results.board import Board, Value, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, Standing
+from oodd_eval.results.undefined import why_undefined
 
 BRIEF: Final = "\N{DAGGER}"
 """Marks the figures of brief cells."""
@@ -95,6 +95,34 @@ def texts(board: Board, entry: Setting, columns: Iterable[Mean]) -> list[str]:
     ]
 
 
+def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Mean]) -> list[str]:
+    """Return why rows have no figure in columns, a sentence for each reason."""
+    rows = grouped(board.records, lambda r: r.setting)
+    lacking: dict[str, dict[str, dict[str, None]]] = {}  # columns and rows by reason
+    over = [(c, {*itertools.product(c.environments, c.anomalies)}) for c in columns]
+    for entry, (column, cells) in itertools.product(entries, over):
+        mean = board.mean(entry, column.environments, column.anomalies, column.metric)
+        if mean.state or not math.isnan(mean.value):
+            continue
+        of_cells = (r for r in rows[entry] if (r.environment, r.anomaly) in cells)
+        for reason in dict.fromkeys(why_undefined(r, column.metric) for r in of_cells):
+            of_reason = lacking.setdefault(reason, {"columns": {}, "rows": {}})
+            of_reason["columns"][column.title] = of_reason["rows"][str(entry)] = None
+    return [
+        f"{reason[0].upper()}{reason[1:]}: {_listed(of, 'columns')} ({_listed(of, 'rows')})."
+        for reason, of in lacking.items()
+        if reason
+    ]
+
+
+def _listed(names: Mapping[str, Collection[str]], kind: str) -> str:
+    """Return the names of a kind one after the other, or how many they are."""
+    chosen = names[kind]
+    return ", ".join(chosen) if len(chosen) <= _NAMED else f"{len(chosen)} {kind}"
+
+
+_NAMED: Final = 8  # names in a sentence, beyond which it has their number
+
 BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
 _SIMPLE: Final = (
@@ -112,7 +140,7 @@ _SIMPLE: Final = (
 _FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
 
 _ALARMS: Final = (
-    "delay",
+    "delay_censored",
     "missed",
     *(f"found_within_{k}" for k in catalogue.FOUND_WITHIN),
     f"found_within_{catalogue.FOUND_WITHIN[-1]}_null",
@@ -122,7 +150,7 @@ _ALARMS: Final = (
 """Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
 
 _PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
-"""Columns of alarms at the paper's threshold."""
+"""Columns of the paper's alarm."""
 
 _LABELS: Final = ("rank", "detector", "settings")
 
@@ -134,11 +162,11 @@ def _by_group(board: Board, title: str, *, intervals: bool) -> list[Mean]:
 
 
 def over_all(
-    board: Board, names: Iterable[str], intervals: Collection[str] = (), *, level: bool = True
+    board: Board, names: Iterable[str], intervals: Collection[str] = (), *, short: bool = False
 ) -> list[Mean]:
-    """Return columns of means over all cells; without `level` their titles do not name it."""
-    titles = {n: metric_info(n).title for n in names}
-    titles |= {} if level else {n: t.partition(" at ")[0].lower() for n, t in titles.items()}
+    """Return columns of means over all cells; `short` where a heading names alarm or level."""
+    infos = map(metric_info, names)
+    titles = {info.name: info.noun if short else info.title for info in infos}
     over = board.environments, board.anomalies
     return [Mean(title, n, *over, n in intervals) for n, title in titles.items()]
 
@@ -152,9 +180,11 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     over = board.environments, board.anomalies
     columns += [Mean(n, f"auc_{n}", *over, intervals) for n in ("smoothed", "unpaired")]
     columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
-    rows = [[str(entry), *texts(board, entry, columns)] for entry in best_first(board)]
+    entries = best_first(board)
+    rows = [[str(entry), *texts(board, entry, columns)] for entry in entries]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    return Table(title, ["detector", *(c.title for c in columns)], rows, note=unranked(board))
+    note = " ".join(filter(None, [unranked(board), *reasons(board, entries, columns)]))
+    return Table(title, ["detector", *(c.title for c in columns)], rows, note=note)
 
 
 def unranked(board: Board) -> str:
@@ -187,16 +217,16 @@ def guaranteed(
     """
     levels = [level for level in catalogue.LEVELS if board.present([f"false_episodes_{level}"])]
     strictest = catalogue.HEADLINE if catalogue.HEADLINE in levels or not levels else levels[-1]
-    suffix = suffix or strictest
+    asked, suffix = suffix or catalogue.HEADLINE, suffix or strictest
     bases = _ALARMS if not nulls else catalogue.GUARANTEED
     names = board.present(f"{name}_{suffix}" for name in bases)
     if not names:
         return None
     with_ends = [n for n in names if intervals or metric_info(n).interval == "exact"]
-    columns = over_all(board, names, with_ends, level=False)
+    columns = over_all(board, names, with_ends, short=True)
     level = f"{100 * catalogue.LEVELS[suffix]:g} %"
     hours = f"false_alarms_per_hour_{suffix}"
-    hourly = f"{metric_info(hours).title.partition(' at ')[0].lower()}, " * (hours in names)
+    hourly = f"{metric_info(hours).noun}, " * (hours in names)
     steps = "delays in steps, " * any(name.startswith("delay") for name in names)
     units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
     title = f"Guaranteed alarms at {level} ({units})"
@@ -205,7 +235,29 @@ def guaranteed(
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
         f"is the share of this split's {episodes} that raised one."
     )
+    if f"delay_censored_{suffix}" in names:
+        note = f"{note} {CENSORED}"
+    if asked != suffix:
+        note = " ".join([note, *missing_level(board, asked)])
     return by_metric(board, title, columns, standings, note)
+
+
+CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."
+"""What has to stand below a table with the delay that ranks."""
+
+
+def missing_level(board: Board, suffix: str = catalogue.HEADLINE) -> list[str]:
+    """Return how many calibration episodes a level takes that rows have no figures at."""
+    level = f"guaranteed alarms at {100 * catalogue.LEVELS[suffix]:g} %"
+    column = Mean(level, f"false_episodes_{suffix}", board.environments, board.anomalies)
+    return reasons(board, board.entries, [column])
+
+
+def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool = False) -> Table:
+    """Return what the paper's alarm does, mean over cells, under a heading of its own."""
+    names = board.present(_PAPER)
+    columns = over_all(board, names, names if intervals else (), short=True)
+    return by_metric(board, f"{PAPER} (delays in steps)", columns, standings)
 
 
 def attribution(
@@ -218,7 +270,7 @@ def attribution(
     names = catalogue.ATTRIBUTION
     if not standings:
         board = Board([r for r in board.records if r.setting in explaining])
-    columns = over_all(board, names, names if intervals else (), level=False)
+    columns = over_all(board, names, names if intervals else (), short=True)
     title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
     note = (
         "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
@@ -249,9 +301,9 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
         means = {e: board.mean(e, *over, intervals=intervals) for e in entries}
         partial = any(means[e].state or means[e].partial for e in averaged)
         average = Value(nan_mean(means[e].value for e in averaged), cells=1, partial=partial)
-        labels = [title_of(environment), metric_info(metric).title]
+        labels = [title_of(environment), metric_info(metric).short]
         rows.append([*labels, *(show_value(v, metric) for v in (*means.values(), average))])
-    title = f"AUC (%), delay (steps), false-alarm rate, {group}-injected anomalies, Δ = {horizon}"
+    title = f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), {group}, Δ = {horizon}"
     # The title says the horizon.
     header = ["Environment", "Result", *(str(replace(e, horizon=1)) for e in entries), "AVG"]
     left_out = [str(e) for e in entries if e not in averaged]
@@ -263,12 +315,13 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
 
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
-    """Return every metric without a level, mean over all cells, with nulls and the placebo."""
+    """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
     usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
     names = board.present(catalogue.METRICS) or usual
-    names = [name for name in names if not metric_info(name).request]
+    infos = map(metric_info, names)
+    names = [info.name for info in infos if not info.request and not info.paper]
     columns = over_all(board, names, names if intervals else ())
-    return by_metric(board, "All metrics, mean over cells", columns)
+    return by_metric(board, "All metrics of separability (%), mean over cells", columns)
 
 
 def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -280,14 +333,17 @@ def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
 def by_anomaly(board: Board, entry: Setting, metric: str = "", *, intervals: bool = False) -> Table:
     """Return one detector's metric by environment and anomaly, by default the one that ranks."""
     metric = metric or board.ranking
-    rows = []
+    rows, columns = [], []
     for e in board.environments:
-        columns = [Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
-        rows.append([title_of(e), *texts(board, entry, columns)])
+        of_environment = [Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
+        rows.append([title_of(e), *texts(board, entry, of_environment)])
+        columns += of_environment
+    note = " ".join(reasons(board, [entry], columns))
     info = metric_info(metric)
     unit = " (%)" if info.unit == "percent" else ""
     title = f"{entry}: {info.title}{unit} by anomaly"
-    return Table(title, ["Environment", *board.anomalies], rows, wrap=not board.paired)
+    header = ["Environment", *board.anomalies]
+    return Table(title, header, rows, note=note, wrap=not board.paired)
 
 
 def failures(board: Board) -> Table | None:
@@ -320,15 +376,6 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
 
 _BESIDE: Final = ("auc_pool_null", "auc_rows", "auc_outcome")
 """Columns beside the metric that ranks rows without twins."""
-
-
-def alarms(ranks: RankedBoard) -> list[Table]:
-    """Return guaranteed alarms at the headline level, and alarms at the paper's threshold."""
-    at_level = guaranteed(ranks.board, intervals=True, standings=ranks.standings)
-    columns = over_all(ranks.board, ranks.board.present(_PAPER))
-    title = "Alarms at the paper's threshold"
-    by_paper = by_metric(ranks.board, title, columns, ranks.standings)
-    return [at_level, by_paper] if at_level else [by_paper]
 
 
 def cost(ranks: RankedBoard) -> Table:
@@ -368,26 +415,6 @@ def findings(board: Board) -> list[str]:
                     f"{simple} beats {entry} in mean {info.title}: {info.text(value)} against "
                     f"{info.text(beaten)} over {counted(cells, 'cell(s)')}."
                 )
-    return sentences
-
-
-def missing_levels(board: Board) -> list[str]:
-    """Return how many calibration episodes the levels of tables take that rows are without."""
-    suffixes = list(catalogue.LEVELS)
-    suffixes = suffixes[: suffixes.index(catalogue.HEADLINE) + 1]
-    rows: dict[int, dict[str, dict[str, None]]] = {}
-    for r in (r for r in board.records if r.ok and "calibration" in r.counts):
-        n = r.counts["calibration"]
-        for suffix in (s for s in suffixes if s not in offered_levels(n, r.alarm)):
-            rows.setdefault(n, {}).setdefault(suffix, {})[str(r.setting)] = None
-    sentences = []
-    for n, lacking in rows.items():
-        listed = [
-            f"at {100 * catalogue.LEVELS[s]:g} %: {', '.join(lacking[s])}"
-            for s in suffixes
-            if s in lacking
-        ]
-        sentences.append(f"{enough_episodes(n)}. Without figures {'; '.join(listed)}.")
     return sentences
 
 
@@ -433,8 +460,8 @@ def notes(board: Board) -> list[str]:
         dirty = counted(changed, "cell(s)")
         lines.append(f"Made with uncommitted changes of oodd-eval's checkout: {dirty}.")
     lines.append(
-        f"Means over cells; {UNDEFINED} is undefined (no alarm, say), an empty field was not run, "
-        "* marks a mean over fewer cells than the split has there. A failure is shown as its state."
+        f"Means over cells; {UNDEFINED} is undefined, an empty field was not run, * marks a mean "
+        "over fewer cells than the split has there. A failure is shown as its state."
     )
     return lines
 
@@ -506,9 +533,8 @@ def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
         )
     if ranks.alarms.ranks:
         info = metric_info(ranks.board.alarm_ranking)
-        title = info.title[0].lower() + info.title[1:]
         if whole:
-            lines.append(f"Alarm rank: the rank by {title}, {info.better} is better.")
+            lines.append(f"Alarm rank: the rank by {info.phrase}, {info.better} is better.")
         without = (row for row in rows if row.alarm_state and not row.state)
         lines += [f"Without an alarm rank: {row.entry}, {row.alarm_state}." for row in without]
         lines += uncalibrated(ranks.board)
@@ -534,6 +560,7 @@ def by_metric(
     rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
     first = _LABELS if standings else ("detector",)
     header = [*first, *(c.title for c in columns)]
+    note = " ".join(filter(None, [note, *reasons(board, labels, columns)]))
     return Table(title, header, rows, labels=len(first), note=note, wrap=not board.paired)
 
 

@@ -18,7 +18,7 @@ POOLED: Final = ("auc_pool", "auc_pool_null", "auc_rows")
 
 _ALARMS: Final = (
     "events_found",
-    "delay",
+    "delay_censored",
     "found_within_100",
     "missed",
     "false_episodes",
@@ -46,11 +46,14 @@ class UnpairedTables:
     standings
         Where there are some, rows are in their order and have their places; else they are in the
         order of their means, the best first.
+    level
+        Suffix of the level of guaranteed alarms, by default the board's.
     """
 
     board: Board
     intervals: bool = False
     standings: Sequence[Standing] = ()
+    level: str = ""
 
     def overview(self, *, whole: bool = False) -> list[Table]:
         """Return all of them, the most important one first.
@@ -74,7 +77,8 @@ class UnpairedTables:
         if not self._present((POOLED[-1], alarms[0]), environments):
             return None
         title = "Separability (%, higher is better) and guaranteed alarms"
-        return self._of_metrics(title, (*POOLED, *alarms), environments)
+        note = tables.CENSORED if self._present([f"delay_censored_{self._level}"]) else ""
+        return self._of_metrics(title, (*POOLED, *alarms), environments, note)
 
     def outcomes(self) -> Table | None:
         """Return what is found of episodes known by their outcome alone; None without any."""
@@ -140,8 +144,12 @@ class UnpairedTables:
     def _entries(self) -> list[Setting]:
         return [row.entry for row in self.standings] or tables.best_first(self.board)
 
+    @property
+    def _level(self) -> str:
+        return self.level or self.board.level
+
     def _at_level(self, *names: str) -> list[str]:
-        return [f"{name}_{self.board.level}" for name in names]
+        return [f"{name}_{self._level}" for name in names]
 
     def _present(self, names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
         """Return the metrics that any record has, of some environments or of all."""
@@ -153,19 +161,20 @@ class UnpairedTables:
         self, title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
     ) -> Table:
         """Return means of the metrics that the board has."""
-        level = f"{100 * catalogue.LEVELS[self.board.level]:g} %"
+        level = f"{100 * catalogue.LEVELS[self._level]:g} %"
         over = environments or self.board.environments, self.board.anomalies
         columns = []
         for name in self._present(names, environments):
             info = metric_info(name)
-            text = info.title.removesuffix(f" at {level}")
-            text = text[0].lower() + text[1:] if text[1:2].islower() else text
-            text = "null" if name == POOLED[1] else text
+            text = "null" if name == POOLED[1] else info.noun
             text += " (steps)" if info.unit == "steps" else ""
             text += f" (≤ {level})" if name.startswith("false_episodes") else ""
             columns.append(Mean(text, name, *over, self.intervals or info.interval == "exact"))
         title += f" at {level}" if any(metric_info(c.metric).level for c in columns) else ""
         title += f": {', '.join(environments)}" if environments else ""
+        asked = self.level or catalogue.HEADLINE
+        if f"false_episodes_{asked}" not in [c.metric for c in columns]:
+            note = " ".join(filter(None, [note, *tables.missing_level(self.board, asked)]))
         return self._of(title, columns, note)
 
     def _of(self, title: str, columns: Sequence[Mean], note: str = "") -> Table:

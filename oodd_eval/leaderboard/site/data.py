@@ -35,6 +35,7 @@ from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
+from oodd_eval.results.tables import missing_level
 
 _COMPARED: Final = (
     "false_episodes",
@@ -194,7 +195,7 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         **_fields(board, "environments", "anomalies"),
         **_fields(board, "paired", "ranking", "level"),
         "own": names_of_logs,
-        "about": [] if board.paired else findings_of(board),
+        "about": [] if board.paired else [*findings_of(board), *missing_level(board)],
         "metrics": names,
         "intervals": _with_intervals(names, board),
         "rows": rows,

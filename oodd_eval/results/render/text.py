@@ -49,7 +49,8 @@ def markdown(report: Report) -> str:
 
 def markdown_section(section: Section) -> str:
     """Return a section as Markdown under its title."""
-    parts = [f"{escape(fact)}\n" for fact in section.facts]
+    parts = [f"**{escape(section.verdict)}**\n"] if section.verdict else []
+    parts += [f"{escape(fact)}\n" for fact in section.facts]
     return "\n".join([f"## {escape(section.title)}\n", *parts, markdown_body(section)])
 
 
@@ -117,7 +118,8 @@ def _parts(report: Report) -> Iterator[tuple[str, str | Table]]:
     """Yield titles, sentences, and tables after their titles, in the order of a report."""
     for section in report.sections:
         yield "title", section.title
-        yield from (("sentence", line) for line in (*section.facts, *section.findings))
+        sentences = filter(None, (section.verdict, *section.facts, *section.findings))
+        yield from (("sentence", line) for line in sentences)
         for table in section.tables:
             yield from (("table", table.title), ("", table))
             yield from [("sentence", table.note)] * bool(table.note)
@@ -129,8 +131,10 @@ def _latex(text: str) -> str:
 
 
 def print_sections(sections: Sequence[Section], console: Console) -> None:
-    """Print tables, findings and notes of sections: what is read last stands last."""
+    """Print the verdict, tables, findings and notes of sections: what is read last stands last."""
     for section in sections:
+        if section.verdict:
+            print_prose(section.verdict + "\n", console, "bold")
         for table in section.tables:
             print_table(table, console)
         for sentence in section.findings:
