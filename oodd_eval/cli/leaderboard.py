@@ -287,7 +287,7 @@ def _git(directory: Path, *arguments: str) -> str:
             ["git", "-C", str(directory), *arguments],  # noqa: S607
             capture_output=True,
             check=False,
-            text=True,
+            encoding="utf-8",
             errors="surrogateescape",
         )
     except OSError as error:

@@ -7,7 +7,7 @@ from typing import Final, TypeVar
 import click
 from tabulate import tabulate
 
-from oodd_eval.cli import Options, command
+from oodd_eval.cli import Options, command, say_notes
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
@@ -30,6 +30,8 @@ def list_names(options: Options) -> int:
     """
     check_known("thing to list", KINDS, options.kind)
     plugins = discover(options.disabled)
+    if options.kind == "detectors":
+        say_notes(plugins.notes)
     print(tabulate(rows(options.kind, plugins), tablefmt="plain", disable_numparse=True))
     return int(options.kind == "detectors" and bool(plugins.broken))
 

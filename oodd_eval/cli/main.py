@@ -1,13 +1,15 @@
 """The entry point: read the command line, carry it out, and return its exit code."""
 
 import contextlib
+import errno
 import os
 import shlex
 import signal
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from typing import Final
+from pathlib import Path
+from typing import Final, NoReturn
 
 import click
 from click.shell_completion import shell_complete
@@ -28,9 +30,9 @@ FIRST_STEPS: Final = (
 EXIT_CODES: Final = (
     "0  ok",
     "1  a cell, check or comparison failed, or a plug-in is broken",
-    "2  interrupted (Ctrl-C, TERM, HUP), or output pipe closed",
+    "2  interrupted (Ctrl-C, TERM, HUP, USR1, USR2, XCPU), or output pipe closed",
     "3  internal error",
-    "4  cannot be carried out: unknown name, missing data, no place to write",
+    "4  cannot be carried out: unknown name, missing data, refused by the system",
     "5  nothing was selected or compared",
 )
 
@@ -105,6 +107,9 @@ PROGRAM: Final = click.version_option(__version__, message="oodd-eval %(version)
     _Program("Evaluate detectors of out-of-distribution dynamics on frozen trajectories.", COMMANDS)
 )
 
+INTERRUPTS: Final = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
+"""Signals that end a command as Ctrl-C does: batch systems send them before they kill."""
+
 COMPLETION: Final = "_OODD_EVAL_COMPLETE"  # the variable in which shells ask for completions
 
 
@@ -127,9 +132,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is not None:
         with plain_streams():
             return _exit_code(list(arguments))
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in INTERRUPTS:
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, _interrupt)
+    _leave_unreadable_directory()
     with plain_streams():
         if question := os.environ.get(COMPLETION):
             with contextlib.suppress(OoddError):  # of a broken split, say: then there are no names
@@ -141,6 +147,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
     os._exit(code)
+
+
+def _interrupt(number: int, frame: object) -> NoReturn:
+    """Interrupt the command; the kernel repeats XCPU every second, which is to hold nothing up."""
+    del frame
+    if number not in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt(signal.Signals(number).name)
+
+
+def _leave_unreadable_directory() -> None:
+    """Import nothing from a working directory whose path cannot be found out."""
+    try:
+        Path.cwd()
+    except OSError:
+        sys.path[:] = [entry for entry in sys.path if entry]
+
+
+def _refusal(error: OSError) -> str:
+    """Return why the system refused a call, with the paths that it was about."""
+    paths = (str(path) for path in (error.filename, error.filename2) if path is not None)
+    reason = error.strerror or str(error) or type(error).__name__
+    advice = ": raise the limit (ulimit -n)" if error.errno == errno.EMFILE else ""
+    return f"{' and '.join(map(repr, paths)) or 'a call of the system'}: {reason}{advice}"
 
 
 def _exit_code(arguments: list[str]) -> int:
@@ -155,8 +185,8 @@ def _exit_code(arguments: list[str]) -> int:
         return ended.exit_code
     except SystemExit as error:
         return say(f"something called sys.exit({error.code!r}), so that not all was done", 3)
-    except KeyboardInterrupt:
-        return say("interrupted", 2)
+    except KeyboardInterrupt as interrupt:
+        return say(" by ".join(("interrupted", *map(str, interrupt.args))), 2)
     except BrokenPipeError:
         # Nothing more can be written to the closed pipe, not even when Python exits.
         with contextlib.suppress(OSError):
@@ -169,6 +199,10 @@ def _exit_code(arguments: list[str]) -> int:
         if "-v" in arguments:
             traceback.print_exc()
         return say(str(error), 4)
+    except OSError as error:
+        if "-v" in arguments:
+            traceback.print_exc()
+        return say(_refusal(error), 4)
     except Exception:  # noqa: BLE001  the outermost: everything unforeseen ends here
         traceback.print_exc()
         return say("internal error, please report it with the lines above", 3)

@@ -23,6 +23,7 @@ class _Table(dict[int, int]):
 
 
 _TABLE: Final = _Table()
+_HYPHENS: Final = dict.fromkeys(map(ord, "\N{EN DASH}\N{EM DASH}\N{MINUS SIGN}"), "-")
 
 
 def plain_text(text: str) -> str:
@@ -32,6 +33,20 @@ def plain_text(text: str) -> str:
     'a�[2Jb\n'
     """
     return text if text.isascii() and text.isprintable() else text.translate(_TABLE)
+
+
+def encodable(text: str, encoding: str | None) -> str:
+    r"""Return a text with what an encoding lacks as a question mark, and dashes as hyphens.
+
+    >>> encodable("Δ ≥ 1 \N{EN DASH} 2", "latin-1")
+    '? ? 1 - 2'
+    """
+    try:
+        text.encode(encoding or "utf-8")
+    except UnicodeEncodeError:
+        hyphens = text.translate(_HYPHENS)
+        return hyphens.encode(encoding or "utf-8", "replace").decode(encoding or "utf-8")
+    return text
 
 
 class PlainStream:
@@ -48,8 +63,7 @@ class PlainStream:
 
     def write(self, text: str) -> int:
         """Write a text; what the encoding of the stream lacks becomes a question mark."""
-        encoding = getattr(self.raw, "encoding", None) or "utf-8"
-        self.raw.write(plain_text(text).encode(encoding, "replace").decode(encoding))
+        self.raw.write(encodable(plain_text(text), getattr(self.raw, "encoding", None)))
         return len(text)
 
     def writelines(self, lines: Any) -> None:

@@ -26,8 +26,8 @@ from rich.segment import Segment
 from rich.text import Text
 
 from oodd_eval._version import __version__
-from oodd_eval.cli import Options, say
-from oodd_eval.cli.streams import plain_text, raw
+from oodd_eval.cli import Options, say, say_notes
+from oodd_eval.cli.streams import encodable, plain_text, raw
 from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.logs import register_readers
 from oodd_eval.data.registry import Spec, register
@@ -61,7 +61,8 @@ class _Console(Console):
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=plain_text(segment.text))
+            text = encodable(plain_text(segment.text), self.encoding)
+            yield segment if segment.control else segment._replace(text=text)
 
     def on_broken_pipe(self) -> None:
         """Raise the error; rich would end the process with the exit code of a failure."""
@@ -71,7 +72,10 @@ class _Console(Console):
 def make_console(*, quiet: bool = False, stderr: bool = False) -> Console:
     """Return a console on a standard stream: coloured on a terminal, plain text in a pipe."""
     file = raw(sys.stderr if stderr else sys.stdout)
-    return _Console(file=file, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
+    console = _Console(file=file, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
+    if console.width < 1:  # COLUMNS=0, as of terminals that do not know their size
+        console.width = 80
+    return console
 
 
 def discovered(options: Options, limits: Limits | None = None) -> Plugins:
@@ -85,6 +89,7 @@ def discovered(options: Options, limits: Limits | None = None) -> Plugins:
         plugins = discover_in_sandbox(options.disabled, limits)
         if watching := ", ".join(point.name for point in plugins.observer_points):
             say(f"plug-ins that observe runs are left out of a sandboxed one: {watching}")
+    say_notes(plugins.notes)
     plugins.report_broken_to(
         lambda b: say(f"plug-in {b.plugin!r} of {b.distribution} is broken: {b.reason}")
     )

@@ -17,6 +17,7 @@ from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twi
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
+    OutputError,
     SplitError,
     SplitNotFoundError,
     UnknownNameError,
@@ -31,7 +32,7 @@ _KEPT: Final = 2**26  # bytes of a dataset of the test parts that is read at onc
 def split_places(split: "Split") -> tuple[str, ...]:
     """Return the directories that hold a split, or others that are at hand."""
     shipped = [path for path in SHIPPED.iterdir() if path.is_dir()]
-    return tuple(map(str, (*shipped, data_home(), split.path)))
+    return tuple(map(str, (*shipped, *_homes()[1:], split.path)))
 
 
 def data_home() -> Path:
@@ -41,17 +42,36 @@ def data_home() -> Path:
     -------
     Path
         The directory, which need not exist.
+
+    Raises
+    ------
+    OutputError
+        When there is no home directory: no ``HOME``, and no entry of the user in passwd.
     """
     if os.environ.get("OODD_EVAL_DATA"):
         return Path(os.environ["OODD_EVAL_DATA"])
-    base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+    try:
+        base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+    except RuntimeError:
+        raise OutputError(
+            "splits are kept in the home directory, and there is none (no HOME, and no entry of "
+            f"user {os.getuid()} in passwd): set OODD_EVAL_DATA to a directory for them"
+        ) from None
     return Path(base) / "oodd-eval" / "splits"
+
+
+def _homes() -> list[Path]:
+    """Return the directories that may hold splits, the shipped ones first."""
+    homes = [SHIPPED]
+    with contextlib.suppress(OutputError):
+        homes.append(data_home())
+    return homes
 
 
 def split_directories() -> dict[str, Path]:
     """Return the directories of splits by name: shipped ones, then those in `data_home`."""
     directories: dict[str, Path] = {}
-    for home in (SHIPPED, data_home()):
+    for home in _homes():
         for manifest in sorted(home.glob(f"*/{MANIFEST}")):
             directories.setdefault(manifest.parent.name, manifest.parent)
     return directories
@@ -93,7 +113,7 @@ def load_split(name: str | Path) -> "Split":
         For a name of no split, or of a published one that is not on this machine.
     """
     path = Path(name)
-    if (path / MANIFEST).is_file():
+    if os.path.isfile(path / MANIFEST):  # noqa: PTH113  of an unreadable directory it is False
         return Split(path)
     if isinstance(name, Path) or os.sep in name:
         raise SplitNotFoundError(f"{name} is no split: it has no {MANIFEST}")

@@ -75,7 +75,7 @@ class StoredFile:
         if not path.is_file():
             raise bounds.failure(f"{path} is no plain file")
         try:
-            self._file = h5py.File(path, "r", rdcc_nbytes=2**20)
+            self._file = h5py.File(path, "r", rdcc_nbytes=2**20, locking=False)
         except _BROKEN as error:
             raise bounds.failure(
                 f"{self.name} cannot be read, it is truncated or no HDF5 file ({error})"

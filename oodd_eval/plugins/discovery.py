@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Collection, Iterator
-from contextlib import chdir, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
@@ -44,6 +44,25 @@ _Spec = TypeVar("_Spec", bound=_Named)
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
 LONGEST_REASON: Final = 600  # characters; of a longer one, the start and the end are kept
+
+
+@contextmanager
+def staying() -> Iterator[None]:
+    """Go back to the working directory after the block, if it was left and can be gone back to."""
+    before = _working_directory()
+    try:
+        yield
+    finally:
+        if before and _working_directory() != before:
+            os.chdir(before)
+
+
+def _working_directory() -> str:
+    """Return its path; empty when it has been removed."""
+    try:
+        return os.getcwd()  # noqa: PTH109
+    except OSError:
+        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +198,8 @@ class Plugins:
     """The installed plug-ins, loaded as far as they were needed; made by `discover`.
 
     `loaded` holds the working ones by name, `broken` those that failed, in the order in which they
-    did, and `observer_points` the entry points of plug-ins that observe runs.
+    did, `observer_points` the entry points of plug-ins that observe runs, and `notes` a sentence on
+    other distributions with broken metadata.
     """
 
     def __init__(
@@ -190,6 +210,7 @@ class Plugins:
     ) -> None:
         self.loaded: dict[str, Offering] = {}
         self.broken: list[Broken] = []
+        self.notes: list[str] = []
         self.points, self.observer_points = points, observer_points
         self._load_point, self._waiting = load or _loaded, list(points)
         self._observed = load is None
@@ -273,7 +294,7 @@ class Plugins:
         The working directory, to which results may be relative, is then what it was.
         """
         try:
-            with chdir("."):
+            with staying():
                 yield
         except KeyboardInterrupt:
             raise
@@ -337,7 +358,7 @@ class Plugins:
         asked = []
         for maker, _ in self._makers():
             try:
-                with chdir("."):
+                with staying():
                     spec = maker.from_spec(text)
             except (OoddError, KeyboardInterrupt):
                 raise
@@ -381,7 +402,10 @@ def discover(
         return point.name not in disabled and (only is None or built_in or point.name in only)
 
     plugins = Plugins([*filter(selected, points)], [*filter(selected, observers)], load)
-    plugins.broken += [Broken("unknown", where, reason) for where, reason in broken]
+    plugins.broken += [Broken("unknown", b.distribution, b.reason) for b in broken if b.is_ours]
+    if others := [b for b in broken if not b.is_ours]:
+        more = f", and {len(others) - 1} more" if others[1:] else ""
+        plugins.notes.append(f"passed over {others[0].distribution}{more}: {others[0].reason}")
     return plugins
 
 

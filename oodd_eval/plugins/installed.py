@@ -3,14 +3,19 @@
 import functools
 from collections.abc import Sequence
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, distributions, entry_points
+from pathlib import Path
 from typing import NamedTuple
 
 
 class BrokenMetadata(NamedTuple):
-    """A distribution whose metadata cannot be used: what it calls itself, and the reason."""
+    """A distribution whose metadata cannot be used: its directory, and the reason.
+
+    It `is_ours` when its entry points name this project, so that a plug-in is lost with it.
+    """
 
     distribution: str
     reason: str
+    is_ours: bool
 
 
 def points_of(groups: Sequence[str]) -> tuple[list[list[EntryPoint]], list[BrokenMetadata]]:
@@ -64,4 +69,9 @@ def _broken(distribution: Distribution | None, error: Exception) -> BrokenMetada
     """Return a broken distribution; its directory is named, as its metadata cannot be trusted."""
     where = str(getattr(distribution, "_path", "unknown distribution"))
     reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-    return BrokenMetadata(where, f"its metadata cannot be read, reinstall or remove it: {reason}")
+    reason = f"its metadata cannot be read, reinstall or remove it: {reason}"
+    try:
+        is_ours = b"oodd_eval" in (Path(where) / "entry_points.txt").read_bytes()
+    except OSError:
+        is_ours = False
+    return BrokenMetadata(where, reason, is_ours)

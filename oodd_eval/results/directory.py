@@ -250,7 +250,7 @@ class ResultsDirectory:
                 note = f"{str(path)!r} was changed since it was written and is not used"
                 self.notes += [] if note in self.notes else [note]
                 raise ValueError(note)
-        return h5py.File(path, "r")
+        return h5py.File(path, "r", locking=False)
 
     def scores(self, key: str, lengths: Mapping[str, Sequence[int]]) -> ScoreFile | None:
         """Read a unit's scores; None when the file is absent, damaged, lacks a part or misfits.

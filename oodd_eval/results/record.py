@@ -380,7 +380,8 @@ def gather(command: str = "") -> dict[str, Any]:
     return {
         "oodd_eval": __version__,
         **_commit(),
-        "command": command,
+        # A path that is no UTF-8 is no JSON either.
+        "command": command.encode(errors="replace").decode(),
         "python": platform.python_version(),
         "packages": packages(),
         "platform": platform.platform(),
@@ -411,7 +412,7 @@ def _git(*arguments: str) -> str:
     # Whichever git is on the path. Killed while it holds the index, it would leave a lock behind.
     command = ["git", "--no-optional-locks", *arguments]
     text = subprocess.check_output(  # noqa: S603  fixed arguments
-        command, cwd=_HOME, stderr=subprocess.DEVNULL, text=True, timeout=10
+        command, cwd=_HOME, stderr=subprocess.DEVNULL, encoding="utf-8", timeout=10
     )
     return text.strip()
 

@@ -11,7 +11,6 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
-from oodd_eval.metrics.promise import enough_episodes
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.results.board import Board, Value, grouped

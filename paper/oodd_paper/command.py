@@ -24,7 +24,8 @@ from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.text import print_table
-from oodd_eval.scoring.executors import RunSettings, available_cores
+from oodd_eval.scoring.cores import available_cores
+from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.runner import RunOutcome, run
 from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS

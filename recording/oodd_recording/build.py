@@ -34,6 +34,7 @@ from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
+from oodd_eval.scoring.cores import available_cores
 from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of, packages_of
 from oodd_recording.policies import load_policy
 from oodd_recording.record import (
@@ -361,7 +362,7 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
 @contextlib.contextmanager
 def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
     """Start worker processes for recording, by default one per core; they end with this one."""
-    context, count = multiprocessing.get_context("spawn"), jobs or os.cpu_count() or 1
+    context, count = multiprocessing.get_context("spawn"), jobs or available_cores()
     # Sums depend on the number of threads of matrix libraries, which these read when they load,
     # before any code of ours runs in a child.
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

@@ -7,11 +7,14 @@ has failed, and a new process goes on with the next one. Such a process runs thi
 
 import os
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 from unittest.mock import patch
 
@@ -49,16 +52,10 @@ _VARIABLES: Final = {
 
 
 class _Session:
-    """The pytest plug-in that gives the tests their detector and hands over what they came to."""
+    """The pytest plug-in that selects the tests and hands over what they came to."""
 
-    def __init__(
-        self, trial: Trial, checks: Collection[str], listener: Callable[[Result], object]
-    ) -> None:
-        self._trial, self._checks, self._listener = trial, checks, listener
-
-    @pytest.fixture(scope="session")
-    def detector(self) -> Trial:
-        return self._trial
+    def __init__(self, checks: Collection[str], listener: Callable[[Result], object]) -> None:
+        self._checks, self._listener = checks, listener
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         items[:] = [item for item in items if _name(item) in self._checks]
@@ -83,6 +80,16 @@ class _Session:
         return report
 
 
+def _fixtures(trial: Trial) -> ModuleType:
+    """Return a pytest plug-in that gives the tests their detector.
+
+    A module: pytest deprecates fixtures of instances that last longer than a test.
+    """
+    fixtures = ModuleType("oodd_eval_detector")
+    vars(fixtures)["detector"] = pytest.fixture(scope="session", name="detector")(lambda: trial)
+    return fixtures
+
+
 def _name(item: pytest.Item) -> str:
     return item.name.removeprefix("test_").replace("_", "-")
 
@@ -95,7 +102,7 @@ def run_tests(
         raise UsageError("checks of detectors are assertions: run them without python -O")
     with patch.dict(os.environ, _VARIABLES):
         code = pytest.main(
-            [*_OPTIONS, str(test_detector.__file__)], [_Session(trial, checks, listener)]
+            [*_OPTIONS, str(test_detector.__file__)], [_Session(checks, listener), _fixtures(trial)]
         )
     if code == pytest.ExitCode.INTERRUPTED:
         raise KeyboardInterrupt
@@ -154,6 +161,10 @@ def _result(message: dict[str, Any], name: str) -> Result:
 
 if __name__ == "__main__":
     channel = connect(sys.argv[1:])
+    try:
+        os.chdir(Path.cwd())
+    except OSError:  # it is gone or cannot be gone back to, and pytest needs one
+        os.chdir(tempfile.gettempdir())
     request = channel.receive()
     spec = offer_of(request["plugin"], request["detector"]).spec
     run_tests(

@@ -104,7 +104,7 @@ def outside(written: Iterable[str], here: Path) -> list[str]:
 
     Allowed are the user's cache directory, byte code, devices, and temporary files that are gone.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111
     allowed = cache, Path("/dev"), Path("/proc")
     return [
         str(path.relative_to(here) if path.is_relative_to(here) else path)

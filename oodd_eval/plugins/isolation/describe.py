@@ -9,7 +9,7 @@ is never the plug-in's to say: the command reads it from the installed distribut
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import chdir, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any, Final, NoReturn
@@ -24,6 +24,7 @@ from oodd_eval.plugins.discovery import (
     distribution_of,
     plugin_of,
     printable,
+    staying,
 )
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
@@ -171,7 +172,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     request, answers = channel.receive(), {}
     for name in request["plugins"]:
         try:
-            with chdir("."):
+            with staying():
                 plugin = plugin_of(request["distribution"], name)
                 answers[name] = _answer(plugin, request["make"])
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything

@@ -1,6 +1,5 @@
 """Executors: where units run. In workers of this machine, or on an existing Dask cluster."""
 
-import os
 import threading
 from dataclasses import dataclass, field
 from typing import Final
@@ -11,6 +10,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.scoring.cores import available_cores
 from oodd_eval.scoring.unit import Scored, UnitJob
 
 LOCAL: Final = "local"  # the executor where none is named
@@ -68,11 +68,6 @@ class Executor:
 
     def close(self) -> None:
         """Release what is held, once no call is under way."""
-
-
-def available_cores() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def open_executor(
