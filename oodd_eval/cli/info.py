@@ -42,9 +42,6 @@ Lines = Iterator[tuple[str, str]]
 def info(options: Options) -> int:
     """Print all there is to know of one detector, environment, anomaly, split or metric."""
     name = options.name
-    if name not in ENVIRONMENTS and name not in ANOMALIES and name in split_directories():
-        described: int = load("oodd_eval.cli.data:info").handler(options)
-        return described
     if name in ENVIRONMENTS:
         lines = _environment(ENVIRONMENTS[name])
     elif name in ANOMALIES:
@@ -62,6 +59,9 @@ def info(options: Options) -> int:
                 lines = _custom(*custom[name])
             elif name in imported:
                 lines = _imported(name, *imported[name])
+            elif name in split_directories():
+                described: int = load("oodd_eval.cli.data:info").handler(options)
+                return described
             elif name in SPLITS:
                 lines = _absent(*next(r for r in rows("splits", plugins) if r[0] == name))
             else:
