@@ -177,12 +177,12 @@ def oodd_detectors():
 def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
     install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
     slow = (*CLOCK, "--detector", "slow", "--fresh")
-    assert "slow on" not in run(*slow)[1]
+    assert "slow on cartpole" not in run(*slow)[1]
     monkeypatch.setattr(terminal, "SILENCE", 0.25)
     code, out, _ = run(*slow)
     assert code == 0
     assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
-    assert "slow on" not in run(*slow, "-q")[1]
+    assert "slow on cartpole" not in run(*slow, "-q")[1]
 
 
 def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_factory):

@@ -247,7 +247,8 @@ def test_a_text_of_results_is_what_the_terminal_shows(tiny_split, tmp_path, caps
     assert main(["run", *arguments]) == 0
     capsys.readouterr()
     assert main(["show", str(tmp_path / "out"), "--split", str(tiny_split)]) == 0
-    printed = capsys.readouterr().out
+    heading, _, printed = capsys.readouterr().out.partition("\n\n")
+    assert heading.startswith("split tiny, digest ")
     assert "Separability" in printed
     for results in (
         load_results(tmp_path / "out", tiny_split),
@@ -361,7 +362,7 @@ def test_a_comparison_says_which_row_is_better_and_turns_with_its_sides(results)
     assert lower.difference == pytest.approx(lower.values[0] - lower.values[1])
     better = "mewma" if lower.difference < 0 else "size"
     clear = lower.p <= 0.05 and (lower.low > 0 or lower.high < 0)
-    assert lower.verdict.startswith(f"{better} beats" if clear else "No difference is clear")
+    assert lower.verdict.startswith(f"{better} beats" if clear else "No difference is shown")
 
 
 @pytest.mark.parametrize(
