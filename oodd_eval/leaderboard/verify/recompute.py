@@ -219,11 +219,12 @@ def _read_scores(path: Path, unit: Collection[Record]) -> None:
             scores, offsets = arrays["scores"], arrays["offsets"]
             most = max(first.counts.values())
             column = scores.ndim == offsets.ndim == 1 and offsets.dtype.kind == "i"
-            column = column and scores.dtype == np.float64
             if not column or len(offsets) > most + 1:
                 raise ResultsError(
                     f"{part} has scores or offsets that are no column of numbers, or too many"
                 )
+            if scores.dtype != np.float64:
+                raise ResultsError(f"{part}/scores are of {scores.dtype}, expected float64")
             for i, sequence in enumerate(np.split(scores, offsets[1:-1])):
                 try:
                     contract.check_scores(
