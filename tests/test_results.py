@@ -396,3 +396,12 @@ def test_plots_without_matplotlib_name_the_extra(results, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'oodd-eval\[plots\]'"):
         results.plot_trajectory("hopper", "iid", row="size")
+
+
+def test_parameters_are_for_all_detectors_or_for_one(tiny_split):
+    where = {"environments": "cartpole", "anomalies": "iid"}
+    for parameters in ({"rf": {"trees": 2}}, {"rf.trees": 2}):
+        results = evaluate(["clock", "rf"], tiny_split, **where, parameters=parameters)
+        assert results.rows == ("clock", "rf[trees=2]")
+    with pytest.raises(UsageError, match=r"clock has none of that name: write rf\.trees"):
+        evaluate(["clock", "rf"], tiny_split, **where, parameters={"trees": 2})
