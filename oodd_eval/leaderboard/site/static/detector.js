@@ -68,14 +68,15 @@ function shortList(board) {
 /** A metric's title with its unit. */
 function withUnit(metric) {
   const { title, kind } = DATA.metrics[metric];
-  return (kind === "rate" ? title : `${title} (${titleOfUnit[kind]})`).replace(/ %/g, "\u00a0%");
+  return (kind === "rate" ? title : `${title}\u00a0(${titleOfUnit[kind]})`).replace(/ %/g, "\u00a0%");
 }
 
-/** A board's metrics under headings: what separates, guaranteed alarms, the paper's alarm. */
+/** A board's metrics under headings: what separates, guaranteed alarms, its level's first, the paper's alarm. */
 function headings(board) {
   const of = (metric) => /_at_\d/.test(metric) ? "Guaranteed alarms" : metric.startsWith("auc") ? "Separability"
     : PAPERS.includes(metric) ? PAPERS_ALARM : "Further metrics";
-  const groups = groupedBy(board.metrics, of);
+  const ofLevel = (metric) => metric.endsWith(board.level);
+  const groups = groupedBy([...board.metrics].sort((a, b) => ofLevel(b) - ofLevel(a)), of);
   return ["Separability", "Guaranteed alarms", PAPERS_ALARM, "Further metrics"].filter((title) => groups.has(title)).map((title) => [title, groups.get(title)]);
 }
 
