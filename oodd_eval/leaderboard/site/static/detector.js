@@ -61,7 +61,7 @@ function summary(board, row) {
 /** Metrics that describe a row in short: what it separates, then its guaranteed alarms, or else the paper's. */
 function shortList(board) {
   const separability = board.paired ? [board.ranking] : [board.ranking, "auc_rows", "auc_outcome"];
-  const guaranteed = known(board, ["found_within_20", "delay_censored", "false_episodes"].map((metric) => `${metric}_${board.level}`));
+  const guaranteed = known(board, [board.paired ? "found_within_20" : "events_found", "delay_censored", "false_episodes"].map((metric) => `${metric}_${board.level}`));
   return [...known(board, [...new Set(separability)]), ...guaranteed.length ? guaranteed : known(board, ["delay_censored", "missed", "far_twin"])];
 }
 
