@@ -61,21 +61,22 @@ function summary(board, row) {
 /** Metrics that describe a row in short: what it separates, then its guaranteed alarms, or else the paper's. */
 function shortList(board) {
   const separability = board.paired ? [board.ranking] : [board.ranking, "auc_rows", "auc_outcome"];
-  const guaranteed = known(board, ["found_within_20", "delay_censored", "false_episodes"].map((metric) => `${metric}_${board.level}`));
+  const guaranteed = known(board, [board.paired ? "found_within_20" : "events_found", "delay_censored", "false_episodes"].map((metric) => `${metric}_${board.level}`));
   return [...known(board, [...new Set(separability)]), ...guaranteed.length ? guaranteed : known(board, ["delay_censored", "missed", "far_twin"])];
 }
 
 /** A metric's title with its unit. */
 function withUnit(metric) {
   const { title, kind } = DATA.metrics[metric];
-  return (kind === "rate" ? title : `${title} (${titleOfUnit[kind]})`).replace(/ %/g, "\u00a0%");
+  return (kind === "rate" ? title : `${title}\u00a0(${titleOfUnit[kind]})`).replace(/ %/g, "\u00a0%");
 }
 
-/** A board's metrics under headings: what separates, guaranteed alarms, the paper's alarm. */
+/** A board's metrics under headings: what separates, guaranteed alarms, its level's first, the paper's alarm. */
 function headings(board) {
   const of = (metric) => /_at_\d/.test(metric) ? "Guaranteed alarms" : metric.startsWith("auc") ? "Separability"
     : PAPERS.includes(metric) ? PAPERS_ALARM : "Further metrics";
-  const groups = groupedBy(board.metrics, of);
+  const ofLevel = (metric) => metric.endsWith(board.level);
+  const groups = groupedBy([...board.metrics].sort((a, b) => ofLevel(b) - ofLevel(a)), of);
   return ["Separability", "Guaranteed alarms", PAPERS_ALARM, "Further metrics"].filter((title) => groups.has(title)).map((title) => [title, groups.get(title)]);
 }
 

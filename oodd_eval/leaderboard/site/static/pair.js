@@ -73,7 +73,7 @@ function pairFigure(board, rows) {
 
 /** Five figures of both rows, or as many of them as the board has. */
 function shortTable(board, rows) {
-  const metrics = shortList(board).slice(0, 4);
+  const metrics = shortList(board).filter((metric) => metric === board.ranking || !metric.startsWith("auc"));
   const line = (title, meaning, texts) => element("tr", {}, element("th", { scope: "row", title: meaning }, title,
     element("span", { class: "under" }, sentence(meaning))), texts.map((text) => element("td", {}, text)));
   return scroller(element("table", { class: "plain short", id: "short" }, captionOf("In short: means over all cells"),

@@ -240,8 +240,8 @@ function foldButton(row, others, open) {
 function underLabel(row) {
   const parts = [`\u0394\u202f=\u202f${row.horizon}`];
   if (row.inputs) parts.push(row.inputs.replace("+", " + "));
-  if (row.seeds.length > 1) parts.push(`${row.seeds.length} seeds`);
-  return [...parts.map((part) => `${part} \u00b7 `), element("span", { class: "trust", title: TRUST[row.trust] }, row.trust)];
+  if (row.seeds.length > 1) parts.push(`${row.seeds.length}\u00a0seeds`);
+  return [...parts.map((part) => `${part}\u00a0\u00b7 `), element("span", { class: "trust", title: TRUST[row.trust] }, row.trust)];
 }
 
 const TRUST = {
