@@ -474,6 +474,10 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     )
     assert "at 10 %" in chosen.title
     assert "calibration" not in chosen.note
+    strict = Report([calibrated("pe", 40)], level="at_1pct", detail="brief").sections[0]
+    assert not [t for t in strict.tables if "Guaranteed" in t.title]
+    reason = "40 calibration episodes; 198 needed at 1 %, or --level 5"
+    assert f"{reason}: guaranteed alarms at 1 % (pe)." in strict.findings
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
     assert tables.guaranteed(Board([none])) is None

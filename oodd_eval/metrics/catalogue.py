@@ -101,6 +101,11 @@ class MetricInfo:
         """The title as it stands inside a sentence."""
         return self.noun + self.title.removeprefix(self.short)
 
+    @property
+    def in_paper(self) -> str:
+        """The title on pages of the paper: an alarm without a level is the paper's there."""
+        return self.short if self.paper else self.title
+
     def text(self, value: float) -> str:
         """Return a value as printed: rates below 10 with three decimals, all else with one."""
         if math.isnan(value):

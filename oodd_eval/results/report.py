@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Final, Literal
 
-from oodd_eval.metrics.catalogue import NAMES, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, NAMES, UNDEFINED, metric_info
 from oodd_eval.names import counted
 from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, grouped
@@ -108,7 +108,7 @@ class Report:
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
-            findings_of(board),
+            findings_of(board, self.level),
             [table for table in self._tables(board) if table],
             notes=tables.notes(board),
             verdict=verdict_of(board, self.level),
@@ -153,14 +153,24 @@ class Report:
                 )
 
 
-def findings_of(board: Board) -> list[str]:
-    """Return the sentences on a board that nobody should miss."""
-    metrics = {name for record in board.records for name in record.metrics}
+def findings_of(board: Board, level: str = "") -> list[str]:
+    """Return the sentences on a board that nobody should miss.
+
+    Parameters
+    ----------
+    board
+        The rows.
+    level
+        Suffix of the level of guaranteed alarms that is asked for, if one is.
+    """
+    alarms = board.present(f"false_episodes_{s}" for s in ([level] if level else LEVELS))
+    # Other boards without alarms have a table of scores, and the reason below it.
+    bare = not alarms and (board.paired or not board.present([board.ranking]))
     return [
         *tables.withheld(board),
         *tables.findings(board),
         *phase_findings(board),
-        *(() if any("false_episodes" in m for m in metrics) else tables.missing_level(board)),
+        *(tables.missing_level(board, level or HEADLINE) if bare else ()),
     ]
 
 

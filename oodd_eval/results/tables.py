@@ -245,7 +245,7 @@ CENSORED: Final = "Delay censored counts a miss as the whole remainder of its ep
 """What has to stand below a table with the delay that ranks."""
 
 
-def missing_level(board: Board, suffix: str = catalogue.HEADLINE) -> list[str]:
+def missing_level(board: Board, suffix: str) -> list[str]:
     """Return how many calibration episodes a level takes that rows have no figures at."""
     level = f"guaranteed alarms at {100 * catalogue.LEVELS[suffix]:g} %"
     column = Mean(level, f"false_episodes_{suffix}", board.environments, board.anomalies)

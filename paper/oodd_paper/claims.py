@@ -260,7 +260,7 @@ def _judgement_text(judged: Judgement) -> str:
     digits = 3 if judged.metric == "far" else 2
     scale = _scale(judged.metric)
     value, low, high = (f"{round(scale * x, digits) + 0.0:.{digits}f}" for x in e.ends)
-    title = RETURN if judged.metric == RETURN else metric_info(judged.metric).short
+    title = RETURN if judged.metric == RETURN else metric_info(judged.metric).in_paper
     over = f"{e.environments} of {e.expected} environments" if e.partial else ""
     over = _named(judged.by_environment) if judged.by_environment else over
     return f"{judged.verdict}: {title} {value} [{low}, {high}]" + (f" ({over})" if over else "")

@@ -146,7 +146,7 @@ def layout(
     labels = {s.label: s.label for s in experiment.series}
     scopes = {s.id: s.title for s in experiment.scopes}
     infos = {metric: metric_info(metric) for metric in metrics}
-    titles = {m: i.short + (" (%)" if i.unit == "percent" else "") for m, i in infos.items()}
+    titles = {m: i.in_paper + (" (%)" if i.unit == "percent" else "") for m, i in infos.items()}
     side_by_side = experiment.across == "series"
     lines, columns = (titles, labels) if side_by_side else (labels, scopes)
     header = ["Environment", "Result" if side_by_side else "Setting", "", *columns.values()]

@@ -75,7 +75,7 @@ def pictures_of(experiment: Experiment, numbers: Numbers) -> dict[str, Picture]:
     if grid.axis != "scopes":
         return {name: Picture(title, _panels(experiment, numbers, metrics), grid)}
     names = {m: name + ("" if m in experiment.metrics else "-matched") for m in metrics}
-    titles = {m: f"{title}: {metric_info(m).short}" for m in metrics}
+    titles = {m: f"{title}: {metric_info(m).in_paper}" for m in metrics}
     return {names[m]: Picture(titles[m], _panels(experiment, numbers, [m]), grid) for m in metrics}
 
 
@@ -103,7 +103,7 @@ def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) ->
         info = metric_info(metric)
         scale, chance, unit = 1.0, NAN, "steps" if info.unit == "steps" else "rate per step"
         if info.unit == "percent":
-            scale, chance, unit = 100.0, 50.0, f"{info.short} (%)"
+            scale, chance, unit = 100.0, 50.0, f"{info.in_paper} (%)"
         dots = []
         for label in (label for before, label in labels if before == horizon):
             in_series = [
@@ -114,7 +114,7 @@ def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) ->
             dots.append(_dots(label, run, scale, [scale * n.paper for n in in_series]))
         over = scopes[scope].title.lower()
         title = experiment.picture.panel.format(
-            metric=info.short, row=titles[row], horizon=horizon, scope=scope, anomalies=over
+            metric=info.in_paper, row=titles[row], horizon=horizon, scope=scope, anomalies=over
         )
         divide = 0 if axis == "horizons" else len(places) - 1
         panels.append(Panel(title, unit, categories, tuple(dots), chance, divide))

@@ -195,7 +195,7 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
         **_fields(board, "environments", "anomalies"),
         **_fields(board, "paired", "ranking", "level"),
         "own": names_of_logs,
-        "about": [] if board.paired else [*findings_of(board), *missing_level(board)],
+        "about": [] if board.paired else [*findings_of(board), *missing_level(board, HEADLINE)],
         "metrics": names,
         "intervals": _with_intervals(names, board),
         "rows": rows,
