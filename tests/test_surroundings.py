@@ -14,11 +14,15 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 from helpers_plugins import write_plugin
 from helpers_split import make_split
+from helpers_wheel import PIP, ROOT
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 from oodd_eval.cli import listing
 from oodd_eval.cli.main import main
@@ -392,3 +396,52 @@ def test_jobs_follow_affinity_and_limits(roomy, tmp_path):
         resource.setrlimit(number, (soft, hard))
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
     assert available_cores(tmp_path) == 1
+
+
+# The lowest versions
+
+WITH = ("gym", "worlds", "onnx", "dask", "logs", "plots", "check")
+"""Extras that are installed in their lowest versions; torch and its like would take gigabytes."""
+
+SELECTION = (
+    "test_records.py", "test_results_directory.py", "test_readers.py", "test_submission_entry.py",
+    "test_live_wrappers.py",
+)  # fmt: skip
+"""Tests that use what the extras bring, and pydantic at length."""
+
+
+def lowest():
+    """Return constraints: the lowest versions in pyproject.toml, of several the highest."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    bounds = {}
+    for text in [*project["dependencies"], *(t for name in WITH for t in extras[name])]:
+        requirement = Requirement(text)
+        for bound in requirement.specifier:
+            if bound.operator == ">=":
+                bounds.setdefault(requirement.name, []).append(Version(bound.version))
+    return "".join(f"{name}=={max(versions)}\n" for name, versions in bounds.items())
+
+
+@pytest.mark.packaging
+def test_the_lowest_versions_work(wheel, tmp_path):
+    constraints, inside = tmp_path / "constraints.txt", tmp_path / "venv"
+    constraints.write_text(lowest())
+    python = inside / "bin" / "python"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", inside], check=True)
+    what = [f"{wheel}[{','.join(WITH)}]", "pytest-xdist", "hypothesis"]
+    install = [*PIP, "--python", python, "install", "--prefer-binary", "-c", constraints, *what]
+    done = subprocess.run(install, capture_output=True, text=True, check=False)
+    if "from versions: none" in done.stderr:
+        pytest.skip("no package index can be reached")
+    assert done.returncode == 0, done.stderr
+    run = run_of(make_split(tmp_path / "tiny", ("cartpole",)), tmp_path / "out")
+    subprocess.run([python, "-m", "oodd_eval", *run], check=True, cwd=tmp_path)
+    tests = [ROOT / "tests" / name for name in SELECTION]
+    done = subprocess.run(
+        [python, "-m", "pytest", "-q", "-n", "1", "-o", "filterwarnings=default", "-p",
+         "no:cacheprovider", "--rootdir", ROOT, "--basetemp", tmp_path / "tests", *tests],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:]
+    shutil.rmtree(inside)
