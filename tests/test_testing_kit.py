@@ -140,7 +140,9 @@ class Bare:
         return [float(score) for score in np.abs(x.observations[:, 0] - self.mean)]
 
 
-@pytest.mark.parametrize("detector", [Bare, Bare(), lambda seed: Bare()], ids=repr)
+@pytest.mark.parametrize(
+    "detector", [Bare, Bare(), lambda seed: Bare()], ids=["class", "object", "function"]
+)
 def test_a_class_with_fit_and_score_alone_is_checked_like_any_other(detector):
     report = run_checks(detector, seed=3, horizon=2)
     assert [result.name for result in report.failed] == ["wrong-dimension"]
