@@ -160,6 +160,8 @@ class RecurrentForecast(NetworkRival):
     def _forecasts(self, episode: Floats) -> tuple[Floats, Floats]:
         """Return residuals and log scales of all rows of an episode, (N, D) each."""
         x, changes = self._pairs(episode)
+        # Rows in one piece, as they come live: of others some processors round products otherwise.
+        x = np.ascontiguousarray(x)
         memory = np.zeros((1, self.parameters.units))
         residuals, log_scales = np.empty_like(changes), np.empty_like(changes)
         for n in range(len(x)):
