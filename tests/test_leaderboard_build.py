@@ -491,11 +491,11 @@ def test_wide_tables_hold_default_rows_and_the_rest_is_in_files():
     rows = [record("riqn", [0.7] * SEEDS)]
     rows += [record("riqn", [0.7] * SEEDS, overrides={"members": i}) for i in range(1, 13)]
     text = page(sections([entry("many", rows)]))
-    (header,) = [line for line in text.splitlines() if line.startswith("| Environment")]
+    (header,) = [line for line in text.splitlines() if line.startswith("| Result")]
     assert "members" not in header
     assert "Win rates" not in text
     only = page(sections([entry("one", rows[1:3])]))
-    assert "| Environment" not in only
+    assert "| Result" not in only
 
 
 def test_nothing_depends_on_the_order_of_entries_or_records():

@@ -568,14 +568,13 @@ def test_a_run_says_how_many_episodes_a_level_needs(tmp_path, capsys):
     arguments = ["run", "--detector", "clock", "--env", "all", "--split", str(split)]
     assert main([*arguments, "--output", str(tmp_path / "out")]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    needed = "30 calibration episodes: at 5 % 38 are needed for a CUSUM of the scores"
-    assert out.count(needed) == 1
-    assert "Without figures at 5 %: clock" in out[out.index(needed) :]
+    needed = "30 calibration episodes; 38 needed at 5 %, or --level 10"
+    assert out.count(f"Undefined for clock: guaranteed alarms at 5 % ({needed}).") == 1
     split = make_log_split(tmp_path / "few", UNPAIRED, calibration=12)
     arguments = ["run", "--detector", "clock", "--env", "all", "--split", str(split)]
     assert main([*arguments, "--output", str(tmp_path / "few-out")]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "Without figures at 10 %: clock; at 5 %: clock." in out
+    assert "at 5 % (12 calibration episodes; 38 needed at 5 %)." in out
 
 
 def test_the_command_prints_doubts_before_the_tables(drifting, tmp_path, capsys):

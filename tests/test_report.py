@@ -463,12 +463,12 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
     reason = "30 calibration episodes; 38 needed at 5 %, or --level 10"
     few = calibrated("rf", 30, level="10")
-    assert f"{reason}: guaranteed alarms at 5 % (rf)." in tables.guaranteed(Board([few])).note
+    assert f"rf: guaranteed alarms at 5 % ({reason})." in tables.guaranteed(Board([few])).note
     mixed = Board([few, calibrated("pe", 30, "score")])
     table = tables.guaranteed(mixed)
     assert "at 5 %" in table.title
     assert cells(table, 0) == dict.fromkeys(table.header, "") | {"detector": "rf"}
-    assert f"{reason}: missed, false episodes, early (rf)." in table.note
+    assert f"Undefined for rf: missed, false episodes, early ({reason})." in table.note
     chosen = next(
         t for t in Report([few], level="at_10pct").sections[0].tables if "Guar" in t.title
     )
@@ -477,11 +477,11 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     strict = Report([calibrated("pe", 40)], level="at_1pct", detail="brief").sections[0]
     assert not [t for t in strict.tables if "Guaranteed" in t.title]
     reason = "40 calibration episodes; 198 needed at 1 %, or --level 5"
-    assert f"{reason}: guaranteed alarms at 1 % (pe)." in strict.findings
+    assert f"Undefined for pe: guaranteed alarms at 1 % ({reason})." in strict.findings
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
     assert tables.guaranteed(Board([none])) is None
-    assert "17 calibration episodes; 38 needed at 5 %: " in " ".join(findings_of(Board([none])))
+    assert "(17 calibration episodes; 38 needed at 5 %)." in " ".join(findings_of(Board([none])))
 
 
 def test_enough_calibration_episodes_leave_no_reason():
@@ -500,17 +500,17 @@ def test_enough_calibration_episodes_leave_no_reason():
     [
         (
             "delay_at_5pct",
-            "No episode has its first alarm from the effect on: delay if found (pe).",
+            "pe: delay if found (no episode has its first alarm from the effect on).",
         ),
-        ("auc_placebo", "No two twins both have a defined score from the effect on: placebo (pe)."),
-        ("delay", "No episode has an alarm from the onset on: delay (pe)."),
+        ("auc_placebo", "pe: placebo (no two twins both have a defined score from the effect on)."),
+        ("delay", "pe: delay (no episode has an alarm from the onset on)."),
     ],
 )
 def test_the_reason_of_a_dash_stands_below_its_table(metric, reason):
     records = [calibrated("pe", 40, **{metric: [None, None]}), calibrated("rf", 40)]
     notes = [t.note for t in Report(records).sections[0].tables]
     assert any(reason in note for note in notes)
-    assert "(pe, rf)" not in " ".join(notes)
+    assert "pe, rf" not in " ".join(notes)
 
 
 NOTHING, RISING = np.full(60, np.nan), np.linspace(0, 1, 60)

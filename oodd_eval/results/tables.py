@@ -108,7 +108,7 @@ def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Mean]) -
             of_reason = lacking.setdefault(reason, {"columns": {}, "rows": {}})
             of_reason["columns"][column.title] = of_reason["rows"][str(entry)] = None
     return [
-        f"{reason[0].upper()}{reason[1:]}: {_listed(of, 'columns')} ({_listed(of, 'rows')})."
+        f"Undefined for {_listed(of, 'rows')}: {_listed(of, 'columns')} ({reason})."
         for reason, of in lacking.items()
         if reason
     ]
