@@ -710,3 +710,15 @@ def test_the_last_window_of_a_fault_may_be_shorter(tmp_path):
     (episode,) = parts["test/odd"]
     assert (len(episode.observations), episode.intervals) == (2, ((0, 2),))
     assert {len(e.observations) for e in parts["train"]} == {4}
+
+
+def test_ends_of_recordings_known_by_their_outcome_are_left_out_as_nominal_ones_are(tmp_path):
+    folder(tmp_path, 25)
+    write(tmp_path / "bad.csv", table(25, 5))
+    bad = {"bad": {"files": "bad.csv"}}
+    source, parts = read(tmp_path, window=10, anomalous=bad)
+    assert [len(e.observations) for e in parts["test/bad"]] == [10, 10]
+    assert any("25 rows at ends" in line for line in source.notes)
+    # What is shorter than a window from the start is whole.
+    _, parts = read(tmp_path, window=30, anomalous=bad)
+    assert [len(e.observations) for e in parts["test/bad"]] == [25]

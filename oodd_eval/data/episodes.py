@@ -467,7 +467,7 @@ class _Maker:
                 stop = min(start + length, total)
                 inside = _clipped(rows, start, stop)
                 parts = self._targets(recorded, roles, kind, inside, is_piece=is_piece)
-                if stop - start < length and NOMINAL_ROLES & {*parts}:
+                if stop - start < length and self._takes_whole_windows(parts, inside):
                     self._left_out["row(s) at ends of recordings, less than a window"] += (
                         stop - start
                     )
@@ -475,6 +475,10 @@ class _Maker:
                     self._refuse_short(recorded.recording, stop - start, is_piece=is_piece)
                 else:
                     yield from ((part, start, stop, inside, is_piece) for part in parts)
+
+    def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
+        """Tell whether ends shorter than a window are left out, as all but labelled ones are."""
+        return bool(NOMINAL_ROLES & {*parts} or (parts and not inside))
 
     def _windows(self, recorded: Recorded) -> dict[int, set[str]]:
         """Return the roles of a recording by the length of their windows."""
@@ -835,6 +839,10 @@ class _EveryMaker(_Maker):
             return (names or by_files or [f"test/{_ANOMALOUS}"])[:1]
         labelled = any(self._says_rows(role.removeprefix("test/")) for role in by_files)
         return by_files[:1] if by_files and not labelled else [EVERY]
+
+    def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
+        del parts, inside
+        return False
 
     def _value(self, recorded: Recorded, name: str, *, last: bool = False) -> str | None:
         try:
