@@ -719,6 +719,11 @@ def test_ends_of_recordings_known_by_their_outcome_are_left_out_as_nominal_ones_
     source, parts = read(tmp_path, window=10, anomalous=bad)
     assert [len(e.observations) for e in parts["test/bad"]] == [10, 10]
     assert any("25 rows at ends" in line for line in source.notes)
+    (warning,) = [line for line in source.notes if line.startswith("warning")]
+    assert "test/bad was cut by window" in warning
     # What is shorter than a window from the start is whole.
-    _, parts = read(tmp_path, window=30, anomalous=bad)
+    source, parts = read(tmp_path, window=30, anomalous=bad)
     assert [len(e.observations) for e in parts["test/bad"]] == [25]
+    assert not any("warning" in line for line in source.notes)
+    source, _ = read(tmp_path, window=10, anomalous={"bad": bad["bad"] | {"onset": 0}})
+    assert not any("warning" in line for line in source.notes)

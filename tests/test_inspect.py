@@ -16,6 +16,7 @@ from oodd_eval.data.inspection.logs import inspect_logs
 from oodd_eval.data.inspection.report import advise, describe_logs, looks_like
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.live.logs import read_logs
 
 
 def process(rows, seed=0):
@@ -245,6 +246,34 @@ def test_folders_sort_files_where_no_label_does(tmp_path):
     recipe = draft_recipe(tmp_path)
     assert recipe.nominal.files == ("nominal/*.csv",)
     assert recipe.anomalous["slip-1"].files == ("Slip 1/*.csv",)
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_a_first_recipe_cuts_faulty_files_only_where_labels_say_since_when(tmp_path, labelled):
+    for i in range(20):
+        for folder in ("good", "bad"):
+            is_bad = folder == "bad"
+            more = {"fault": [int(is_bad and row > 150) for row in range(300)]}
+            columns = times(300) | process(300, i + 100 * is_bad) | (more if labelled else {})
+            write(tmp_path / folder / f"run-{i}.csv", columns)
+    logs = inspect_logs(tmp_path)
+    text = draft(logs)
+    recipe = Recipe.parse(tomllib.loads(text))
+    assert recipe.anomalous["bad"].files == ("bad/*.csv",)
+    assert (recipe.window, recipe.clock) == ((60, False) if labelled else (0, True))
+    assert ("# window = 60 " in text) == (not labelled)
+    assert ("once labels" in topics(logs)["few"]) == (not labelled)
+
+
+def test_a_scan_cuts_few_recordings_whatever_is_known_of_them(tmp_path):
+    for i in range(3):
+        for folder in ("good", "bad"):
+            write(
+                tmp_path / folder / f"run-{i}.csv",
+                times(1000) | process(1000, i + 9 * (folder == "bad")),
+            )
+    assert draft_recipe(tmp_path).window == 0
+    assert len(read_logs(tmp_path).episodes) == 6 * 1000 // 50
 
 
 def test_names_of_files_sort_them(tmp_path):

@@ -377,6 +377,7 @@ class _Maker:
         self._recordings = 0
         self._names: set[str] = set()
         self._problems: list[str] = []
+        self._cut_by_outcome: set[str] = set()  # parts with windows that no label is of
         self._base: _Base | None = None
 
     def close(self) -> None:
@@ -474,6 +475,8 @@ class _Maker:
                 elif stop - start < max(2, self._recipe.baseline + 1):
                     self._refuse_short(recorded.recording, stop - start, is_piece=is_piece)
                 else:
+                    if has_windows and not inside:
+                        self._cut_by_outcome |= {*parts} - NOMINAL_ROLES
                     yield from ((part, start, stop, inside, is_piece) for part in parts)
 
     def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
@@ -723,6 +726,13 @@ class _Maker:
                 )
             if episodes or part != TWINS:
                 lines.append(line)
+            if part in self._cut_by_outcome:
+                lines.append(
+                    f"warning: {part} was cut by window, and nothing says which rows are "
+                    "anomalous: every window counts as anomalous, also those before the fault. "
+                    "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
+                    "fault is there from the first row on), or leave out window"
+                )
         if self._recipe.nominal.files:
             how = "in the order of their stamps" if self._by_stamps() else "in the order of files"
             if self._recipe.order == "shuffled":

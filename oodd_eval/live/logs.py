@@ -9,6 +9,7 @@ from typing import Any
 from oodd_eval.data.episodes import EVERY, Episode, read_every_episode
 from oodd_eval.data.inspection.draft import draft
 from oodd_eval.data.inspection.logs import inspect_logs, recognised
+from oodd_eval.data.inspection.meaning import window_of
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.metrics.outliers import ENOUGH
 
@@ -56,7 +57,7 @@ def read_logs(
         recognised.
     window
         Rows to which longer recordings are cut, in place of the recipe's. Without a recipe, 20
-        recordings and more are left whole.
+        recordings and more are left whole, and fewer are cut as ``data inspect`` advises.
 
     Returns
     -------
@@ -68,8 +69,8 @@ def read_logs(
         logs = inspect_logs(path, reader.name, options or {})
         recipe = Recipe.parse(tomllib.loads(draft(logs)))
         files = list(dict.fromkeys(root / recording.file for recording in logs.recordings))
-        if window is None and len(logs.recordings) >= ENOUGH:
-            window = 0
+        if window is None:
+            window = 0 if len(logs.recordings) >= ENOUGH else window_of(logs)
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
     with read_every_episode(recipe, root, files) as source:

@@ -18,6 +18,7 @@ from oodd_eval.data.inspection.meaning import (
     fields_of,
     gap_of,
     keys_of_fields,
+    lacks_rows,
     lacks_values,
     name_of,
     nominal_values,
@@ -129,11 +130,17 @@ def _draft_rows(logs: Inspection) -> Iterator[str]:
         yield "# rate = 10  # rows in a second, if it is known: then there are alarms per hour"
     if any(cuts_of(logs)) or len(times) > 1:
         yield f"gap = {number(gap_of(logs))}  # seconds without a row, at which recordings are cut"
-    if window := window_of(logs):
+    window = window_of(logs)
+    is_cut = window > 0 and not lacks_rows(logs)
+    if is_cut:
         yield f"window = {window}  # rows of an episode, to which long recordings are cut"
         yield "clock = false  # row t of a window has nothing to do with row t of another"
+    elif window:
+        yield f"# window = {window}  # rows of an episode, once labels, intervals or an onset say"
+        yield "#   which rows are anomalous: without them all windows of a faulty recording count"
+        yield "#   as anomalous, also those before the fault"
     yield "# baseline = 100  # rows at the start of every episode that are nominal, if they are"
-    if not window:
+    if not is_cut:
         yield "# clock = false  # if row t of one episode has nothing to do with row t of another"
     yield ""
 

@@ -171,6 +171,17 @@ def window_of(logs: Inspection) -> int:
     return int(round(window, -digits)) if digits > 0 else window
 
 
+def lacks_rows(logs: Inspection) -> bool:
+    """Tell whether recordings are anomalous of which nothing says since which row."""
+    keys, anomalous = keys_of_fields(logs), sort_files(logs).anomalous
+    if logs.labels or logs.intervals:
+        return False
+    if {"outcome", "kinds"} & {*keys}:
+        return True
+    files = {file for names in anomalous.values() for file in names}
+    return any(r.file in files and "onset" not in r.fields for r in logs.recordings)
+
+
 def nominal_recordings(logs: Inspection) -> list[RecordingFacts]:
     """Return the recordings of files that seem to be nominal, at least in part."""
     files = sort_files(logs).nominal

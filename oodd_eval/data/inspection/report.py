@@ -20,6 +20,7 @@ from oodd_eval.data.inspection.meaning import (
     fields_of,
     gap_of,
     keys_of_fields,
+    lacks_rows,
     lacks_values,
     nominal_recordings,
     nominal_values,
@@ -232,6 +233,8 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
     if 0 < (nominal := len(nominal_recordings(logs))) < ENOUGH:
         window = window_of(logs)
         advised = f": window = {window} cuts recordings into more" if window else ""
+        if window and lacks_rows(logs):
+            advised += ", once labels, intervals or an onset say which rows are anomalous"
         yield _say("few", episodes=counted(nominal, "nominal episode(s)"), window=advised)
 
 
