@@ -223,6 +223,23 @@ def test_a_sentence_says_where_the_time_alone_does_as_well_within_episodes():
     ]
 
 
+@pytest.mark.parametrize(
+    ("pool", "rows", "named"),
+    [
+        (0.5, [0.6, 0.6, 0.6, 0.6, 0.6], True),
+        (0.5, [0.9, 0.1, 0.4, 0.6, 0.5], False),  # at chance
+        (0.55, [0.6, 0.6, 0.6, 0.6, 0.6], False),  # clock = false: rows share no number
+    ],
+)
+def test_no_phase_is_found_at_chance_or_where_episodes_share_none(pool, rows, named):
+    records = [
+        log_record("range", values=labelled(0.5, rows), episodes=5),
+        log_record("clock", values=labelled(pool, 0.7), episodes=5),
+    ]
+    sentences = [s for s in findings_of(Board(records)) if s.startswith("clock, ")]
+    assert bool(sentences) == named
+
+
 def outcome(auc, found):
     return {
         "auc_pool": 0.5,
@@ -254,7 +271,7 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
     assert ranks.board.ranking == "auc_outcome"
     assert list(ranks.alarms.ranks) == ["mewma", "clock"]
     alone = UnpairedTables(Board(records[1:])).outcomes()
-    assert "clock" in alone.note
+    assert "Add the row clock" in alone.note
     assert "clock" not in first.note
 
 

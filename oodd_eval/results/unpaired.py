@@ -89,7 +89,10 @@ class UnpairedTables:
             names += [*POOLED, *self._at_level("false_episodes", "false_alarms_per_hour")]
         note = "Episodes are compared up to the same row, as failures run into the time limit."
         if all(entry.detector != _CLOCK for entry in self.board.entries):
-            note += f" The row {_CLOCK} would say what the phase of the episode alone gives."
+            note += (
+                f" Add the row {_CLOCK} (--detector ...,{_CLOCK}) to see how much of this the "
+                "phase of the episode alone gives."
+            )
         return self._of_metrics("Episodes known by their outcome alone (%)", names, note=note)
 
     def nominal(self) -> Table | None:
@@ -197,18 +200,28 @@ class UnpairedTables:
 def phase_findings(board: Board) -> list[str]:
     """Return a sentence where what knows the time alone does as well as detectors within episodes.
 
-    Rows that nobody takes for a detector of dynamics are left out.
+    Left out are rows that nobody takes for a detector of dynamics, rows at chance, which follow no
+    phase either, and environments whose episodes have no phase that they share: their pooled AUC
+    compares rows of all numbers, where that of the clock is not one half by ties alone.
     """
     info = metric_info("auc_rows")
     sentences = []
     for clock in (entry for entry in board.entries if entry.detector == _CLOCK):
-        detectors = [entry for entry in board.entries if entry.detector not in _SENSELESS]
-        compared = {entry: board.compare(clock, entry, info.name) for entry in detectors}
-        listed = [
-            f"{entry} ({info.text(value)} against {info.text(phase)})"
-            for entry, (phase, value, _) in compared.items()
-            if phase >= value
+        phased = [
+            name
+            for name in board.environments
+            if board.mean(clock, [name], board.anomalies, POOLED[0]).value == 0.5
         ]
+        records = [record for record in board.records if record.environment in phased]
+        if not records:
+            continue
+        part = Board(records)
+        listed = []
+        for entry in (entry for entry in part.entries if entry.detector not in _SENSELESS):
+            phase, value, _ = part.compare(clock, entry, info.name)
+            mean = part.mean(entry, phased, part.anomalies, info.name, intervals=True)
+            if phase >= value and not mean.low <= 0.5 <= mean.high:
+                listed.append(f"{entry} ({info.text(value)} against {info.text(phase)})")
         if listed:
             sentences.append(
                 f"{clock}, which knows the time alone, is as good as or better than these rows in "
