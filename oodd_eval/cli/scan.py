@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import click
+import numpy as np
 from rich.text import Text
 from tabulate import tabulate
 
@@ -15,7 +16,7 @@ from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.live.logs import read_logs
 from oodd_eval.live.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
-from oodd_eval.live.scan_page import NUMBERS, cells, page, summary, titles
+from oodd_eval.live.scan_page import NUMBERS, cells, figure, page, summary, titles
 from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
 from oodd_eval.names import counted
@@ -26,6 +27,10 @@ _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
 _SHARE.name = "SHARE"
 _MANY: Final = 40  # episodes of which the table has a line each
 _LARGEST_SHARE: Final = 0.2  # of odd episodes, beyond which they hide one another
+_COLUMNS: Final = (
+    "largest: the episode's largest statistic; p: how often a nominal episode has one that is as "
+    "large; q: the smallest false discovery rate (--fdr) at which the episode is odd."
+)
 _ALWAYS: Final = 5  # columns that are there in any case
 _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
 
@@ -124,6 +129,7 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         console.print("")
         left = len(result.episodes) - len(listed)
         for note in [
+            _COLUMNS,
             *([f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."] * (left > 0)),
             *notes,
             *result.notes,
@@ -140,20 +146,36 @@ def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
     labelled = [one for one in result.episodes if one.label]
     if not labelled:
         return
-    odd = sum(one.odd for one in labelled)
-    many = fitted and len(labelled) > len(result.episodes) * _LARGEST_SHARE
+    missed = [one for one in labelled if not one.odd]
     anomalous = counted(len(labelled), "episode(s)")
     yield (
-        f"Anomalous by their labels: {anomalous}, {odd} of them odd here."
-        + " Where more than a fifth are, they pass for nominal: scan nominal logs alone, or judge "
-        "by a watchdog that was fitted on these (--watchdog FILE)." * many
+        f"Anomalous by their labels: {anomalous}, {len(labelled) - len(missed)} of them odd here."
+    )
+    others = [one.largest for one in result.episodes if not one.label]
+    limits = [one.threshold for one in missed if math.isfinite(one.threshold)]
+    if not (fitted and limits and others):
+        return
+    usual, anomalies = np.median(others), np.median([one.largest for one in labelled])
+    yield (
+        f"The largest statistic of these is {figure(anomalies)} in the median, that of the others "
+        f"{figure(usual)}; an episode is odd from about {figure(np.median(limits))} on, as a scan "
+        "does not know which episodes are nominal."
+    )
+    many = len(labelled) > len(result.episodes) * _LARGEST_SHARE
+    yield (
+        "Where more than a fifth are anomalous, they pass for nominal: scan nominal logs alone, or "
+        "judge by a watchdog that was fitted on these (--watchdog FILE)."
+        if many
+        else "A detector that is fitted on nominal episodes alone finds smaller faults: use "
+        "`oodd-eval data import` and `run`, or a watchdog (--watchdog FILE)."
     )
 
 
 def _listed(result: Scan, *, everything: bool) -> list[ScannedEpisode]:
-    """Return the episodes of the table in recorded order: of many, odd ones and the next to it."""
-    if everything or len(result.episodes) <= _MANY:
-        return list(result.episodes)
-    others = [one for one in result.episodes if not one.odd]
-    nearest = sorted(others, key=lambda one: -one.largest if math.isnan(one.p) else one.p)[:_NEXT]
-    return [one for one in result.episodes if one.odd or one in nearest]
+    """Return the episodes of the table, the oddest first: of many, odd ones and the next to it."""
+    oddest = sorted(
+        result.episodes,
+        key=lambda one: (not one.odd, math.inf if math.isnan(one.p) else one.p, -one.largest),
+    )
+    most = len(oddest) if everything or len(oddest) <= _MANY else len(result.odd) + _NEXT
+    return oddest[:most]
