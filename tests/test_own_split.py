@@ -106,6 +106,15 @@ def test_results_are_shown_described_and_kept_as_a_reference(place, tmp_path, ca
     assert main(["data", "verify", "mine"]) == 0
 
 
+def test_an_environment_of_another_split_is_told_with_that_split(place, capsys, monkeypatch):
+    monkeypatch.setenv("OODD_EVAL_DATA", str(place.parent))
+    assert main(["run", "--detector", "clock", "--env", "pump"]) == 4
+    message = capsys.readouterr().err
+    assert "'pump': it is in split mine, pass --split mine" in message
+    assert main(["run", "--detector", "clock", "--env", "pumpp"]) == 4
+    assert "unknown environment 'pumpp'" in capsys.readouterr().err
+
+
 def test_an_unknown_anomaly_of_the_chosen_environments_is_named(place):
     with pytest.raises(UsageError, match=r"unknown anomaly 'gravity'.*Known: slip"):
         evaluate("clock", place, environments="pump", anomalies="gravity")

@@ -93,6 +93,27 @@ def imported_environments() -> Iterator[tuple[str, str, dict[str, Any]]]:
                     yield environment, name, entry
 
 
+def splits_with(environment: str) -> list[str]:
+    """Return the names of the splits of `split_directories` that have an environment.
+
+    Parameters
+    ----------
+    environment
+        Its name.
+
+    Returns
+    -------
+    list of str
+        Splits that cannot be read are passed over.
+    """
+    names = []
+    for name, directory in split_directories().items():
+        with contextlib.suppress(SplitError):
+            if environment in Split(directory).environments:
+                names.append(name)
+    return names
+
+
 def load_split(name: str | Path) -> "Split":
     """Open a split by its directory or its name; only its manifest is read.
 
@@ -241,7 +262,15 @@ class Split:
         UsageError
             When something is unknown, or the environments have nominal episodes only.
         """
-        chosen = select("environment", environments, self.environments)
+        try:
+            chosen = select("environment", environments, self.environments)
+        except UnknownNameError as error:
+            if not (holders := splits_with(error.name)):
+                raise
+            raise UsageError(
+                f"split {self.name} has no environment {error.name!r}: it is in split "
+                f"{' and '.join(holders)}, pass --split {holders[0]}"
+            ) from None
         if not (known := self._names(*chosen)):
             raise UsageError(
                 f"split {self.name} has no anomalous episodes of {', '.join(chosen)}, expected "
