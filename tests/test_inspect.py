@@ -464,6 +464,34 @@ def test_the_command_prints_and_writes_a_recipe_that_is_read(clean, capsys, monk
     assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 4
 
 
+@pytest.mark.parametrize(
+    ("rows", "text", "advised"), [(300, False, "--window=15"), (3, False, ""), (300, True, "")]
+)
+def test_the_command_advises_only_scans_that_work(tmp_path, capsys, rows, text, advised):
+    columns = times(rows) | {"q": process(rows)["q[rad]"]}
+    if text:
+        columns["q"] = ["err" if i % 50 == 0 else x for i, x in enumerate(columns["q"])]
+    write(tmp_path / "logs" / "run.csv", columns)
+    assert main(["data", "inspect", str(tmp_path / "logs")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert ("No column can be a sensor" in out) == text
+    assert ("--recipe FILE.toml" in out) == (not text)
+    if not advised:
+        assert "oodd-eval scan" not in out
+        return
+    command = out.split("Which of them are odd: oodd-eval ")[1].split(" A first")[0]
+    assert command.endswith(advised)
+    assert main(command.split()) in {0, 1}
+
+
+def test_a_first_recipe_leaves_out_a_file_that_cannot_be_read(clean):
+    (clean / "run-7.csv").write_text("")
+    assert "left out, as they cannot be read: run-7.csv" in draft(inspect_logs(clean))
+    patterns = draft_recipe(clean).nominal.files
+    matched = {path.name for pattern in patterns for path in clean.glob(pattern)}
+    assert matched == {f"run-{i}.csv" for i in range(40) if i != 7}
+
+
 def test_a_recipe_elsewhere_names_the_root(clean, tmp_path_factory, capsys):
     elsewhere = tmp_path_factory.mktemp("recipes") / "arm.toml"
     assert main(["data", "inspect", str(clean), "--recipe", str(elsewhere)]) == 0

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from typing import Final
 
 import click
 
@@ -9,9 +10,20 @@ from oodd_eval.cli import FILE, PARAMETER, Options, command
 from oodd_eval.cli.terminal import make_console, register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.inspection.draft import draft
-from oodd_eval.data.inspection.logs import inspect_logs
+from oodd_eval.data.inspection.logs import Inspection, inspect_logs
+from oodd_eval.data.inspection.meaning import sensors_of, window_of
 from oodd_eval.data.inspection.report import describe_logs
 from oodd_eval.errors import OutputError
+from oodd_eval.live.episode_faults import SHORTEST
+from oodd_eval.live.scan import FITS, WINDOWS
+from oodd_eval.metrics.outliers import LEAST
+from oodd_eval.results.render.text import print_prose
+
+_NO_SENSOR: Final = (
+    "No column can be a sensor, so that there is nothing to scan or import: expected columns of "
+    "numbers that change, in all files. Correct the files, or say how they are read, as in --read "
+    "separator=; or --read decimal=,"
+)
 
 
 @command(
@@ -44,13 +56,15 @@ def inspect(options: Options) -> int:
     )
     console.print(describe_logs(logs, console.width))
     console.print("")
-    scan = ["oodd-eval", "scan", str(options.path)]
-    scan += [f"--format={options.format}"] if options.format else []
-    scan += [f"--read={key}={json.dumps(value)}" for key, value in options.read]
-    console.print(f"Which of them are odd: {shlex.join(scan)}")
+    sensors = sensors_of(logs)
+    if not sensors:
+        print_prose(_NO_SENSOR, console)
+    elif scan := _scan(options, logs):
+        console.print(f"Which of them are odd: {scan}")
     folder = options.path if logs.recordings[0].file != options.path.name else options.path.parent
     if not options.recipe:
-        console.print(f"A first recipe for them: {options.invocation} --recipe FILE.toml")
+        if sensors:
+            console.print(f"A first recipe for them: {options.invocation} --recipe FILE.toml")
         return 0
     home, root = options.recipe.resolve().parent, folder.resolve()
     below = root.is_relative_to(home)
@@ -61,3 +75,17 @@ def inspect(options: Options) -> int:
         f"Read and edit it, then: {shlex.join(['oodd-eval', 'data', 'import', *arguments])}"
     )
     return 0
+
+
+def _scan(options: Options, logs: Inspection) -> str:
+    """Return the command that scans the logs; empty where they are too short for one."""
+    command = ["oodd-eval", "scan", str(options.path)]
+    command += [f"--format={options.format}"] if options.format else []
+    command += [f"--read={key}={json.dumps(value)}" for key, value in options.read]
+    rows = logs.recordings[0].length
+    if len(logs.recordings) == 1 and not window_of(logs) and rows < WINDOWS * LEAST:
+        window = max(SHORTEST, rows // FITS)
+        if rows < window * LEAST:
+            return ""
+        command.append(f"--window={window}")
+    return shlex.join(command)

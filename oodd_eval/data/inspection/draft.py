@@ -24,6 +24,7 @@ from oodd_eval.data.inspection.meaning import (
     nominal_values,
     rate_of,
     roles_of,
+    sensors_of,
     sort_files,
     usable_files,
     window_of,
@@ -147,12 +148,11 @@ def _draft_rows(logs: Inspection) -> Iterator[str]:
 
 def _draft_columns(logs: Inspection) -> Iterator[str]:
     """Yield the sensors and what becomes of them."""
-    sensors = [name for name in logs.columns if name.startswith("obs:")]
-    if sensors:
+    sensors = sensors_of(logs)
+    if any(name.startswith("obs:") for name in sensors):
         yield "# sensors and actions are the columns obs:NAME[UNIT] and action:NAME[UNIT]"
     else:
         roles = roles_of(logs)
-        sensors = [name for name in roles if not roles[name]]
         yield "sensors = ["
         yield from (f"  {toml(name)}," for name in sensors)
         yield "]"
@@ -201,6 +201,9 @@ def _draft_files(logs: Inspection, prefix: str) -> Iterator[str]:
     files = list(dict.fromkeys(r.file for r in logs.recordings))
     if others := [file for file in files if file not in usable_files(logs)]:
         yield f"# left out, as copies of others or with other columns: {listed(others, 40)}"
+    if logs.unreadable:
+        yield f"# left out, as they cannot be read: {listed(logs.unreadable, 40)}"
+        files = list(dict.fromkeys([*files, *logs.unreadable]))
     yield "[nominal]" + (f"  # {sorting.reason}" if sorting.reason else "")
     yield f"files = {_globs(files, sorting.nominal, prefix)}"
     keys = {} if logs.labels or logs.intervals else keys_of_fields(logs)

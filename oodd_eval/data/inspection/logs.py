@@ -109,8 +109,8 @@ class Inspection:
         File that says which rows of others are anomalous; empty without one.
     others
         Number of files of other formats, by ending.
-    problems
-        What could not be read.
+    problems, unreadable
+        What could not be read, and the files that it is in.
     """
 
     path: Path
@@ -125,6 +125,7 @@ class Inspection:
     intervals: str = ""
     others: Counter[str] = field(default_factory=Counter)
     problems: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -302,6 +303,7 @@ def inspect_logs(
                     result.add(recording, names[file])
         except TrajectoryError as error:
             result.problems.append(str(error))
+            result.unreadable.append(names[file])
     exchanged = set() if "transpose" in options else _exchanged(later)
     result.transposed = [names[file] for file in files if file in exchanged]
     for file, recording in later:

@@ -69,6 +69,12 @@ def roles_of(logs: Inspection) -> dict[str, str]:
     return {name: role(name, facts) for name, facts in logs.columns.items()}
 
 
+def sensors_of(logs: Inspection) -> list[str]:
+    """Return the columns that are sensors of a first recipe."""
+    named = [name for name in logs.columns if name.startswith("obs:")]
+    return named or [name for name, role in roles_of(logs).items() if not role]
+
+
 def fields_of(logs: Inspection) -> dict[str, Counter[Any]]:
     """Return the values of fields with few values, and episodes with each."""
     counts: dict[str, Counter[Any]] = defaultdict(Counter)
