@@ -1,14 +1,16 @@
 """The score contract, and the messages of those who break it."""
 
 import functools
+import sys
 import threading
+import types
 
 import numpy as np
 import pytest
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.plugins.contract import accepted, check_scores, copied
+from oodd_eval.plugins.contract import accepted, check_scores, copied, float_scores
 
 EPISODE = Trajectory(np.zeros((6, 2)), np.zeros((5, 1)))
 
@@ -161,3 +163,8 @@ def test_of_a_thousand_names_a_message_lists_some():
     message = str(UnknownNameError("column", "zzz", [f"topic.{i}" for i in range(1000)]))
     assert len(message) < 1000
     assert "and 940 more" in message
+
+
+def test_scores_are_read_while_another_thread_imports_masked_arrays(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numpy.ma", types.ModuleType("numpy.ma"))
+    assert float_scores(np.arange(3)).tolist() == [0.0, 1.0, 2.0]

@@ -424,8 +424,9 @@ def float_scores(returned: object, subject: str = "score", where: str = "") -> S
     import numpy as np  # noqa: PLC0415  see above
 
     # A detector that returns masked arrays has imported numpy.ma; others would pay 50 ms for it.
-    masked = sys.modules.get("numpy.ma")
-    if masked and masked.is_masked(returned):
+    # While another thread imports it, it has no names yet.
+    is_masked = getattr(sys.modules.get("numpy.ma"), "is_masked", None)
+    if is_masked and is_masked(returned):
         # Only its data would go on, with whatever stands where it is masked.
         expected = "expected NaN where it is undefined"
         raise ContractError(f"{subject} returned a masked array{where}, {expected}")
