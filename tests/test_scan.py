@@ -795,3 +795,19 @@ def test_files_that_a_recipe_does_not_list_are_read(tmp_path):
     (one,) = read_logs(tmp_path / "new" / "run-01.csv", recipe).episodes
     assert one.name == "run-01"
     assert len(read_logs(tmp_path / "new", recipe, window=10).episodes) == 6
+
+
+def test_files_of_a_recipe_may_be_relative_to_its_folder(tmp_path):
+    write_logs(tmp_path / "data/good", logs(n=2, rows=30))
+    write_logs(tmp_path / "data/bad", logs(n=2, rows=30))
+    recipe = Recipe.parse(
+        {"split": "x", "sensors": SENSORS, "nominal": {"files": ["data/good/*.csv"]},
+         "anomalous": {"leak": {"files": ["data/bad/*.csv"]}}}
+    )  # fmt: skip
+    read = read_logs(tmp_path / "data", recipe, home=tmp_path)
+    assert sorted(one.kind for one in read.episodes) == ["", "", "leak", "leak"]
+    # Logs elsewhere, and files that are relative to the logs.
+    elsewhere = read_logs(tmp_path / "data", recipe, home=tmp_path / "recipes")
+    assert {one.kind for one in elsewhere.episodes} == {""}
+    read = read_logs(tmp_path, recipe, home=tmp_path / "recipes")
+    assert sorted(one.kind for one in read.episodes) == ["", "", "leak", "leak"]

@@ -76,7 +76,14 @@ def scan(options: Options) -> int:
         refuse(options, ["format", "read"], "is said by the recipe: write it there")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
-    logs = read_logs(options.logs, recipe, options.format or "", dict(options.read), options.window)
+    logs = read_logs(
+        options.logs,
+        recipe,
+        options.format or "",
+        dict(options.read),
+        options.window,
+        options.recipe.parent if options.recipe else None,
+    )
     result = scan_episodes(
         logs.episodes,
         sensors=logs.sensors,

@@ -299,7 +299,7 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
     listed: dict[Path, set[str]] = {}
     for name, table in recipe.anomalous.items():
         for pattern in table.files:
-            for path in _names_matching(pattern, root):
+            for path in names_matching(pattern, root):
                 listed.setdefault(root / path, set()).add(f"test/{name}")
     recordings = (
         Recorded(recording, path, path.relative_to(root).as_posix(), frozenset(roles))
@@ -318,7 +318,7 @@ def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
     UsageError
         When none of the globs matches anything.
     """
-    names = [name for pattern in patterns for name in _names_matching(pattern, root)]
+    names = [name for pattern in patterns for name in names_matching(pattern, root)]
     if patterns and not names:
         there = sorted(path.name for path in root.iterdir())[:20] if root.is_dir() else []
         raise UsageError(
@@ -340,7 +340,7 @@ def _recorded(recipe: Recipe, root: Path, notes: list[str]) -> Iterator[Recorded
     }
     anomalous = {f"test/{name}": table.files for name, table in recipe.anomalous.items()}
     globs = dict.fromkeys(itertools.chain(*tables.values(), *anomalous.values()))
-    absent = [pattern for pattern in globs if not _names_matching(pattern, root)]
+    absent = [pattern for pattern in globs if not names_matching(pattern, root)]
     # Who has a part of a set lacks files of some anomalies; where all lack, that is an error.
     there = {role: patterns for role, patterns in anomalous.items() if {*patterns} - {*absent}}
     roles: dict[Path, set[str]] = {}
@@ -358,7 +358,20 @@ def _recorded(recipe: Recipe, root: Path, notes: list[str]) -> Iterator[Recorded
             yield Recorded(recording, path, relative, frozenset(roles[path]))
 
 
-def _names_matching(pattern: str, root: Path) -> list[str]:
+def names_matching(pattern: str, root: Path) -> list[str]:
+    """Return the names of files that a glob matches.
+
+    Parameters
+    ----------
+    pattern
+        The glob.
+    root
+        Folder that it and the names are relative to.
+
+    Returns
+    -------
+    list of str
+    """
     # Patterns may be whole paths, which `Path.glob` refuses.
     return glob.glob(pattern, root_dir=root, recursive=True)  # noqa: PTH207
 

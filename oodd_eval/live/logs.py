@@ -1,12 +1,13 @@
 """Logs as a scan reads them: every episode in recorded order, labelled or not."""
 
+import itertools
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from oodd_eval.data.episodes import EVERY, Episode, read_every_episode
+from oodd_eval.data.episodes import EVERY, Episode, names_matching, read_every_episode
 from oodd_eval.data.inspection.draft import draft
 from oodd_eval.data.inspection.logs import inspect_logs, recognised
 from oodd_eval.data.inspection.meaning import window_of
@@ -42,6 +43,7 @@ def read_logs(
     form: str = "",
     options: Mapping[str, Any] | None = None,
     window: int | None = None,
+    home: Path | None = None,
 ) -> RecordedLogs:
     """Read all episodes of logs.
 
@@ -58,6 +60,9 @@ def read_logs(
     window
         Rows to which longer recordings are cut, in place of the recipe's. Without a recipe, 20
         recordings and more are left whole, and fewer are cut as ``data inspect`` advises.
+    home
+        Folder of the recipe. Its files are relative to this where the logs are in it and no file
+        that it lists is relative to `path`.
 
     Returns
     -------
@@ -73,6 +78,8 @@ def read_logs(
             window = 0 if len(logs.recordings) >= ENOUGH else window_of(logs)
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
+    if home is not None and files[0].is_relative_to(home) and not _lists(recipe, root):
+        root = home
     with read_every_episode(recipe, root, files) as source:
         return RecordedLogs(
             list(source.episodes(EVERY)),
@@ -80,3 +87,13 @@ def read_logs(
             recipe.baseline,
             list(source.notes),
         )
+
+
+def _lists(recipe: Recipe, root: Path) -> bool:
+    """Tell whether any file of a recipe is there, relative to a folder."""
+    nominal = recipe.nominal
+    tables = (table.files for table in recipe.anomalous.values())
+    patterns = itertools.chain(
+        nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins, *tables
+    )
+    return any(names_matching(pattern, root) for pattern in patterns)
