@@ -145,7 +145,7 @@ def test_x_stops_at_the_first_failure(run, failing):
 @pytest.mark.parametrize(
     ("arguments", "last"),
     [
-        (["--detector=fails"], "0 of 1 fit is kept; the same command fits the other again"),
+        (["--detector=fails"], "0 of 1 fit is kept; the same command fits it again"),
         (["--detector=fails,clock"], "1 of 2 fits is kept; the same command fits the other again"),
         (
             ["--detector=fails,clock", "--fresh"],
@@ -157,6 +157,15 @@ def test_the_last_line_of_a_run_with_failures_says_what_is_kept(run, failing, ar
     _, out, _ = run(*CLOCK, *arguments)
     assert out.splitlines()[-1] == last
     _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+
+
+def test_the_last_line_of_a_run_without_an_extra_says_to_install_it(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    code, out, _ = run("run", "--detector=pe", "--env=cartpole", "--split=tiny")
+    assert code == 1
+    assert out.count("pip install") == out.count("needs torch") == 1
+    last = "0 of 1 fit is kept; install what is named above, then the same command fits it"
     assert out.splitlines()[-1] == last
 
 
@@ -636,6 +645,7 @@ def test_info_describes_detectors_environments_and_anomalies(run):
     code, _, err = run("info", "gravty")
     assert code == 4
     assert "did you mean 'gravity'" in err
+    assert "did you mean" not in run("info", "nonsense")[2]
 
 
 def test_info_describes_splits_and_metrics(run):

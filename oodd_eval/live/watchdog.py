@@ -26,6 +26,7 @@ from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
+from oodd_eval.names import check_known
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
 
@@ -316,7 +317,8 @@ class Watchdog:
         TrajectoryError
             For an array of another length, which is a mistake of the caller and no fault.
         UsageError
-            For a time stamp without a rate, or one of an action alone.
+            For a time stamp without a rate, or one of an action alone, and for a reading of a
+            sensor that is none of `sensors`.
         """
         rate = self.settings.rate
         if (time is not None and not rate) or (acted is not None and time is None):
@@ -325,6 +327,7 @@ class Watchdog:
                 "fitted with rate=, observations in a second, and acted needs time"
             )
         if isinstance(observation, Mapping):
+            check_known("sensor", self.sensors, *observation)
             observation = [observation.get(name, math.nan) for name in self.sensors]
         return self._judged(self._measured(observation), action, time, acted)
 
