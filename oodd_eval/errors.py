@@ -15,7 +15,6 @@ class UsageError(OoddError, ValueError):
     """The request itself is wrong: an unknown name, a bad value, nothing selected."""
 
 
-
 def near(name: object, known: Iterable[str]) -> list[str]:
     """Return the known names that a wrong one may stand for, at most five, the most alike first.
 

@@ -2,12 +2,14 @@
 
 import contextlib
 import io
+import math
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -17,11 +19,12 @@ from helpers_split import make_split
 from rich.console import Console
 
 from oodd_eval import cli as cli_package
-from oodd_eval.cli import listing, terminal
+from oodd_eval.cli import listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.scoring import display
 
 
 @pytest.fixture
@@ -187,7 +190,7 @@ def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
     install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
     slow = (*CLOCK, "--detector", "slow", "--fresh")
     assert "slow on cartpole" not in run(*slow)[1]
-    monkeypatch.setattr(terminal, "SILENCE", 0.25)
+    monkeypatch.setattr(display, "SILENCE", 0.25)
     code, out, _ = run(*slow)
     assert code == 0
     assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
@@ -202,6 +205,18 @@ def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_f
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
     assert re.search(r"0/16 cells, 0:00:\d\d so far", text)
     assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, \d+ s", text)
+
+
+def test_the_time_left_is_from_cells_of_this_run_alone():
+    pace = display.Pace(total=16, start=100.0)
+    for _ in range(8):
+        pace.add(100.1, resumed=True)
+    assert math.isnan(pace.left(108.0))
+    for _ in range(4):
+        pace.add(140.0, resumed=False)
+    assert (pace.done, pace.left(140.0), pace.left(150.0)) == (12, 40.0, 30.0)
+    assert pace.left(200.0) == 0
+    assert str(display.Pace(16, time.perf_counter(), done=8)) == "8/16 cells, 0:00:00 so far"
 
 
 def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):

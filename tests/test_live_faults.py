@@ -171,7 +171,7 @@ def test_readings_come_by_name_too():
 @pytest.mark.parametrize(
     ("sensors", "name", "message"),
     [
-        (["pole angle", "y", "z"], "pole angel", "unknown sensor 'pole angel': did you mean 'pole "),
+        (["pole angle", "y", "z"], "pole angel", "'pole angel': did you mean 'pole angle'"),
         (None, "x", "unknown sensor 'x': Known: sensor 0, sensor 1, sensor 2"),
         (None, 0, "unknown sensor 0: Known: sensor 0"),
     ],

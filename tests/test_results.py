@@ -4,6 +4,7 @@ import gc
 import json
 import re
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from oodd_eval import DetectorSpec, evaluate, load_results, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, ResultsError, UnknownNameError, UsageError
 from oodd_eval.results.collection import Results
+from oodd_eval.scoring import display
 
 CELLS = {"environments": ["hopper", "cartpole"], "anomalies": "iid,gravity"}
 
@@ -137,6 +139,19 @@ class Locked(Bare):
     def fit(self, nominal):
         super().fit(nominal)
         self.fits, self.lock = self.fits + 1, threading.Lock()
+
+
+def test_progress_says_what_is_being_fitted(tiny_split, capsys, monkeypatch):
+    class Slow(Size):
+        def fit(self, nominal):
+            time.sleep(0.6)
+            return super().fit(nominal)
+
+    monkeypatch.setattr(display, "SILENCE", 0.2)
+    evaluate(Slow, tiny_split, **CELLS, progress=True)
+    assert re.search(r"^slow on hopper: fitting, \d s$", capsys.readouterr().err, re.MULTILINE)
+    evaluate(Slow, tiny_split, **CELLS)
+    assert "slow" not in capsys.readouterr().err
 
 
 def test_an_object_that_cannot_be_copied_says_why_and_its_class_will_do(tiny_split):
