@@ -16,8 +16,22 @@ class UsageError(OoddError, ValueError):
 
 
 def near(name: object, known: Iterable[str]) -> list[str]:
-    """Return the known names that a wrong one may stand for, at most five, the most alike first.
+    """Return the known names that a wrong one may stand for.
 
+    Parameters
+    ----------
+    name
+        The wrong name.
+    known
+        The names that exist.
+
+    Returns
+    -------
+    list of str
+        At most five, the most alike first.
+
+    Examples
+    --------
     >>> near("hoper", ["ant", "hopper"]), near("nonsense", ["components"])
     (['hopper'], [])
     """
