@@ -64,11 +64,12 @@ def evaluate(
     Parameters
     ----------
     detector
-        One or several of: the name of an installed detector, which runs in worker processes, as on
-        the command line. A `DetectorSpec`; a class or function called as ``factory(seed=...,
-        horizon=..., **parameters)``, without seed or horizon if it does not take them; an unfitted
-        detector, of which every fit is a copy. These run in this process. A class's, function's and
-        instance's detector is shown actions, a spec's if it says so.
+        One or several of: the name of an installed detector, or a comma list or glob of names,
+        which run in worker processes, as on the command line. A `DetectorSpec`; a class or function
+        called as ``factory(seed=..., horizon=..., **parameters)``, without seed or horizon if it
+        does not take them; an unfitted detector, of which every fit is a copy. These run in this
+        process. A class's, function's and instance's detector is shown actions, a spec's if it says
+        so.
     split
         Name or path of a split, or an opened one.
     environments, anomalies
@@ -136,6 +137,7 @@ def evaluate(
         raise UsageError("no detector was named: expected at least one")
     installed = any(isinstance(d, str) for d in tried)
     plugins = discover() if installed else discover(only=())
+    tried = [n for d in tried for n in (plugins.select(d) if isinstance(d, str) else [d])]
     by_name = {d for d in tried if isinstance(d, str)}
     shared = {k: v for k, v in arguments.items() if "." not in k and k not in by_name}
     names = [_offer(plugins, d, shared) for d in tried]
@@ -199,9 +201,9 @@ def load_results(path: str | Path, split: str | Path | Split | None = None) -> R
 
 
 def _offer(plugins: Plugins, detector: Tried, arguments: Mapping[str, Any]) -> str:
-    """Offer a detector, unless it is an installed one; return its name."""
+    """Offer a detector, unless it is the name of an installed one; return its name."""
     if isinstance(detector, str):
-        return plugins.offer(detector).spec.name
+        return detector
     spec = detector if isinstance(detector, DetectorSpec) else _spec_of(detector, arguments)
     check_detector_spec(spec)
     plugins.add(Offer(spec, "", "", "local", ""))

@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,6 +142,14 @@ class Locked(Bare):
         self.fits, self.lock = self.fits + 1, threading.Lock()
 
 
+def test_installed_detectors_are_selected_as_on_the_command_line(tiny_split):
+    results = evaluate(["cloc*", "mewma, range", Size()], tiny_split, **CELLS)
+    assert [*results.rows] == ["clock", "mewma", "range", "size"]
+    assert evaluate("rang?", tiny_split, **CELLS).rows == ("range",)
+    with pytest.raises(UnknownNameError, match="unknown detector 'nope"):
+        evaluate("clock,nope*", tiny_split, **CELLS)
+
+
 def test_progress_says_what_is_being_fitted(tiny_split, capsys, monkeypatch):
     class Slow(Size):
         def fit(self, nominal):
@@ -160,8 +169,9 @@ def test_an_object_that_cannot_be_copied_says_why_and_its_class_will_do(tiny_spl
         evaluate(Locked(), tiny_split, **cells)
     expected = evaluate(Bare, tiny_split, **cells)
     for detector in (Locked, Locked(early=False)):
-        with pytest.warns(UserWarning, match="it is fitted again for each group"):
+        with pytest.warns(UserWarning, match="it is fitted again for each group") as warned:
             results = evaluate(detector, tiny_split, **cells)
+        assert {Path(w.filename).name for w in warned} == {Path(__file__).name}
         for i in range(2):
             scores = [r.scores("hopper", "iid", i).scores for r in (expected, results)]
             np.testing.assert_array_equal(*scores)
@@ -284,7 +294,7 @@ def test_a_text_of_results_says_why_cells_failed(results):
 def test_means_are_those_of_the_tables(results):
     own = [r.value("auc_matched") for r in results if r.detector == "mewma"]
     assert results.mean(row="mewma") == pytest.approx(np.mean(own))
-    with pytest.raises(UsageError, match="3 rows, expected the name of one: mewma, range, size"):
+    with pytest.raises(UsageError, match="3 rows, expected row= as one of mewma, range, size"):
         results.mean()
     with pytest.raises(UnknownNameError, match="unknown metric 'acu'"):
         results.mean("acu", "mewma")

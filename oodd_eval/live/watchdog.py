@@ -26,7 +26,7 @@ from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
-from oodd_eval.names import check_known
+from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
 
@@ -238,6 +238,12 @@ class Watchdog:
             f"a false alarm every {r.hours:g} h on average ({interval}, from {r.observed:.3g} h of "
             f"nominal operation{beyond})"
         )
+
+    def __repr__(self) -> str:
+        """Return the detector, the sensors and the promise in a line."""
+        detector = self._handle.state["name"] or type(self._handle.detector).__name__
+        sensors = counted(len(self.sensors), "sensor(s)")
+        return f"Watchdog({detector}, {sensors}: {self.promise})"
 
     def reset(self) -> None:
         """Begin a new episode, without an alarm."""
