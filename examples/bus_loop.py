@@ -20,6 +20,7 @@ import numpy as np
 from oodd_recording.policies import load_policy
 
 from oodd_eval import load_split
+from oodd_eval.errors import OoddError
 from oodd_eval.live import TerminalMonitor, Watchdog
 
 RATE = 50
@@ -82,21 +83,33 @@ class Robot:
 def main(arguments=None):
     """Watch one episode; return the reading that raised the alarm, or None."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--detector", default="panel-a")
-    parser.add_argument("--fault", choices=(*FAULTS, "none"), default="stuck")
-    parser.add_argument("--topic", default="pole angle", help="the sensor with the fault")
-    parser.add_argument("--onset", type=int, default=100)
-    parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument(
+        "--detector", default="panel-a", help="of `oodd-eval list detectors` (default: panel-a)"
+    )
+    parser.add_argument(
+        "--fault", choices=(*FAULTS, "none"), default="stuck", help="what happens (default: stuck)"
+    )
+    parser.add_argument(
+        "--topic", default="pole angle", help="the sensor with the fault (default: pole angle)"
+    )
+    parser.add_argument("--onset", type=int, default=100, help="step of the fault (default: 100)")
+    parser.add_argument("--steps", type=int, default=200, help="at most so many (default: 200)")
+    parser.add_argument("--seed", type=int, default=7, help="of the cart's start (default: 7)")
     parser.add_argument("--fast", action="store_true", help="do not wait for the clock")
     parser.add_argument("--monitor", action="store_true", help="show the readings as they come")
     options = parser.parse_args(arguments)
     data = load_split("mini").environment("cartpole")
+    topics = [sensor.name for sensor in data.sensors]
+    if options.topic not in topics:
+        parser.error(f"--topic {options.topic!r}, expected one of {', '.join(topics)}")
     parameters = PARAMETERS.get(options.detector)
     episodes = f"{len(data.train)} nominal episodes of CartPole"
     print(f"fitting {options.detector} on {episodes}, which takes seconds ...", flush=True)
     start = time.monotonic()
-    watchdog = Watchdog.fit(options.detector, data, rate=RATE, parameters=parameters)
+    try:
+        watchdog = Watchdog.fit(options.detector, data, rate=RATE, parameters=parameters)
+    except OoddError as error:  # of a detector that there is not, say
+        parser.error(str(error))
     bus = Bus()
     robot = Robot(bus, watchdog.sensors, options.fault, options.topic, options.onset, options.seed)
     print(f"fitted in {time.monotonic() - start:.1f} s; {watchdog.promise}")

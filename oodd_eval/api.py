@@ -9,6 +9,7 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -18,7 +19,6 @@ import numpy as np
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import PromiseWarning, UsageError
 from oodd_eval.names import each_once, read, whole_number
-from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.contract import (
     AnyDetector,
     Detector,
@@ -32,10 +32,9 @@ from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.plugins.specs import check_detector_spec
 from oodd_eval.results.collection import Results
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.record import Record
 from oodd_eval.scoring.doubts import doubts_after, doubts_before
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.plan import Plan, make_plan
+from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 Tried: TypeAlias = AnyDetector | DetectorSpec
@@ -65,11 +64,12 @@ def evaluate(
     Parameters
     ----------
     detector
-        One or several of: the name of an installed detector, which runs in worker processes, as on
-        the command line. A `DetectorSpec`; a class or function called as ``factory(seed=...,
-        horizon=..., **parameters)``, without seed or horizon if it does not take them; an unfitted
-        detector, of which every fit is a copy. These run in this process. A class's, function's and
-        instance's detector is shown actions, a spec's if it says so.
+        One or several of: the name of an installed detector, or a comma list or glob of names,
+        which run in worker processes, as on the command line. A `DetectorSpec`; a class or function
+        called as ``factory(seed=..., horizon=..., **parameters)``, without seed or horizon if it
+        does not take them; an unfitted detector, of which every fit is a copy. These run in this
+        process. A class's, function's and instance's detector is shown actions, a spec's if it says
+        so.
     split
         Name or path of a split, or an opened one.
     environments, anomalies
@@ -88,7 +88,7 @@ def evaluate(
     jobs
         Installed detectors that are fitted at a time; by default one per core.
     progress
-        Whether to show a bar on standard error.
+        Whether to show on standard error what is being fitted, as on the command line.
     row_metrics
         Whether to compute figures of published tables, too, for splits without twins: ``f1_rows``,
         ``far_rows``, ``mar_rows`` and ``vus_pr``.
@@ -137,6 +137,7 @@ def evaluate(
         raise UsageError("no detector was named: expected at least one")
     installed = any(isinstance(d, str) for d in tried)
     plugins = discover() if installed else discover(only=())
+    tried = [n for d in tried for n in (plugins.select(d) if isinstance(d, str) else [d])]
     by_name = {d for d in tried if isinstance(d, str)}
     shared = {k: v for k, v in arguments.items() if "." not in k and k not in by_name}
     names = [_offer(plugins, d, shared) for d in tried]
@@ -162,12 +163,13 @@ def evaluate(
     )
     if output is None:
         weakref.finalize(directory, shutil.rmtree, directory.path, ignore_errors=True)
-    observers = [_Bar()] if progress else []
     settings = RunSettings(jobs=jobs, row_metrics=row_metrics)
     for name, finding in doubts_before(plan, opened):
         if finding.subject != "episodes":  # the tables lack what these are too few for
             warnings.warn(f"{name}: {finding}", PromiseWarning, stacklevel=2)
-    outcome = run(plan, opened, plugins, settings, directory, observers)
+    with ExitStack() as stack:
+        observers = [stack.enter_context(_display())] if progress else []
+        outcome = run(plan, opened, plugins, settings, directory, observers)
     for name, finding in doubts_after(plan, opened, directory):
         warnings.warn(f"{name}: {finding}", PromiseWarning, stacklevel=2)
     return Results(outcome.records, directory, opened)
@@ -199,9 +201,9 @@ def load_results(path: str | Path, split: str | Path | Split | None = None) -> R
 
 
 def _offer(plugins: Plugins, detector: Tried, arguments: Mapping[str, Any]) -> str:
-    """Offer a detector, unless it is an installed one; return its name."""
+    """Offer a detector, unless it is the name of an installed one; return its name."""
     if isinstance(detector, str):
-        return plugins.offer(detector).spec.name
+        return detector
     spec = detector if isinstance(detector, DetectorSpec) else _spec_of(detector, arguments)
     check_detector_spec(spec)
     plugins.add(Offer(spec, "", "", "local", ""))
@@ -273,23 +275,10 @@ def _without_numpy(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-class _Bar:
-    """A progress bar on standard error: an observer of the run."""
+def _display() -> AbstractContextManager[object]:
+    """Return what shows on standard error what runs; its library is imported with it."""
+    from rich.console import Console  # noqa: PLC0415
 
-    @hookimpl
-    def oodd_run_started(self, plan: Plan) -> None:
-        from rich.console import Console  # noqa: PLC0415
-        from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
+    from oodd_eval.scoring.display import Display  # noqa: PLC0415
 
-        columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True))
-        self._task = self._progress.add_task("cells", total=len(plan.cells))
-        self._progress.start()
-
-    @hookimpl
-    def oodd_cell_finished(self, record: Record) -> None:
-        self._progress.update(self._task, advance=1, description=str(record.cell))
-
-    @hookimpl
-    def oodd_run_finished(self) -> None:
-        self._progress.stop()
+    return Display(Console(stderr=True, highlight=False, markup=False))

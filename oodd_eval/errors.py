@@ -15,7 +15,31 @@ class UsageError(OoddError, ValueError):
     """The request itself is wrong: an unknown name, a bad value, nothing selected."""
 
 
+def near(name: object, known: Iterable[str]) -> list[str]:
+    """Return the known names that a wrong one may stand for.
+
+    Parameters
+    ----------
+    name
+        The wrong name.
+    known
+        The names that exist.
+
+    Returns
+    -------
+    list of str
+        At most five, the most alike first.
+
+    Examples
+    --------
+    >>> near("hoper", ["ant", "hopper"]), near("nonsense", ["components"])
+    (['hopper'], [])
+    """
+    return difflib.get_close_matches(str(name), dict.fromkeys(known), n=5, cutoff=0.6)
+
+
 _LISTED = 60  # known names in a message: logs may have thousands of columns
+_FEW = 20  # of which a message has all, beside a name that may be meant
 
 
 class UnknownNameError(UsageError, LookupError):
@@ -38,12 +62,12 @@ class UnknownNameError(UsageError, LookupError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         names = sorted(known)
-        close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]!r}? " if close else ""
         further = len(names) - _LISTED
         more = f" and {further} more" if further > 0 else ""
-        listed = f"{', '.join(names[:_LISTED]) or 'none'}{more}"
-        super().__init__(f"unknown {kind} {name!r}: {hint}Known: {listed}")
+        hints = [f"did you mean {close!r}?" for close in near(name, names)[:1]]
+        if not hints or len(names) <= _FEW:
+            hints.append(f"Known: {', '.join(names[:_LISTED]) or 'none'}{more}")
+        super().__init__(f"unknown {kind} {name!r}: {' '.join(hints)}")
         self.kind, self.name, self.known = kind, name, names
 
 

@@ -2,12 +2,14 @@
 
 import contextlib
 import io
+import math
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -17,11 +19,12 @@ from helpers_split import make_split
 from rich.console import Console
 
 from oodd_eval import cli as cli_package
-from oodd_eval.cli import listing, terminal
+from oodd_eval.cli import listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.scoring import display
 
 
 @pytest.fixture
@@ -145,7 +148,7 @@ def test_x_stops_at_the_first_failure(run, failing):
 @pytest.mark.parametrize(
     ("arguments", "last"),
     [
-        (["--detector=fails"], "0 of 1 fit is kept; the same command fits the other again"),
+        (["--detector=fails"], "0 of 1 fit is kept; the same command fits it again"),
         (["--detector=fails,clock"], "1 of 2 fits is kept; the same command fits the other again"),
         (
             ["--detector=fails,clock", "--fresh"],
@@ -157,6 +160,15 @@ def test_the_last_line_of_a_run_with_failures_says_what_is_kept(run, failing, ar
     _, out, _ = run(*CLOCK, *arguments)
     assert out.splitlines()[-1] == last
     _, out, _ = run(*CLOCK, *arguments)
+    assert out.splitlines()[-1] == last
+
+
+def test_the_last_line_of_a_run_without_an_extra_says_to_install_it(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    code, out, _ = run("run", "--detector=pe", "--env=cartpole", "--split=tiny")
+    assert code == 1
+    assert out.count("pip install") == out.count("needs torch") == 1
+    last = "0 of 1 fit is kept; install what is named above, then the same command fits it"
     assert out.splitlines()[-1] == last
 
 
@@ -178,7 +190,7 @@ def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
     install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
     slow = (*CLOCK, "--detector", "slow", "--fresh")
     assert "slow on cartpole" not in run(*slow)[1]
-    monkeypatch.setattr(terminal, "SILENCE", 0.25)
+    monkeypatch.setattr(display, "SILENCE", 0.25)
     code, out, _ = run(*slow)
     assert code == 0
     assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
@@ -193,6 +205,18 @@ def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_f
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
     assert re.search(r"0/16 cells, 0:00:\d\d so far", text)
     assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, \d+ s", text)
+
+
+def test_the_time_left_is_from_cells_of_this_run_alone():
+    pace = display.Pace(total=16, start=100.0)
+    for _ in range(8):
+        pace.add(100.1, resumed=True)
+    assert math.isnan(pace.left(108.0))
+    for _ in range(4):
+        pace.add(140.0, resumed=False)
+    assert (pace.done, pace.left(140.0), pace.left(150.0)) == (12, 40.0, 30.0)
+    assert pace.left(200.0) == 0
+    assert str(display.Pace(16, time.perf_counter(), done=8)) == "8/16 cells, 0:00:00 so far"
 
 
 def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):
@@ -636,6 +660,7 @@ def test_info_describes_detectors_environments_and_anomalies(run):
     code, _, err = run("info", "gravty")
     assert code == 4
     assert "did you mean 'gravity'" in err
+    assert "did you mean" not in run("info", "nonsense")[2]
 
 
 def test_info_describes_splits_and_metrics(run):

@@ -121,7 +121,8 @@ def test_every_reference_leads_to_one_object(tiny_split, tmp_path):
 def test_addresses_are_relative_or_below_the_one_that_is_named(tiny_split, tmp_path, capsys):
     files = exported(tiny_split, tmp_path)["distribution"]
     assert all(file["contentUrl"] == file["name"] for file in files)
-    assert "creator, license, url" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "creator, license, url; before publishing name the address with --url and" in said
     described = exported(tiny_split, tmp_path, "--url", "https://example.org/tiny/")
     assert described["url"] == "https://example.org/tiny/"
     assert {file["contentUrl"] for file in described["distribution"]} == {
@@ -152,6 +153,7 @@ def test_logs_have_the_licence_and_citation_of_their_recipe(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--format", "croissant"], "name a folder for others with --output"),
         (["--format", "croissant", "--env", "hopper"], "metadata are of a whole split"),
         (["--format", "minari"], "needs --output"),
         (["--format", "minari", "--output", "x", "--url", "y"], "has no --url"),

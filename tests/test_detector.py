@@ -163,6 +163,8 @@ def test_of_a_thousand_names_a_message_lists_some():
     message = str(UnknownNameError("column", "zzz", [f"topic.{i}" for i in range(1000)]))
     assert len(message) < 1000
     assert "and 940 more" in message
+    near = UnknownNameError("column", "topik.7", [f"topic.{i}" for i in range(1000)])
+    assert str(near) == "unknown column 'topik.7': did you mean 'topic.7'?"
 
 
 def test_scores_are_read_while_another_thread_imports_masked_arrays(monkeypatch):

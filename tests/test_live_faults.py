@@ -168,6 +168,21 @@ def test_readings_come_by_name_too():
     assert readings[-1].alarm
 
 
+@pytest.mark.parametrize(
+    ("sensors", "name", "message"),
+    [
+        (["pole angle", "y", "z"], "pole angel", "'pole angel': did you mean 'pole angle'"),
+        (None, "x", "unknown sensor 'x': Known: sensor 0, sensor 1, sensor 2"),
+        (None, 0, "unknown sensor 0: Known: sensor 0"),
+    ],
+)
+def test_a_reading_of_an_unknown_sensor_is_a_mistake_of_the_caller(sensors, name, message):
+    watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1, sensors=sensors)
+    with pytest.raises(UsageError, match=message):
+        watchdog.update({name: 1.0})
+    assert watchdog.update(dict.fromkeys(watchdog.sensors, 0.0)).t == 0
+
+
 @pytest.fixture(scope="module")
 def cartpole():
     data = load_split("mini").environment("cartpole")

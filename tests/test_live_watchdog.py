@@ -321,6 +321,14 @@ def test_scores_of_another_number_or_type_are_refused():
             Watchdog.fit(detector, WIDE, CALIBRATION)
 
 
+def test_a_watchdog_is_a_line_in_a_prompt():
+    promise = "at most 5 % of nominal episodes raise an alarm"
+    watchdog = Watchdog.fit("persistence", WIDE, CALIBRATION)
+    n = len(watchdog.sensors)
+    assert repr(watchdog) == f"Watchdog(persistence, {n} sensors: {promise})"
+    assert repr(Watchdog.fit(LiveSize, WIDE, CALIBRATION)).startswith("Watchdog(LiveSize, ")
+
+
 def test_a_watchdog_that_cannot_be_copied_names_the_attribute():
     class Locked(LiveSize):
         def fit(self, nominal):

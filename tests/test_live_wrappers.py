@@ -294,6 +294,20 @@ def test_a_loop_on_a_bus_is_quiet_without_a_fault():
     assert run_example("bus_loop.py").main(["--fault", "none", "--fast"]) is None
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--topic", "nope"], "--topic 'nope', expected one of cart position, cart velocity, pole"),
+        (["--detector", "nope"], "unknown detector 'nope'"),
+    ],
+)
+def test_the_loop_on_a_bus_refuses_unknown_names(arguments, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run_example("bus_loop.py").main([*arguments, "--fast"])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
 class BaseCallback:
     """What stable-baselines3 documents of its own: the hooks, and what they may look at."""
 

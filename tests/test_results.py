@@ -4,7 +4,9 @@ import gc
 import json
 import re
 import threading
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from oodd_eval import DetectorSpec, evaluate, load_results, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, ResultsError, UnknownNameError, UsageError
 from oodd_eval.results.collection import Results
+from oodd_eval.scoring import display
 
 CELLS = {"environments": ["hopper", "cartpole"], "anomalies": "iid,gravity"}
 
@@ -139,14 +142,36 @@ class Locked(Bare):
         self.fits, self.lock = self.fits + 1, threading.Lock()
 
 
+def test_installed_detectors_are_selected_as_on_the_command_line(tiny_split):
+    results = evaluate(["cloc*", "mewma, range", Size()], tiny_split, **CELLS)
+    assert [*results.rows] == ["clock", "mewma", "range", "size"]
+    assert evaluate("rang?", tiny_split, **CELLS).rows == ("range",)
+    with pytest.raises(UnknownNameError, match="unknown detector 'nope"):
+        evaluate("clock,nope*", tiny_split, **CELLS)
+
+
+def test_progress_says_what_is_being_fitted(tiny_split, capsys, monkeypatch):
+    class Slow(Size):
+        def fit(self, nominal):
+            time.sleep(0.6)
+            return super().fit(nominal)
+
+    monkeypatch.setattr(display, "SILENCE", 0.2)
+    evaluate(Slow, tiny_split, **CELLS, progress=True)
+    assert re.search(r"^slow on hopper: fitting, \d s$", capsys.readouterr().err, re.MULTILINE)
+    evaluate(Slow, tiny_split, **CELLS)
+    assert "slow" not in capsys.readouterr().err
+
+
 def test_an_object_that_cannot_be_copied_says_why_and_its_class_will_do(tiny_split):
     cells = {"environments": "hopper", "anomalies": "iid"}
     with pytest.raises(UsageError, match=r"Locked cannot be copied, .* 'lock' .*: pass the class"):
         evaluate(Locked(), tiny_split, **cells)
     expected = evaluate(Bare, tiny_split, **cells)
     for detector in (Locked, Locked(early=False)):
-        with pytest.warns(UserWarning, match="it is fitted again for each group"):
+        with pytest.warns(UserWarning, match="it is fitted again for each group") as warned:
             results = evaluate(detector, tiny_split, **cells)
+        assert {Path(w.filename).name for w in warned} == {Path(__file__).name}
         for i in range(2):
             scores = [r.scores("hopper", "iid", i).scores for r in (expected, results)]
             np.testing.assert_array_equal(*scores)
@@ -269,7 +294,7 @@ def test_a_text_of_results_says_why_cells_failed(results):
 def test_means_are_those_of_the_tables(results):
     own = [r.value("auc_matched") for r in results if r.detector == "mewma"]
     assert results.mean(row="mewma") == pytest.approx(np.mean(own))
-    with pytest.raises(UsageError, match="3 rows, expected the name of one: mewma, range, size"):
+    with pytest.raises(UsageError, match="3 rows, expected row= as one of mewma, range, size"):
         results.mean()
     with pytest.raises(UnknownNameError, match="unknown metric 'acu'"):
         results.mean("acu", "mewma")

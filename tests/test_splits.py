@@ -193,7 +193,7 @@ def test_unknown_environment_and_anomaly_are_named(tiny_split):
     split = load_split(tiny_split)
     with pytest.raises(UnknownNameError, match="did you mean 'hopper'"):
         split.environment("hoper")
-    with pytest.raises(UnknownNameError, match=r"of hopper\.h5 'idd': did you mean 'iid'"):
+    with pytest.raises(UnknownNameError, match=r"of hopper 'idd': did you mean 'iid'"):
         split.environment("hopper").anomalous("idd")
 
 

@@ -315,6 +315,15 @@ def test_a_signal_of_a_batch_system_ends_a_run_as_an_interrupt_does(split, tmp_p
     assert len((output / "records.jsonl").read_text().splitlines()) == 2
 
 
+def test_an_interrupt_of_the_imports_ends_a_command_as_a_later_one(tmp_path):
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+    done = subprocess.run(
+        [sys.executable, "-m", "oodd_eval", "--help"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (2, "oodd-eval: interrupted\n")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR2])
 def test_a_command_says_which_signal_has_ended_it(number):
     code = (

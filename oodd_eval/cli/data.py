@@ -19,7 +19,7 @@ from oodd_eval.data.logs.minari import export as export_split
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.data.shipped_recipes import shipped_recipes
-from oodd_eval.data.split import load_split
+from oodd_eval.data.split import SHIPPED, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment, counted, select
 from oodd_eval.results.render.text import print_prose
@@ -198,10 +198,20 @@ def export(options: Options) -> int:
     if options.format == "croissant":
         if options.env != "all":
             raise UsageError("--env is for --format minari: metadata are of a whole split")
+        if options.output is None and split.path.parent == SHIPPED:
+            raise UsageError(
+                f"split {split.name} is in the installed package, which has its metadata already: "
+                "name a folder for others with --output"
+            )
         metadata = croissant.write(split, options.output, url=options.url)
-        if metadata.lacking:
-            keys = ", ".join(metadata.lacking)
-            say(f"not known, and required by searches for data sets: {keys}; add before publishing")
+        if lacking := metadata.lacking:
+            advice = ["name the address with --url"] if "url" in lacking else []
+            if {*lacking} - {"url"}:
+                advice.append("write the others into the file" if advice else "write into the file")
+            say(
+                f"not known, and required by searches for data sets: {', '.join(lacking)}; before "
+                f"publishing {' and '.join(advice)}"
+            )
         make_console().print(f"metadata of split {split.name} are in {metadata.path}")
         return 0
     if options.output is None or options.url:

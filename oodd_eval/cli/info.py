@@ -1,6 +1,5 @@
 """``oodd-eval info``: describe a detector, an environment, an anomaly, a split or a metric."""
 
-import difflib
 import json
 from collections.abc import Iterator, Mapping
 from itertools import chain
@@ -24,7 +23,7 @@ from oodd_eval.data.facts import (
 from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.data.split import imported_environments, split_directories
-from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.errors import UnknownNameError, UsageError, near
 from oodd_eval.metrics.accumulation import NOUNS
 from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
 from oodd_eval.names import counted
@@ -69,8 +68,8 @@ def info(options: Options) -> int:
         except UnknownNameError:
             names = [*ENVIRONMENTS, *ANOMALIES, *custom, *imported, *plugins.offers]
             names += [*SPLITS, *split_directories(), *NAMES]
-            near = difflib.get_close_matches(name, dict.fromkeys(names), n=5, cutoff=0.5)
-            meant = f": did you mean {' or '.join(map(repr, near))}?" if near else ":"
+            close = near(name, names)
+            meant = f": did you mean {' or '.join(map(repr, close))}?" if close else ":"
             kinds = "detector, environment, anomaly, split or metric"
             raise UsageError(
                 f"unknown {kinds} {name!r}{meant} `oodd-eval list KIND` has all names of a kind"

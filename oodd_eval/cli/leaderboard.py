@@ -108,7 +108,7 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
 @click.option(
     "--hub",
     metavar="OWNER/NAME",
-    help="also write results for a hub of models, on which the split has this id",
+    help="also write results for a hub of models, on which the split has this id, into ./hub-ID",
 )
 def submit(options: Options) -> int:
     """Write an entry from a results directory.
@@ -237,10 +237,17 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
             console.print(f"  trust level established here: {verdict.reached}")
     else:
         console.print(f"{verdict.name}: refused, {counted(findings.count, 'problem(s)')}")
-    problems = findings.problems if verbosity > 0 else findings.problems[:MOST_SHOWN]
-    lines = [f"{verdict.name}: {problem.text}" for problem in problems]
-    if findings.count > len(problems):
-        lines.append(f"and {findings.count - len(problems)} more")
+    alike: dict[object, list[str]] = {}  # one line of those that many records have
+    for i, problem in enumerate(findings.problems):
+        key = i if verbosity > 0 else (problem.field, problem.message)
+        alike.setdefault(key, []).append(problem.text)
+    groups = list(alike.values()) if verbosity > 0 else list(alike.values())[:MOST_SHOWN]
+    lines = [
+        f"{verdict.name}: {text}" + (f" (and {len(more)} more like this)" if more else "")
+        for text, *more in groups
+    ]
+    if (left := findings.count - sum(map(len, groups))) > 0:
+        lines.append(f"and {left} more")
     if verdict.rerun is not None:
         lines.append(f"re-run: {verdict.rerun.how}")
     lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]

@@ -177,18 +177,21 @@ def _lacks_twins(split: Split, environment: str) -> bool:
 
 def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:
     """Return how a run goes on that has not done all: which fits are kept, and by which command."""
-    kept, every = (
-        len({(r.environment, r.cell.label) for r in done.records if r.ok}),
-        len(plan.units),
-    )
+    kept = len({(r.environment, r.cell.label) for r in done.records if r.ok})
+    every = len(plan.units)
     if kept == every:
         return ""
     again = "the same command without --fresh" if fresh and kept else "the same command"
-    does = (
-        "continues" if done.left else f"fits the {'others' if every > kept + 1 else 'other'} again"
-    )
+    rest = "it" if every == 1 else "all" if not kept else "the others"
+    rest = "the other" if 1 <= kept == every - 1 else rest
+    if done.left:
+        advice = f"{again} continues"
+    elif any(record.status == "unavailable" for record in done.records):
+        advice = f"install what is named above, then {again} fits {rest}"
+    else:
+        advice = f"{again} fits {rest} again"
     are = "is" if 1 in (kept, every) else "are"
-    return f"{kept} of {counted(every, 'fit(s)')} {are} kept; {again} {does}"
+    return f"{kept} of {counted(every, 'fit(s)')} {are} kept; {advice}"
 
 
 class _Doubts:

@@ -336,7 +336,7 @@ class EnvironmentData:
         UnknownNameError
             When this split has no such anomaly.
         """
-        check_known(f"anomaly of {self._file.name}", self.anomalies, str(anomaly))
+        check_known(f"anomaly of {self.id}", self.anomalies, str(anomaly))
         return LabelledSet(self._parts, f"test/{anomaly}")
 
     def anomalous(self, anomaly: str | Condition) -> AnomalousSet:
@@ -357,7 +357,7 @@ class EnvironmentData:
         UnknownNameError
             When this split has no such anomaly.
         """
-        check_known(f"anomaly of {self._file.name}", self.anomalies, str(anomaly))
+        check_known(f"anomaly of {self.id}", self.anomalies, str(anomaly))
         return AnomalousSet(self._parts, f"test/{anomaly}")
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:

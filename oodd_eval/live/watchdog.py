@@ -26,6 +26,7 @@ from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
+from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
 
@@ -238,6 +239,12 @@ class Watchdog:
             f"nominal operation{beyond})"
         )
 
+    def __repr__(self) -> str:
+        """Return the detector, the sensors and the promise in a line."""
+        detector = self._handle.state["name"] or type(self._handle.detector).__name__
+        sensors = counted(len(self.sensors), "sensor(s)")
+        return f"Watchdog({detector}, {sensors}: {self.promise})"
+
     def reset(self) -> None:
         """Begin a new episode, without an alarm."""
         self._live.reset()
@@ -316,7 +323,8 @@ class Watchdog:
         TrajectoryError
             For an array of another length, which is a mistake of the caller and no fault.
         UsageError
-            For a time stamp without a rate, or one of an action alone.
+            For a time stamp without a rate, or one of an action alone, and for a reading of a
+            sensor that is none of `sensors`.
         """
         rate = self.settings.rate
         if (time is not None and not rate) or (acted is not None and time is None):
@@ -325,6 +333,7 @@ class Watchdog:
                 "fitted with rate=, observations in a second, and acted needs time"
             )
         if isinstance(observation, Mapping):
+            check_known("sensor", self.sensors, *observation)
             observation = [observation.get(name, math.nan) for name in self.sensors]
         return self._judged(self._measured(observation), action, time, acted)
 

@@ -361,7 +361,7 @@ class Results(Sequence[Record]):
     def _row(self, name: str) -> Setting:
         if name or len(self.rows) == 1:
             return row_named(self.records, name or self.rows[0])
-        raise UsageError(f"{len(self.rows)} rows, expected the name of one: {', '.join(self.rows)}")
+        raise UsageError(f"{len(self.rows)} rows, expected row= as one of {', '.join(self.rows)}")
 
     def _episodes(self, records: Sequence[Record]) -> Iterator[list[ScoredEpisode]]:
         """Yield all episodes of each record. An environment is opened once, which takes long."""

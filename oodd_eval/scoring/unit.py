@@ -1,5 +1,6 @@
 """Score one unit: take kept scores, or fit and score in a worker, and check all that comes back."""
 
+import inspect
 import secrets
 import traceback
 import warnings
@@ -243,7 +244,7 @@ class GroupedScoring:
                 f"{type(detector).__name__} cannot be copied after its fit, so that it is fitted "
                 "again for each group of episodes: define __getstate__ and __setstate__ to save "
                 "that time",
-                stacklevel=2,
+                stacklevel=_callers_level(),
             )
             return self._fitted()
 
@@ -306,6 +307,14 @@ class GroupedScoring:
             sensors = len(self._job.data.sensors)
             named[part].append(explanations.check_named(array, parts[part][i], sensors, where))
         return self._whole(ScoreFile(parts, {}, named))
+
+
+def _callers_level() -> int:
+    """Return the `stacklevel` at which a warning names the line that has called this package."""
+    frame, level = inspect.currentframe(), 0
+    while frame and str(frame.f_globals.get("__name__")).startswith("oodd_eval."):
+        frame, level = frame.f_back, level + 1
+    return level  # this function's frame is one of them
 
 
 class _Visible(TrajectorySequence):
