@@ -179,10 +179,10 @@ def test_many_findings_are_folded_and_few_are_not():
     nets = [make_record(f"net-{i}", values={"auc_matched": [0.4, 0.4]}) for i in range(9)]
     records = [*nets, make_record("clock", values={"auc_matched": [0.6, 0.6]})]
     assert "<details><summary><b>9 times" in rendered(records)
-    assert rendered(records).count("- clock beats net-") == 9
+    assert rendered(records).count("- clock has a higher mean matched AUC than net-") == 9
     few = rendered([*nets[:2], records[-1]])
     assert "<details>" not in few
-    assert few.count("**clock beats net-") == 2
+    assert few.count("**clock has a higher mean matched AUC than net-") == 2
 
 
 # Tables
@@ -279,7 +279,7 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
 
 def test_a_simple_row_that_wins_is_named_for_both_metrics():
     assert tables.findings(Board(example())) == [
-        "rf beats riqn in mean matched AUC: 72.5 against 67.5 over 2 cells."
+        "rf has a higher mean matched AUC than riqn: 72.5 against 67.5 over 2 cells."
     ]
     board = Board([
         make_record("riqn", values={"auc": [0.5, 0.5], "auc_matched": [0.5, 0.5]}),
@@ -292,7 +292,8 @@ def test_a_simple_row_that_wins_is_named_for_both_metrics():
 def test_every_simple_row_is_named_and_the_auc_of_what_knows_the_time_is_no_finding(simple):
     board = Board([make_record(), make_record(simple, values={"auc_matched": [0.7, 0.7]})])
     (sentence,) = tables.findings(board)
-    assert sentence.startswith(f"{simple} beats riqn in mean matched AUC: 70.0 against 50.0")
+    expected = f"{simple} has a higher mean matched AUC than riqn: 70.0 against 50.0"
+    assert sentence.startswith(expected)
     if simple in ("comb", "clock"):
         assert not tables.findings(
             Board([make_record(), make_record(simple, values={"auc": [1.0, 1.0]})])
@@ -402,10 +403,11 @@ def test_compare_says_first_who_is_better_by_scores_and_by_alarms(tmp_path, caps
     ]
     (tmp_path / "records.jsonl").write_text("".join(r.to_json() + "\n" for r in records))
     assert main(["compare", str(tmp_path), "mewma", "rf"]) == 0
-    first, figures, second, *_ = capsys.readouterr().out.splitlines()
+    first, figures, second, steps, *_ = capsys.readouterr().out.splitlines()
     assert first == "rf beats mewma by 20.0 points [20.0, 20.0] in matched AUC on Hopper."
-    assert figures.startswith("matched AUC: mewma 55.0, rf 75.0 %, difference -20.0 [-20.0, -20.0]")
+    assert re.fullmatch(r"matched AUC: mewma 55.0 %, rf 75.0 %, p = [\d.e-]+, 1 cell", figures)
     assert second.startswith("mewma beats rf by 2.0 steps [2.0, 2.0] in delay censored at 5 % on")
+    assert steps.startswith("Delay censored at 5 %: mewma 5.5 steps, rf 7.5 steps, p = ")
 
 
 def test_no_difference_is_shown_where_the_interval_includes_zero():
@@ -415,7 +417,23 @@ def test_no_difference_is_shown_where_the_interval_includes_zero():
     assert compared.low < 0 < compared.high
     text = verdict_of(Board(records))
     assert text.startswith("No difference is shown between mewma and rf in matched AUC on CartPole")
-    assert f": 0.0 points [-{100 * compared.high:.1f}, {100 * compared.high:.1f}], p = 1." in text
+    ends = f"[-{100 * compared.high:.1f}, {100 * compared.high:.1f}]"
+    assert text.endswith(f": 0.0 points {ends}, p = 1 (the interval holds 0, and p is above 0.05).")
+    assert str(compared).count("p = ") == 1
+
+
+@pytest.mark.parametrize(
+    ("low", "p", "why"),
+    [
+        (-0.1, 0.002, "p is at most 0.05, but the interval holds 0"),
+        (0.1, 0.67, "the interval leaves out 0, but p is above 0.05"),
+    ],
+)
+def test_the_verdict_says_which_criterion_fails(low, p, why):
+    compared = compare_rows(rows(mewma=[0.5, 0.6] * 6, rf=[0.7, 0.8] * 6), "rf", "mewma")
+    text = replace(compared, low=low, p=p).verdict
+    assert text.startswith("No difference is shown between rf and mewma")
+    assert text.endswith(f", p = {p:g} ({why}).")
 
 
 def test_the_verdict_on_one_row_is_its_headline_in_words():
@@ -426,7 +444,7 @@ def test_the_verdict_on_one_row_is_its_headline_in_words():
     }
     board = Board([make_record(values=values | {"false_episodes_at_5pct": [0, 0]})])
     assert verdict_of(board) == (
-        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes delay "
+        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes: delay "
         "censored 20.0 steps, missed 50.0 %, false episodes 0.0 %."
     )
     assert verdict_of(Board([make_record(status="oom")])) == ""

@@ -395,7 +395,7 @@ def wins(ranks: RankedBoard) -> Table | None:
 
 
 def findings(board: Board) -> list[str]:
-    """Return a sentence for every detector that a simple row beats, in matched AUC or AUC.
+    """Return a sentence where a simple row has a higher mean than a detector: matched AUC or AUC.
 
     The AUC of what knows the time alone is left out: the clock's is 1 by construction.
     Without twins it is the metric that ranks.
@@ -408,11 +408,11 @@ def findings(board: Board) -> list[str]:
         names = [board.ranking]
         names += ["auc"] * (board.paired and simple.detector not in BLIND)
         for info in map(metric_info, names):
-            value, beaten, cells = board.compare(simple, entry, info.name)
-            if value > beaten:
+            value, lower, cells = board.compare(simple, entry, info.name)
+            if value > lower:
                 sentences.append(
-                    f"{simple} beats {entry} in mean {info.title}: {info.text(value)} against "
-                    f"{info.text(beaten)} over {counted(cells, 'cell(s)')}."
+                    f"{simple} has a higher mean {info.title} than {entry}: {info.text(value)} "
+                    f"against {info.text(lower)} over {counted(cells, 'cell(s)')}."
                 )
     return sentences
 
