@@ -561,6 +561,7 @@ def verdict_of(board: Board, level: str = "") -> str:
 
 def _in_words(board: Board, entry: Setting, level: str) -> str:
     """Return the headline figures of a row; empty where it has none."""
+
     def figures(*names: str) -> str:
         over = board.environments, board.anomalies
         means = {metric_info(n): board.mean(entry, *over, n).value for n in names}

@@ -499,10 +499,17 @@ def _episodes(board: Board) -> list[str]:
 _PARTS: Final = {"train": "training", "calibration": "calibration", "nominal": "nominal test"}
 
 
-def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
-    """Return what has to stand below a ranking; not `whole` without columns of lead and alarms."""
-    rows = ranks.standings
-    lines = [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
+def ranking_notes(
+    ranks: RankedBoard, *, whole: bool = True, rows: Sequence[Standing] = ()
+) -> list[str]:
+    """Return what has to stand below a ranking.
+
+    Not `whole` is one without columns of lead and alarms and without text above it. `rows` are
+    those that are printed, by default all.
+    """
+    rows = rows or ranks.standings
+    lines = [] if whole else [_RANK]
+    lines += [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
     if not all(row.primary for row in rows):
         lines.append(
             "A variant is a further row of a detector. It has the rank that it would have, and "
@@ -545,6 +552,12 @@ def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
             "share a letter may well differ."
         )
     return lines
+
+
+_RANK: Final = (
+    "Rank is 1 + the number of primary rows that are significantly better, so ranks need not "
+    "follow the means."
+)
 
 
 def by_metric(
