@@ -485,7 +485,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     mixed = Board([few, calibrated("pe", 30, "score")])
     table = tables.guaranteed(mixed)
     assert "at 5 %" in table.title
-    assert cells(table, 0) == dict.fromkeys(table.header, "") | {"detector": "rf"}
+    assert cells(table, 0) == dict.fromkeys(table.header, "\N{EN DASH}") | {"detector": "rf"}
     assert f"Undefined for rf: missed, false episodes, early ({reason})." in table.note
     chosen = next(
         t for t in Report([few], level="at_10pct").sections[0].tables if "Guar" in t.title

@@ -173,6 +173,7 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
     reason = "(30 calibration episodes; 38 needed at 5 %, or --level 10)."
     undefined = f"Undefined for mewma, rf: guaranteed alarms at 5 % {reason}"
     assert undefined in table_titled(records, "Separability").note
+    assert table_titled(records, "Separability").note.endswith("So all rows are shown at 10 %.")
     assert not [text for text in findings_of(board) if "calibration" in text]
     # One row with a statistic that takes half as many episodes does not leave the others blank.
     one = log_record(
@@ -182,6 +183,15 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
         alarm="score",
     )
     assert Board([*records, one]).alarm_ranking == "delay_censored_at_10pct"
+    # What is said of that row alone has the level that it has among the others.
+    (of_one,) = Report([*records, one], detector="pe").sections
+    assert "in at most 10 % of nominal episodes: " in of_one.verdict
+    assert of_one.notes == [undefined, "So all rows are shown at 10 %."]
+    (asked,) = Report([*records, one], detector="pe", level="at_5pct").sections
+    assert "in at most 5 % of nominal episodes: " in asked.verdict
+    assert not asked.notes
+    strict = Report(records, level="at_1pct").sections[0].tables[0]
+    assert strict.title == "Separability (%, higher is better)"
     assert Board([one]).alarm_ranking == "delay_censored_at_5pct"
     assert "calibration" not in table_titled([one], "Separability").note
 
@@ -437,7 +447,7 @@ def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):
         assert main(["compare", now, "--against", now, "--by", by]) == 0
     capsys.readouterr()
     assert main(["compare", now, "mewma", "rf"]) == 0
-    assert "pooled AUC: mewma 66.7, rf 50.0" in capsys.readouterr().out
+    assert "pooled AUC: mewma 66.7 %, rf 50.0 %" in capsys.readouterr().out
 
 
 def test_a_single_figure_is_no_table_by_anomaly():

@@ -237,7 +237,7 @@ def guaranteed(
     if f"delay_censored_{suffix}" in names:
         note = f"{note} {CENSORED}"
     if asked != suffix:
-        note = " ".join([note, *missing_level(board, asked)])
+        note = " ".join([note, *lowered_level(board, asked, suffix)])
     return by_metric(board, title, columns, standings, note)
 
 
@@ -250,6 +250,14 @@ def missing_level(board: Board, suffix: str) -> list[str]:
     level = f"guaranteed alarms at {100 * catalogue.LEVELS[suffix]:g} %"
     column = Mean(level, f"false_episodes_{suffix}", board.environments, board.anomalies)
     return reasons(board, board.entries, [column])
+
+
+def lowered_level(board: Board, asked: str, level: str) -> list[str]:
+    """Return which rows have no figures at a level, and that another stands for all rows."""
+    lacking = missing_level(board, asked)
+    if level != asked and lacking:
+        lacking.append(f"So all rows are shown at {100 * catalogue.LEVELS[level]:g} %.")
+    return lacking
 
 
 def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool = False) -> Table:
