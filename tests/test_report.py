@@ -17,7 +17,7 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
-from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.metrics.catalogue import PAPER, metric_info
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.evaluate import Rules, cell_metrics
@@ -52,7 +52,7 @@ TITLES = {  # by the start of a title: columns of labels, and one number: row, c
     "Separability": (1, "riqn", "mean", "67.5"),
     "Guaranteed alarms at 5 % (%)": (1, "riqn", "found within 20", "50.0"),
     "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
-    f"{PAPER} (delays in steps)": (1, "riqn", "delay", "3.2"),
+    f"{PAPER} (delays in steps, the rest as shares)": (1, "riqn", "delay", "3.2"),
     f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sensor": (
         2,
         "Hopper",
@@ -272,6 +272,20 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     drawn = [drawn_cell("hopper", 0, contribution(r, "auc_matched")) for r in records]
     assert (value.low, value.high) == pytest.approx(bounds(sample_cells(drawn), 0.45, [2]))
     assert value.value == pytest.approx((0.5 + 0.4) / 2)
+
+
+def test_columns_are_explained_below_the_first_table_and_that_of_the_papers_alarm():
+    values = ("auc_matched", "auc_smoothed", "delay", "delay_null", "far", "far_twin")
+    text = rendered([make_record(values={name: [0.5, 0.5] for name in values})])
+    assert "\nsmoothed = matched AUC of scores after one moving average" in text
+    assert "(delays in steps, the rest as shares)" in text
+    assert "delay null = steps to the first alarm on the nominal twin: what false" in text
+    assert "FAR twin = false-alarm rate over whole nominal twins." in text
+
+
+def test_no_zero_has_a_sign():
+    for name in ("far", "auc", "delay"):
+        assert "-" not in metric_info(name).text(-1e-9)
 
 
 # Findings and notes

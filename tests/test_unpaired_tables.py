@@ -147,6 +147,9 @@ def test_the_headline_has_its_columns_in_order_and_those_that_no_record_has_are_
         "false alarms per hour",
     ]
     assert table.title.endswith("at 5 %")
+    assert table.note.startswith("pooled AUC = anomalous rows against")
+    assert "; null = nominal test episodes against" in table.note
+    assert "; events found = share of anomalous intervals in which an alarm begins." in table.note
     assert [row[0] for row in table.rows] == ["mewma", "rf", "clock"]
     assert column(table, "pooled AUC") == {"mewma": "66.7", "rf": "50.0", "clock": "50.0"}
     assert re.fullmatch(r"16\.7 \[\d.*, \d.*\]", column(table, "false episodes (≤ 5 %)")["rf"])
@@ -426,6 +429,15 @@ def test_show_prints_stored_records_and_one_detector(tmp_path, capsys):
         main(["show", str(tmp_path), "--stored", "--detector", "rf", "--metric", "auc_rows"]) == 0
     )
     assert "rf: AUC of rows (%) by anomaly" in capsys.readouterr().out
+
+
+def test_the_papers_alarm_is_refused_without_twins(tmp_path, capsys):
+    text = "".join(r.to_json() + "\n" for r in two_environments())
+    (tmp_path / "records.jsonl").write_text(text)
+    assert main(["show", str(tmp_path), "--stored", "--paper"]) == 4
+    assert (
+        "--paper is for splits with twins, and these results have none" in capsys.readouterr().err
+    )
 
 
 def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):

@@ -151,6 +151,8 @@ _ALARMS: Final = (
 _PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
 """Columns of the paper's alarm."""
 
+_PAPERS_NULLS: Final = ("delay_null", "far_twin")
+
 _LABELS: Final = ("rank", "detector", "settings")
 
 
@@ -177,13 +179,18 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     """
     columns = _by_group(board, "mean", intervals=intervals)
     over = board.environments, board.anomalies
-    columns += [Mean(n, f"auc_{n}", *over, intervals) for n in ("smoothed", "unpaired")]
+    columns += [Mean(n[4:], n, *over, intervals) for n in _BESIDE_MATCHED]
     columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
     entries = best_first(board)
     rows = [[str(entry), *texts(board, entry, columns)] for entry in entries]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    note = " ".join(filter(None, [unranked(board), *reasons(board, entries, columns)]))
+    beside = {c.title: c.metric for c in columns if c.metric in board.present(_BESIDE_MATCHED)}
+    notes = [explained(beside), unranked(board), *reasons(board, entries, columns)]
+    note = " ".join(filter(None, notes))
     return Table(title, ["detector", *(c.title for c in columns)], rows, note=note)
+
+
+_BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
 
 
 def unranked(board: Board) -> str:
@@ -264,7 +271,15 @@ def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool 
     """Return what the paper's alarm does, mean over cells, under a heading of its own."""
     names = board.present(_PAPER)
     columns = over_all(board, names, names if intervals else (), short=True)
-    return by_metric(board, f"{PAPER} (delays in steps)", columns, standings)
+    note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
+    title = f"{PAPER} (delays in steps, the rest as shares)"
+    return by_metric(board, title, columns, standings, note)
+
+
+def explained(columns: Mapping[str, str]) -> str:
+    """Return what columns show, from the catalogue's summaries of their metrics."""
+    meanings = (f"{title} = {metric_info(metric).meaning}" for title, metric in columns.items())
+    return f"{'; '.join(meanings)}." if columns else ""
 
 
 def attribution(

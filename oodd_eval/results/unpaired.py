@@ -80,7 +80,14 @@ class UnpairedTables:
         title = "Separability (%, higher is better)"
         title += " and guaranteed alarms" * bool(self._present(alarms, environments))
         note = tables.CENSORED if self._present([f"delay_censored_{self._level}"]) else ""
+        if not environments:
+            note = " ".join(filter(None, [self._explained(alarms[0]), note]))
         return self._of_metrics(title, (*POOLED, *alarms), environments, note)
+
+    def _explained(self, intervals_found: str) -> str:
+        """Return what the columns show that no other table has."""
+        names = {_heading(name): name for name in self._present((*POOLED[:2], intervals_found))}
+        return tables.explained(names)
 
     def outcomes(self) -> Table | None:
         """Return what is found of episodes known by their outcome alone; None without any."""
@@ -168,7 +175,7 @@ class UnpairedTables:
         columns = []
         for name in self._present(names, environments):
             info = metric_info(name)
-            text = "null" if name == POOLED[1] else info.noun
+            text = _heading(name)
             text += " (steps)" if info.unit == "steps" else ""
             text += f" (≤ {level})" if name.startswith("false_episodes") else ""
             columns.append(Mean(text, name, *over, self.intervals or info.interval == "exact"))
@@ -196,6 +203,11 @@ class UnpairedTables:
         value = nan_mean(mean.value for mean in known)
         run = sum(mean.cells for mean in means)
         return Value(value, state=state, cells=run, partial=partial)
+
+
+def _heading(name: str) -> str:
+    """Return the heading of a metric's column."""
+    return "null" if name == POOLED[1] else metric_info(name).noun
 
 
 def phase_findings(board: Board) -> list[str]:
