@@ -18,6 +18,7 @@ from oodd_eval.leaderboard.entry import SuiteSection, sections
 from oodd_eval.leaderboard.published import (
     board_of,
     neighbours,
+    neighbours_notes,
     placement,
     published_bytes,
     rankings,
@@ -276,6 +277,48 @@ def test_place_says_where_a_run_stands(shipped, tmp_path, capsys):
     assert "mine" not in capsys.readouterr().out
     assert main(["leaderboard", "place", directory, "-q"]) == 0
     assert "Ranking" not in capsys.readouterr().out
+
+
+def test_a_place_over_few_cells_says_how_many_rows_share_it(shipped):
+    mine = row("mine", 0.85, places=PLACES[:1])
+    (first, *_) = board_command._sentences(placement(mine, shipped), {})
+    assert first.startswith("mine, over 1 of 4 cells: rank 2 (shared by 3 rows) by separability, ")
+    clock = row("clock", 0.85, plugin="oodd-eval:trivial")
+    beside = dataclasses.replace(
+        shipped,
+        records=[*shipped.records, *clock],
+        trust=shipped.trust | {Setting("clock"): "re-run"},
+        primary=shipped.primary | {Setting("clock")},
+    )
+    (first, *_) = board_command._sentences(placement(mine, beside), {})
+    assert "rank 2 (shared by 4 rows, 1 of them trivial: it says nothing) by separability" in first
+    (whole, *_) = board_command._sentences(placement(row("mine", 0.85), beside), {})
+    assert whole.startswith("mine: rank 2 by separability, rank ")
+
+
+def test_notes_of_a_place_speak_of_printed_rows_and_stand_once(
+    shipped, tmp_path, capsys, monkeypatch
+):
+    directory = run_of([*row("mine", 0.7), *row("other", 0.65)], tmp_path / "out")
+    assert main(["leaderboard", "place", directory]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.count("Paired differences over the same test episodes") == 1
+    assert "Rank is 1 + the number of primary rows that are significantly better" in text
+    assert "others stand below, in brackets the rank" in text
+    monkeypatch.setattr(board_command, "NEARBY", 0)
+    assert main(["leaderboard", "place", directory]) == 0
+    assert "others stand below" not in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_tie_whose_interval_leaves_out_zero_has_its_reason(shipped):
+    placed = placement(row("mine", 0.7), shipped)
+    tests = [dataclasses.replace(test, p_holm=0.2) for test in placed.ranks.ranking.comparisons]
+    ranking = dataclasses.replace(placed.ranks.ranking, comparisons=tests)
+    table = neighbours(placed.ranks._replace(ranking=ranking), Setting("mine"))
+    assert [line[-1] for line in table.rows] == ["tie (Holm)", "tie (Holm)", "worse", "better"]
+    assert "Holm's correction for all pairs" in neighbours_notes([table])[1]
+    assert len(neighbours_notes([neighbours(placed.ranks, Setting("mine"))])) == 1
+    assert neighbours_notes([]) == []
 
 
 def test_place_prints_the_rows_nearby_unless_all_are_asked_for(

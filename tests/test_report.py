@@ -17,7 +17,7 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
-from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.metrics.catalogue import PAPER, metric_info
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.evaluate import Rules, cell_metrics
@@ -52,7 +52,7 @@ TITLES = {  # by the start of a title: columns of labels, and one number: row, c
     "Separability": (1, "riqn", "mean", "67.5"),
     "Guaranteed alarms at 5 % (%)": (1, "riqn", "found within 20", "50.0"),
     "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
-    f"{PAPER} (delays in steps)": (1, "riqn", "delay", "3.2"),
+    f"{PAPER} (delays in steps, the rest as shares)": (1, "riqn", "delay", "3.2"),
     f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sensor": (
         2,
         "Hopper",
@@ -179,10 +179,10 @@ def test_many_findings_are_folded_and_few_are_not():
     nets = [make_record(f"net-{i}", values={"auc_matched": [0.4, 0.4]}) for i in range(9)]
     records = [*nets, make_record("clock", values={"auc_matched": [0.6, 0.6]})]
     assert "<details><summary><b>9 times" in rendered(records)
-    assert rendered(records).count("- clock beats net-") == 9
+    assert rendered(records).count("- clock has a higher mean matched AUC than net-") == 9
     few = rendered([*nets[:2], records[-1]])
     assert "<details>" not in few
-    assert few.count("**clock beats net-") == 2
+    assert few.count("**clock has a higher mean matched AUC than net-") == 2
 
 
 # Tables
@@ -274,12 +274,26 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     assert value.value == pytest.approx((0.5 + 0.4) / 2)
 
 
+def test_columns_are_explained_below_the_first_table_and_that_of_the_papers_alarm():
+    values = ("auc_matched", "auc_smoothed", "delay", "delay_null", "far", "far_twin")
+    text = rendered([make_record(values={name: [0.5, 0.5] for name in values})])
+    assert "\nsmoothed = matched AUC of scores after one moving average" in text
+    assert "(delays in steps, the rest as shares)" in text
+    assert "delay null = steps to the first alarm on the nominal twin: what false" in text
+    assert "FAR twin = false-alarm rate over whole nominal twins." in text
+
+
+def test_no_zero_has_a_sign():
+    for name in ("far", "auc", "delay"):
+        assert "-" not in metric_info(name).text(-1e-9)
+
+
 # Findings and notes
 
 
 def test_a_simple_row_that_wins_is_named_for_both_metrics():
     assert tables.findings(Board(example())) == [
-        "rf beats riqn in mean matched AUC: 72.5 against 67.5 over 2 cells."
+        "rf has a higher mean matched AUC than riqn: 72.5 against 67.5 over 2 cells."
     ]
     board = Board([
         make_record("riqn", values={"auc": [0.5, 0.5], "auc_matched": [0.5, 0.5]}),
@@ -292,7 +306,8 @@ def test_a_simple_row_that_wins_is_named_for_both_metrics():
 def test_every_simple_row_is_named_and_the_auc_of_what_knows_the_time_is_no_finding(simple):
     board = Board([make_record(), make_record(simple, values={"auc_matched": [0.7, 0.7]})])
     (sentence,) = tables.findings(board)
-    assert sentence.startswith(f"{simple} beats riqn in mean matched AUC: 70.0 against 50.0")
+    expected = f"{simple} has a higher mean matched AUC than riqn: 70.0 against 50.0"
+    assert sentence.startswith(expected)
     if simple in ("comb", "clock"):
         assert not tables.findings(
             Board([make_record(), make_record(simple, values={"auc": [1.0, 1.0]})])
@@ -402,10 +417,11 @@ def test_compare_says_first_who_is_better_by_scores_and_by_alarms(tmp_path, caps
     ]
     (tmp_path / "records.jsonl").write_text("".join(r.to_json() + "\n" for r in records))
     assert main(["compare", str(tmp_path), "mewma", "rf"]) == 0
-    first, figures, second, *_ = capsys.readouterr().out.splitlines()
+    first, figures, second, steps, *_ = capsys.readouterr().out.splitlines()
     assert first == "rf beats mewma by 20.0 points [20.0, 20.0] in matched AUC on Hopper."
-    assert figures.startswith("matched AUC: mewma 55.0, rf 75.0 %, difference -20.0 [-20.0, -20.0]")
+    assert re.fullmatch(r"matched AUC: mewma 55.0 %, rf 75.0 %, p = [\d.e-]+, 1 cell", figures)
     assert second.startswith("mewma beats rf by 2.0 steps [2.0, 2.0] in delay censored at 5 % on")
+    assert steps.startswith("Delay censored at 5 %: mewma 5.5 steps, rf 7.5 steps, p = ")
 
 
 def test_no_difference_is_shown_where_the_interval_includes_zero():
@@ -415,7 +431,23 @@ def test_no_difference_is_shown_where_the_interval_includes_zero():
     assert compared.low < 0 < compared.high
     text = verdict_of(Board(records))
     assert text.startswith("No difference is shown between mewma and rf in matched AUC on CartPole")
-    assert f": 0.0 points [-{100 * compared.high:.1f}, {100 * compared.high:.1f}], p = 1." in text
+    ends = f"[-{100 * compared.high:.1f}, {100 * compared.high:.1f}]"
+    assert text.endswith(f": 0.0 points {ends}, p = 1 (the interval holds 0, and p is above 0.05).")
+    assert str(compared).count("p = ") == 1
+
+
+@pytest.mark.parametrize(
+    ("low", "p", "why"),
+    [
+        (-0.1, 0.002, "p is at most 0.05, but the interval holds 0"),
+        (0.1, 0.67, "the interval leaves out 0, but p is above 0.05"),
+    ],
+)
+def test_the_verdict_says_which_criterion_fails(low, p, why):
+    compared = compare_rows(rows(mewma=[0.5, 0.6] * 6, rf=[0.7, 0.8] * 6), "rf", "mewma")
+    text = replace(compared, low=low, p=p).verdict
+    assert text.startswith("No difference is shown between rf and mewma")
+    assert text.endswith(f", p = {p:g} ({why}).")
 
 
 def test_the_verdict_on_one_row_is_its_headline_in_words():
@@ -426,7 +458,7 @@ def test_the_verdict_on_one_row_is_its_headline_in_words():
     }
     board = Board([make_record(values=values | {"false_episodes_at_5pct": [0, 0]})])
     assert verdict_of(board) == (
-        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes delay "
+        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes: delay "
         "censored 20.0 steps, missed 50.0 %, false episodes 0.0 %."
     )
     assert verdict_of(Board([make_record(status="oom")])) == ""
@@ -467,7 +499,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     mixed = Board([few, calibrated("pe", 30, "score")])
     table = tables.guaranteed(mixed)
     assert "at 5 %" in table.title
-    assert cells(table, 0) == dict.fromkeys(table.header, "") | {"detector": "rf"}
+    assert cells(table, 0) == dict.fromkeys(table.header, "\N{EN DASH}") | {"detector": "rf"}
     assert f"Undefined for rf: missed, false episodes, early ({reason})." in table.note
     chosen = next(
         t for t in Report([few], level="at_10pct").sections[0].tables if "Guar" in t.title

@@ -147,6 +147,9 @@ def test_the_headline_has_its_columns_in_order_and_those_that_no_record_has_are_
         "false alarms per hour",
     ]
     assert table.title.endswith("at 5 %")
+    assert table.note.startswith("pooled AUC = anomalous rows against")
+    assert "; null = nominal test episodes against" in table.note
+    assert "; events found = share of anomalous intervals in which an alarm begins." in table.note
     assert [row[0] for row in table.rows] == ["mewma", "rf", "clock"]
     assert column(table, "pooled AUC") == {"mewma": "66.7", "rf": "50.0", "clock": "50.0"}
     assert re.fullmatch(r"16\.7 \[\d.*, \d.*\]", column(table, "false episodes (≤ 5 %)")["rf"])
@@ -173,6 +176,7 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
     reason = "(30 calibration episodes; 38 needed at 5 %, or --level 10)."
     undefined = f"Undefined for mewma, rf: guaranteed alarms at 5 % {reason}"
     assert undefined in table_titled(records, "Separability").note
+    assert table_titled(records, "Separability").note.endswith("So all rows are shown at 10 %.")
     assert not [text for text in findings_of(board) if "calibration" in text]
     # One row with a statistic that takes half as many episodes does not leave the others blank.
     one = log_record(
@@ -182,6 +186,15 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
         alarm="score",
     )
     assert Board([*records, one]).alarm_ranking == "delay_censored_at_10pct"
+    # What is said of that row alone has the level that it has among the others.
+    (of_one,) = Report([*records, one], detector="pe").sections
+    assert "in at most 10 % of nominal episodes: " in of_one.verdict
+    assert of_one.notes == [undefined, "So all rows are shown at 10 %."]
+    (asked,) = Report([*records, one], detector="pe", level="at_5pct").sections
+    assert "in at most 5 % of nominal episodes: " in asked.verdict
+    assert not asked.notes
+    strict = Report(records, level="at_1pct").sections[0].tables[0]
+    assert strict.title == "Separability (%, higher is better)"
     assert Board([one]).alarm_ranking == "delay_censored_at_5pct"
     assert "calibration" not in table_titled([one], "Separability").note
 
@@ -435,6 +448,15 @@ def test_show_prints_stored_records_and_one_detector(tmp_path, capsys):
     assert "rf: AUC of rows (%) by anomaly" in capsys.readouterr().out
 
 
+def test_the_papers_alarm_is_refused_without_twins(tmp_path, capsys):
+    text = "".join(r.to_json() + "\n" for r in two_environments())
+    (tmp_path / "records.jsonl").write_text(text)
+    assert main(["show", str(tmp_path), "--stored", "--paper"]) == 4
+    assert (
+        "--paper is for splits with twins, and these results have none" in capsys.readouterr().err
+    )
+
+
 def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):
     worse = [
         log_record(r.detector, r.environment, r.anomaly, values=labelled(0.2, 0.2))
@@ -454,7 +476,7 @@ def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):
         assert main(["compare", now, "--against", now, "--by", by]) == 0
     capsys.readouterr()
     assert main(["compare", now, "mewma", "rf"]) == 0
-    assert "pooled AUC: mewma 66.7, rf 50.0" in capsys.readouterr().out
+    assert "pooled AUC: mewma 66.7 %, rf 50.0 %" in capsys.readouterr().out
 
 
 def test_a_single_figure_is_no_table_by_anomaly():

@@ -22,7 +22,9 @@ from oodd_eval.leaderboard.published import (
     PublishedBoard,
     board_of,
     neighbours,
+    neighbours_notes,
     placement,
+    printed_name,
     rankings,
     read_published,
 )
@@ -35,6 +37,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
 from oodd_eval.results.render.text import markdown_section, print_prose, print_sections
 from oodd_eval.results.report import Section
+from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import overview, thresholds
 from oodd_eval.results.tables import Table
 
@@ -103,11 +106,14 @@ def place_run(options: Options) -> int:
             of_ranks = rankings(placed.ranks, trust, placed.rows)
             if not options.everything:
                 of_ranks = list(map(_nearby, of_ranks))
-            compared = (
-                neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str)
-            )
-            of_ranks += [table for table in compared if table]
-            notes = tables.ranking_notes(placed.ranks, whole=False)
+            names = {line[1] for table in of_ranks for line in table.rows}
+            standings = placed.ranks.standings
+            printed = [s for s in standings if printed_name(s, placed.rows) in names]
+            beside = (neighbours(placed.ranks, row) for row in sorted(new or placed.rows, key=str))
+            compared = [table for table in beside if table]
+            of_ranks += compared
+            notes = neighbours_notes(compared)
+            notes += tables.ranking_notes(placed.ranks, whole=False, rows=printed)
         output.print(
             Section(
                 f"Your rows on the leaderboard, {board}",
@@ -156,8 +162,13 @@ def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
     """Return a sentence on the rank of each row, and what is to be known of it."""
     lines = []
     for standing in (s for s in placed.ranks.standings if s.entry in placed.rows):
-        row, ranks = standing.entry, map(_rank, (standing.rank, standing.alarm_rank))
-        text = "{}: {} by separability, {} by guaranteed alarms.".format(row, *ranks)
+        row, over = standing.entry, ""
+        by_scores, by_alarms = _rank(standing.rank), _rank(standing.alarm_rank)
+        if placed.cells != placed.expected:
+            over = f", over {len(placed.cells)} of {counted(len(placed.expected), 'cell(s)')}"
+            by_scores += _shared(standing, placed.ranks.standings, "rank")
+            by_alarms += _shared(standing, placed.ranks.standings, "alarm_rank")
+        text = f"{row}{over}: {by_scores} by separability, {by_alarms} by guaranteed alarms."
         if row in placed.published:
             text += f" It has the numbers of that row of entry {entries[row]}, and its place."
         elif row in placed.replaced:
@@ -181,6 +192,20 @@ def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
 
 def _rank(rank: int | None) -> str:
     return "no rank" if rank is None else f"rank {rank}"
+
+
+def _shared(standing: Standing, standings: Sequence[Standing], kind: str) -> str:
+    """Return in brackets how many rows share a rank, and that it says nothing among trivial ones.
+
+    Rows below the ranking do not count, nor trivial ones beside a row that is trivial itself.
+    """
+    rank = getattr(standing, kind)
+    same = [s for s in standings if rank and getattr(s, kind) == rank and not s.below]
+    if len(same) < 2:
+        return ""
+    trivial = sum(s.trivial for s in same) * (not standing.trivial)
+    among = f", {trivial} of them trivial: it says nothing" * (trivial > 0)
+    return f" (shared by {len(same)} rows{among})"
 
 
 class _Output:

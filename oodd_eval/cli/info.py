@@ -144,14 +144,19 @@ def _anomaly(info: AnomalyInfo) -> Lines:
             yield f"strength in {environment}", f"0 to {bound:g} ({unit}): not calibrated"
             continue
         rungs = rungs_of(environment, info.id)
-        ends = f"{rungs['kept99'].strength:.3g} to {[*rungs.values()][-1].strength:.3g}"
-        strongest = [*rungs][-1]
-        text = f"{ends} ({unit_of(environment, info.id)}): kept99 to {strongest}"
+        ends = [f"{rungs[name].strength:.3g}" for name in (["kept99", [*rungs][-1]])]
+        strengths, names = map(_range, (ends, ["kept99", [*rungs][-1]]))
+        text = f"{strengths} ({unit_of(environment, info.id)}): {names}"
         yield f"strength in {environment}", text
 
 
+def _range(ends: list[str]) -> str:
+    """Return the first to the last, once where they are one."""
+    return " to ".join(dict.fromkeys(ends))
+
+
 _BETTER: Final = {"higher": "higher is better", "lower": "lower is better", "": "neither"}
-_UNITS: Final = {"percent": "a share, printed in percent", "steps": "rows", "rate": "a number"}
+_UNITS: Final = {"percent": "a share, printed in percent", "steps": "steps", "rate": "a number"}
 _CELLS: Final = {"paired": "with twins", "unpaired": "without twins", "": "with and without twins"}
 
 

@@ -107,6 +107,8 @@ def run(options: Options) -> int:
     environments, anomalies = split.select(options.env, options.anomaly)
     if options.row_metrics and not any(_lacks_twins(split, name) for name in environments):
         raise UsageError(f"--row-metrics is for splits without twins, unlike split {split.name}")
+    if options.paper and all(_lacks_twins(split, name) for name in environments):
+        raise UsageError(f"--paper is for splits with twins, unlike split {split.name}")
     plan = make_plan(
         plugins,
         split=split,

@@ -33,6 +33,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
+from oodd_eval.results.unpaired import ROWS
 
 _format_options: Final = together(
     *(
@@ -72,23 +73,8 @@ def show(options: Options) -> int:
 
     The exit code is 1 when one of the cells failed.
     """
-    if options.alarm and options.stored:
-        raise UsageError(
-            f"--alarm {options.alarm} computes figures that --stored would not show: leave out one"
-        )
-    if options.metric:
-        check_known("metric", NAMES, options.metric)
     layout = _format(options)
-    if options.stored:
-        refuse(options, ["split", "row_metrics"], "is for computing, and --stored computes nothing")
-    if not options.detector:
-        refuse(options, ["metric"], "is of the table of one detector: name it with --detector")
-    if layout:
-        refuse(options, ["wide"], "is for the terminal: a format has all metrics")
-    if options.detector:
-        refuse(options, ["wide"], "prints tables of all detectors: leave out --detector")
-    if layout and not layout.tables:
-        refuse(options, ["metric"], "is of a table, and that format has all metrics of a cell")
+    _check(options, layout)
     results = ResultsDirectory(options.directory)
     records = results.records()
     known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
@@ -106,6 +92,10 @@ def show(options: Options) -> int:
     say_notes(results.notes)
     if options.row_metrics and records and all(r.paired for r in records):
         raise UsageError("--row-metrics is for splits without twins, and these results have twins")
+    if options.paper and records and not any(r.paired for r in records):
+        raise UsageError("--paper is for splits with twins, and these results have none")
+    if options.row_metrics and not any(name in r.metrics for r in records for name in ROWS):
+        say("--row-metrics adds nothing: no episode of these results has known anomalous rows")
     if not records:
         return say(f"no records in {options.directory} are selected", 5)
     code = int(not all(r.ok for r in records))
@@ -137,6 +127,29 @@ def show(options: Options) -> int:
         reporter.failures(records)
     reporter.console.print(summary(records))
     return code
+
+
+def _check(options: Options, layout: Format | None) -> None:
+    """Refuse options that would do nothing beside others."""
+    if options.alarm and options.stored:
+        raise UsageError(
+            f"--alarm {options.alarm} computes figures that --stored would not show: leave out one"
+        )
+    if options.metric:
+        check_known("metric", NAMES, options.metric)
+    if options.stored:
+        refuse(options, ["split", "row_metrics"], "is for computing, and --stored computes nothing")
+    if not options.detector:
+        refuse(options, ["metric"], "is of the table of one detector: name it with --detector")
+    if layout:
+        refuse(options, ["wide"], "is for the terminal: a format has all metrics")
+        refuse(options, ["paper"], "is for the terminal: a format has the paper's alarm anyway")
+    if options.detector:
+        every = "prints tables of all detectors: leave out --detector"
+        refuse(options, ["wide", "paper"], every)
+    if layout and not layout.tables:
+        refuse(options, ["metric"], "is of a table, and that format has all metrics of a cell")
+        refuse(options, ["level"], "is of tables, and that format has all levels of a cell")
 
 
 def _format(options: Options) -> Format | None:

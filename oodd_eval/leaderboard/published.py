@@ -299,6 +299,11 @@ def _lacking(records: Sequence[Record], expected: set[tuple[str, str]]) -> str:
     return " and ".join(parts)
 
 
+def printed_name(row: Standing, marked: Collection[Setting] = ()) -> str:
+    """Return the name of a row as rankings print it, of those `marked` with `MARK`."""
+    return f"{MARK * (row.entry in marked)}{row.entry}{row.marks}"
+
+
 def rankings(
     ranks: RankedBoard, trust: Mapping[Setting, str], marked: Collection[Setting] = ()
 ) -> list[Table]:
@@ -320,8 +325,8 @@ def rankings(
             label = str(row.entry)
             letters = ranking.letters(str(row.clone_of or row.entry))
             rank = f"{row.printed(ranking.ranks.get(label))} {letters}".rstrip()
-            name = f"{MARK * (row.entry in marked)}{label}{row.marks}"
-            lines.append((row.entry, [rank, name, *texts(ranks.board, row.entry, columns)]))
+            labels = [rank, printed_name(row, marked)]
+            lines.append((row.entry, [*labels, *texts(ranks.board, row.entry, columns)]))
         return lines
 
     by_separability = rows(ranks.standings, ranks.ranking, by_scores.name)
@@ -387,14 +392,30 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
         above = [name for name in order[:here] if name in tests][-1:]
         below = [name for name in order[here:] if name in tests][:1]
         for neighbour in (*above, *below):
-            better = "better" if tests[neighbour].better else "tie"
-            verdict = "worse" if neighbour in worse else better
-            difference = _difference(tests[neighbour], metric)
+            test = tests[neighbour]
+            tie = HOLM if test.low > 0 or test.high < 0 else "tie"
+            verdict = "worse" if neighbour in worse else "better" if test.better else tie
+            difference = _difference(test, metric)
             lines.append([title, neighbour, str(ranking.ranks[neighbour]), difference, verdict])
     header = ["metric", "against", "rank", "difference", "verdict"]
-    note = "Paired differences over the same test episodes, this row minus the other."
     title = f"{row} and the rows next to it"
-    return Table(title, header, lines, labels=2, note=note) if lines else None
+    return Table(title, header, lines, labels=2) if lines else None
+
+
+HOLM: Final = "tie (Holm)"
+"""A verdict: the interval leaves out 0, but the corrected p-value is too large."""
+
+
+def neighbours_notes(compared: Iterable[Table]) -> list[str]:
+    """Return what has to stand once below tables of `neighbours`."""
+    verdicts = [line[-1] for table in compared for line in table.rows]
+    notes = ["Paired differences over the same test episodes, this row minus the other."]
+    if HOLM in verdicts:
+        notes.append(
+            f"{HOLM}: the interval leaves out 0, but after Holm's correction for all pairs of rows "
+            "the difference is not significant."
+        )
+    return notes if verdicts else []
 
 
 def _difference(test: PairTest, metric: str) -> str:

@@ -32,7 +32,7 @@ LEVELS: Final[Mapping[str, float]] = MappingProxyType(
 """Largest share of nominal episodes with an alarm, by the suffix of the metrics at this level."""
 
 HEADLINE: Final = "at_5pct"  # suffix of the level that tables show
-PAPER: Final = "The paper's alarm: about one in ten rows is false"
+PAPER: Final = "The paper's alarm: meant to be false in about one row in ten"
 """Heading of all figures of alarms at the paper's threshold."""
 
 FOUND_WITHIN: Final = (20, 100)  # rows from the effect on within which an episode counts as found
@@ -111,11 +111,19 @@ class MetricInfo:
         if math.isnan(value):
             return UNDEFINED
         if self.unit == "percent":
-            return f"{100 * value:.1f}"
+            return f"{100 * value:z.1f}"
         if self.unit == "steps" or value >= 10:
-            return f"{value:.1f}"
-        return f"{value:.3f}"
+            return f"{value:z.1f}"
+        return f"{value:z.3f}"
 
+    @property
+    def meaning(self) -> str:
+        """The summary without the alarm that it is of, for tables whose heading names it."""
+        return self.summary.partition(f"; {_PROMISE}")[0].removesuffix(f" ({_PAPERS})")
+
+
+_PAPERS: Final = "the paper's alarm"
+_PROMISE: Final = "at a threshold that promises"
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -127,7 +135,7 @@ def _facts(table: str) -> dict[str, MetricInfo]:
         | {"range": tuple(row["range"]), "short": row["title"]}
         | {
             "title": row["title"] + ", paper's alarm" * row.get("paper", False),
-            "summary": "the paper's alarm: " * row.get("paper", False) + row["summary"],
+            "summary": row["summary"] + f" ({_PAPERS})" * row.get("paper", False),
         }
         for row in _TABLES[table]
     )
@@ -189,8 +197,7 @@ def metric_info(name: str) -> MetricInfo:
         info,
         name=name,
         title=f"{info.title} at {percent}",
-        summary=f"{info.summary}; at a threshold that promises an alarm in at most {percent} of "
-        "nominal episodes",
+        summary=f"{info.summary}; {_PROMISE} an alarm in at most {percent} of nominal episodes",
         null=f"{info.null}_{suffix}" if info.null else "",
         level=percent,
     )

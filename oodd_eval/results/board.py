@@ -52,8 +52,8 @@ class Conditions:
 class Value(NamedTuple):
     """A mean over some cells and its interval, NaN where undefined or not asked for.
 
-    `state` is the status of the first failed cell, without which there is a value; `partial` says
-    that expected cells are missing in it, `brief` that all of the cells are brief.
+    `state` is the status of the first failed cell, without which there is a value; `cells` are
+    those that were run, `partial` says that expected ones are missing, `brief` that all are brief.
     """
 
     value: float = NAN
@@ -173,7 +173,7 @@ class Board:
         records = [of_row[i] for i in indices]
         blank = Value(
             state=next((r.status for r in records if not r.ok), ""),
-            cells=sum(not r.ok or metric in r.metrics for r in records),
+            cells=len(records),
             partial=0 < len(cells) < len(chosen),
             brief=bool(records) and all(r.brief for r in records),
         )

@@ -140,8 +140,16 @@ class Report:
     def _of_detector(self, board: Board) -> Section:
         title = f"{self.detector} on split {board.split}"
         rows = [r for r in board.records if r.detector == self.detector]
-        verdict = verdict_of(Board(rows), self.level) if rows else ""
-        return Section(title, tables=list(self._tables_of_detector(board)), verdict=verdict)
+        # The board may have a weaker level than the row alone, for its other rows.
+        level = self.level or board.level
+        verdict = verdict_of(Board(rows), level) if rows else ""
+        lowered = level != HEADLINE and not self.level
+        return Section(
+            title,
+            tables=list(self._tables_of_detector(board)),
+            notes=tables.lowered_level(board, HEADLINE, level) if lowered else (),
+            verdict=verdict,
+        )
 
     def _tables_of_detector(self, board: Board) -> Iterator[Table]:
         for entry in (e for e in board.entries if e.detector == self.detector):

@@ -403,7 +403,8 @@ class PairedComparison:
     def verdict(self) -> str:
         """One sentence: which row is better and by how much, or that no difference is shown.
 
-        A difference is shown where the interval leaves out 0 and the p-value is at most 0.05.
+        A difference is shown where the interval leaves out 0 and the p-value is at most 0.05;
+        where it is not, the sentence says which of the two fails.
         """
         info = metric_info(self.metric)
         sign = -1 if (self.difference < 0) != (info.better == "lower") else 1
@@ -416,23 +417,30 @@ class PairedComparison:
         where = f"in {info.phrase} {in_words(self.environments)}".rstrip()
         if ends[0] > 0 and self.p <= ALPHA:
             return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {where}."
-        but = " but" * (ends[0] > 0)
+        if ends[0] > 0:
+            why = f"the interval leaves out 0, but p is above {ALPHA:g}"
+        elif self.p <= ALPHA:
+            why = f"p is at most {ALPHA:g}, but the interval holds 0"
+        else:
+            why = f"the interval holds 0, and p is above {ALPHA:g}"
         return (
             f"No difference is shown between {rows[0]} and {rows[1]} {where}: "
-            f"{amount}{unit} [{low}, {high}],{but} p = {self.p:.2g}."
+            f"{amount}{unit} [{low}, {high}], p = {self.p:.2g} ({why})."
         )
 
     def __str__(self) -> str:
-        """Return the verdict, and below it the figures."""
-        info = metric_info(self.metric)
-        figures = *self.values, self.difference, self.low, self.high
-        first, second, difference, low, high = map(info.text, figures)
-        unit = " %" if info.unit == "percent" else ""
+        """Return the verdict, and below it both means, and p where the verdict lacks it."""
+        info, verdict = metric_info(self.metric), self.verdict
+        first, second = map(info.text, self.values)
+        unit = _UNITS.get(info.unit, "")
+        p = "" if " p = " in verdict else f"p = {self.p:.2g}, "
         return (
-            f"{self.verdict}\n{info.title}: {self.first} {first}, {self.second} {second}{unit}, "
-            f"difference {difference} [{low}, {high}], p = {self.p:.2g}, "
-            f"{counted(self.cells, 'cell(s)')}"
+            f"{verdict}\n{info.title}: {self.first} {first}{unit}, {self.second} {second}{unit}, "
+            f"{p}{counted(self.cells, 'cell(s)')}"
         )
+
+
+_UNITS: Final = {"percent": " %", "steps": " steps"}
 
 
 def in_words(environments: Sequence[str]) -> str:
@@ -553,13 +561,12 @@ def verdict_of(board: Board, level: str = "") -> str:
 
 def _in_words(board: Board, entry: Setting, level: str) -> str:
     """Return the headline figures of a row; empty where it has none."""
-    units = {"percent": " %", "steps": " steps"}
 
     def figures(*names: str) -> str:
         over = board.environments, board.anomalies
         means = {metric_info(n): board.mean(entry, *over, n).value for n in names}
         return ", ".join(
-            f"{info.noun} {info.text(mean)}{units.get(info.unit, '')}"
+            f"{info.noun} {info.text(mean)}{_UNITS.get(info.unit, '')}"
             for info, mean in means.items()
             if not math.isnan(mean)
         )
@@ -567,7 +574,7 @@ def _in_words(board: Board, entry: Setting, level: str) -> str:
     alarms = figures(*(f"{name}_{level}" for name in _IN_WORDS))
     if alarms:
         percent = f"{100 * LEVELS[level]:g} %"
-        alarms = f"with alarms in at most {percent} of nominal episodes {alarms}"
+        alarms = f"with alarms in at most {percent} of nominal episodes: {alarms}"
     parts = "; ".join(filter(None, [figures(board.ranking), alarms]))
     return f"{entry} {in_words(board.environments)}: {parts}." if parts else ""
 

@@ -151,6 +151,8 @@ _ALARMS: Final = (
 _PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
 """Columns of the paper's alarm."""
 
+_PAPERS_NULLS: Final = ("delay_null", "far_twin")
+
 _LABELS: Final = ("rank", "detector", "settings")
 
 
@@ -177,13 +179,18 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     """
     columns = _by_group(board, "mean", intervals=intervals)
     over = board.environments, board.anomalies
-    columns += [Mean(n, f"auc_{n}", *over, intervals) for n in ("smoothed", "unpaired")]
+    columns += [Mean(n[4:], n, *over, intervals) for n in _BESIDE_MATCHED]
     columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
     entries = best_first(board)
     rows = [[str(entry), *texts(board, entry, columns)] for entry in entries]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    note = " ".join(filter(None, [unranked(board), *reasons(board, entries, columns)]))
+    beside = {c.title: c.metric for c in columns if c.metric in board.present(_BESIDE_MATCHED)}
+    notes = [explained(beside), unranked(board), *reasons(board, entries, columns)]
+    note = " ".join(filter(None, notes))
     return Table(title, ["detector", *(c.title for c in columns)], rows, note=note)
+
+
+_BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
 
 
 def unranked(board: Board) -> str:
@@ -237,7 +244,7 @@ def guaranteed(
     if f"delay_censored_{suffix}" in names:
         note = f"{note} {CENSORED}"
     if asked != suffix:
-        note = " ".join([note, *missing_level(board, asked)])
+        note = " ".join([note, *lowered_level(board, asked, suffix)])
     return by_metric(board, title, columns, standings, note)
 
 
@@ -252,11 +259,27 @@ def missing_level(board: Board, suffix: str) -> list[str]:
     return reasons(board, board.entries, [column])
 
 
+def lowered_level(board: Board, asked: str, level: str) -> list[str]:
+    """Return which rows have no figures at a level, and that another stands for all rows."""
+    lacking = missing_level(board, asked)
+    if level != asked and lacking:
+        lacking.append(f"So all rows are shown at {100 * catalogue.LEVELS[level]:g} %.")
+    return lacking
+
+
 def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool = False) -> Table:
     """Return what the paper's alarm does, mean over cells, under a heading of its own."""
     names = board.present(_PAPER)
     columns = over_all(board, names, names if intervals else (), short=True)
-    return by_metric(board, f"{PAPER} (delays in steps)", columns, standings)
+    note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
+    title = f"{PAPER} (delays in steps, the rest as shares)"
+    return by_metric(board, title, columns, standings, note)
+
+
+def explained(columns: Mapping[str, str]) -> str:
+    """Return what columns show, from the catalogue's summaries of their metrics."""
+    meanings = (f"{title} = {metric_info(metric).meaning}" for title, metric in columns.items())
+    return f"{'; '.join(meanings)}." if columns else ""
 
 
 def attribution(
@@ -395,7 +418,7 @@ def wins(ranks: RankedBoard) -> Table | None:
 
 
 def findings(board: Board) -> list[str]:
-    """Return a sentence for every detector that a simple row beats, in matched AUC or AUC.
+    """Return a sentence where a simple row has a higher mean than a detector: matched AUC or AUC.
 
     The AUC of what knows the time alone is left out: the clock's is 1 by construction.
     Without twins it is the metric that ranks.
@@ -408,11 +431,11 @@ def findings(board: Board) -> list[str]:
         names = [board.ranking]
         names += ["auc"] * (board.paired and simple.detector not in BLIND)
         for info in map(metric_info, names):
-            value, beaten, cells = board.compare(simple, entry, info.name)
-            if value > beaten:
+            value, lower, cells = board.compare(simple, entry, info.name)
+            if value > lower:
                 sentences.append(
-                    f"{simple} beats {entry} in mean {info.title}: {info.text(value)} against "
-                    f"{info.text(beaten)} over {counted(cells, 'cell(s)')}."
+                    f"{simple} has a higher mean {info.title} than {entry}: {info.text(value)} "
+                    f"against {info.text(lower)} over {counted(cells, 'cell(s)')}."
                 )
     return sentences
 
@@ -499,10 +522,17 @@ def _episodes(board: Board) -> list[str]:
 _PARTS: Final = {"train": "training", "calibration": "calibration", "nominal": "nominal test"}
 
 
-def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
-    """Return what has to stand below a ranking; not `whole` without columns of lead and alarms."""
-    rows = ranks.standings
-    lines = [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
+def ranking_notes(
+    ranks: RankedBoard, *, whole: bool = True, rows: Sequence[Standing] = ()
+) -> list[str]:
+    """Return what has to stand below a ranking.
+
+    Not `whole` is one without columns of lead and alarms and without text above it. `rows` are
+    those that are printed, by default all.
+    """
+    rows = rows or ranks.standings
+    lines = [] if whole else [_RANK]
+    lines += [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
     if not all(row.primary for row in rows):
         lines.append(
             "A variant is a further row of a detector. It has the rank that it would have, and "
@@ -545,6 +575,12 @@ def ranking_notes(ranks: RankedBoard, *, whole: bool = True) -> list[str]:
             "share a letter may well differ."
         )
     return lines
+
+
+_RANK: Final = (
+    "Rank is 1 + the number of primary rows that are significantly better, so ranks need not "
+    "follow the means."
+)
 
 
 def by_metric(

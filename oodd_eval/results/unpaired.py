@@ -1,5 +1,6 @@
 """Tables and sentences of a board whose episodes have no twins."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -76,9 +77,17 @@ class UnpairedTables:
         alarms = self._at_level(*_ALARMS)
         if not self._present((POOLED[-1], alarms[0]), environments):
             return None
-        title = "Separability (%, higher is better) and guaranteed alarms"
+        title = "Separability (%, higher is better)"
+        title += " and guaranteed alarms" * bool(self._present(alarms, environments))
         note = tables.CENSORED if self._present([f"delay_censored_{self._level}"]) else ""
+        if not environments:
+            note = " ".join(filter(None, [self._explained(alarms[0]), note]))
         return self._of_metrics(title, (*POOLED, *alarms), environments, note)
+
+    def _explained(self, intervals_found: str) -> str:
+        """Return what the columns show that no other table has."""
+        names = {_heading(name): name for name in self._present((*POOLED[:2], intervals_found))}
+        return tables.explained(names)
 
     def outcomes(self) -> Table | None:
         """Return what is found of episodes known by their outcome alone; None without any."""
@@ -169,7 +178,7 @@ class UnpairedTables:
         columns = []
         for name in self._present(names, environments):
             info = metric_info(name)
-            text = "null" if name == POOLED[1] else info.noun
+            text = _heading(name)
             text += " (steps)" if info.unit == "steps" else ""
             text += f" (≤ {level})" if name.startswith("false_episodes") else ""
             columns.append(Mean(text, name, *over, self.intervals or info.interval == "exact"))
@@ -177,7 +186,8 @@ class UnpairedTables:
         title += f": {', '.join(environments)}" if environments else ""
         asked = self.level or catalogue.HEADLINE
         if f"false_episodes_{asked}" not in [c.metric for c in columns]:
-            note = " ".join(filter(None, [note, *tables.missing_level(self.board, asked)]))
+            lowered = tables.lowered_level(self.board, asked, self._level)
+            note = " ".join(filter(None, [note, *lowered]))
         return self._of(title, columns, note)
 
     def _of(self, title: str, columns: Sequence[Mean], note: str = "") -> Table:
@@ -190,11 +200,17 @@ class UnpairedTables:
         """Return a row's mean over environments, each counting once."""
         board = self.board
         means = [board.mean(entry, [e], board.anomalies, board.ranking) for e in self._compared]
-        known = [mean for mean in means if mean.cells]
+        known = [mean for mean in means if mean.state or not math.isnan(mean.value)]
         state = next((mean.state for mean in known if mean.state), "")
         partial = 0 < len(known) < len(means) or any(mean.partial for mean in known)
         value = nan_mean(mean.value for mean in known)
-        return Value(value, state=state, cells=len(known), partial=partial)
+        run = sum(mean.cells for mean in means)
+        return Value(value, state=state, cells=run, partial=partial)
+
+
+def _heading(name: str) -> str:
+    """Return the heading of a metric's column."""
+    return "null" if name == POOLED[1] else metric_info(name).noun
 
 
 def phase_findings(board: Board) -> list[str]:

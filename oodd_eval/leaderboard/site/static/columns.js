@@ -7,7 +7,7 @@ const BESIDE = ["auc_null", "auc_placebo", "auc_pool_null", "delay_null", "found
 const isMarked = (metric, kind) =>
   !BESIDE.some((name) => metric.startsWith(name)) && (kind === "percent" || metric.includes("_at_"));
 
-const PAPERS_ALARM = "The paper\u2019s alarm: about one in ten rows is false";
+const PAPERS_ALARM = "The paper\u2019s alarm: meant to be false in about one row in ten";
 
 /** Metrics of the paper's alarm. */
 const PAPERS = ["delay", "delay_null", "delay_censored", "missed", "far", "far_twin"];
