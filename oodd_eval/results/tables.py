@@ -306,8 +306,10 @@ def attribution(
 def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
     """Return AUC, delay and false-alarm rate by environment: the paper's Table 5.
 
-    There is a table for each horizon and group of anomalies.
+    There is a table for each horizon and group of anomalies, and none where records lack all three.
     """
+    if not board.present(("auc", "delay", "far")):
+        return []
     groups = filter(board.in_group, GROUPS)
     everything = itertools.product(board.horizons, groups)
     return [_anomaly_group(board, h, group, intervals=intervals) for h, group in everything]
