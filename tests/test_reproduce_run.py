@@ -43,11 +43,12 @@ def reproduce(split, output, *options, only=ONLY):
 
 
 def contents(directory):
-    """Everything a reader sees, by name: not the scores and logs."""
+    """Everything a reader sees, by name: not scores, logs, and where the split was."""
     return {
         str(path.relative_to(directory)): path.read_bytes()
         for path in sorted(Path(directory).rglob("*"))
-        if path.is_file() and path.parts[len(Path(directory).parts)] not in ("scores", "logs")
+        if path.is_file()
+        and path.parts[len(Path(directory).parts)] not in ("scores", "logs", "splits.json")
     }
 
 

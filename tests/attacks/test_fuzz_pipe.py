@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OoddError
+from oodd_eval.plugins.contract import ignore_progress
 from oodd_eval.plugins.isolation import Channel, ChannelClosedError, ChannelGarbledError, supervisor
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.state import pack
@@ -85,6 +86,7 @@ def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
             os.write(writing, talk)
         os.close(writing)
         settings = {"keep": True, "streamed": bool(len(talk) % 2), "state": None}
+        settings["progress"] = ignore_progress
         unit = supervisor._UnitRun({}, [], Limits(), lambda: False, **settings)
         child, outcome = child_of(reading), unit.outcome
         for name in ("send", "send_array", "send_bytes"):
