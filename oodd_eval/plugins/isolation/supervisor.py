@@ -162,7 +162,8 @@ class _UnitRun:
             child.start = self.start
             try:
                 yield child
-            except ChannelGarbledError:
+            except ChannelGarbledError as error:
+                self.outcome.log += f"{error}\n"
                 reason = "the detector wrote into the pipe between worker and harness"
                 raise GivenUpError("error", reason) from None
             except (ChannelClosedError, ConnectionError):
