@@ -35,7 +35,7 @@ def near(name: object, known: Iterable[str]) -> list[str]:
     >>> near("hoper", ["ant", "hopper"]), near("nonsense", ["components"])
     (['hopper'], [])
     """
-    return difflib.get_close_matches(str(name), dict.fromkeys(known), n=5, cutoff=0.6)
+    return difflib.get_close_matches(str(name), dict.fromkeys(known), n=5, cutoff=0.57)
 
 
 _LISTED = 60  # known names in a message: logs may have thousands of columns
