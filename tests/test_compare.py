@@ -466,7 +466,7 @@ REFERENCES = {
     "quick.jsonl": (
         "npn[h=1,seed=0,members=1,updates=250]",
         "riqn[h=1,seed=0,members=1,updates=250]",
-        "pe-a[h=1,seed=0,members=1,updates=900]",
+        "pe-a[h=1,seed=0,updates=900]",
     ),
 }
 """Files of reference scores, and the settings in them."""
