@@ -215,7 +215,7 @@ def test_the_time_left_is_from_cells_of_this_run_alone():
     for _ in range(4):
         pace.add(140.0, resumed=False)
     assert (pace.done, pace.left(140.0), pace.left(150.0)) == (12, 40.0, 30.0)
-    assert pace.left(200.0) == 0
+    assert math.isnan(pace.left(200.0))  # the last ones take longer than those before
     assert str(display.Pace(16, time.perf_counter(), done=8)) == "8/16 cells, 0:00:00 so far"
 
 

@@ -66,7 +66,7 @@ REFERENCE: Final = 512
 
 
 class Basis(Protocol):
-    """What the scores of calibration episodes say about a score, whatever the row."""
+    """A transformation of scores that calibration episodes decide, the same at every row."""
 
     def __call__(self, scores: Floats) -> Floats:
         """Return what is accumulated, row by row; NaN stays NaN."""

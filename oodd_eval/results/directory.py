@@ -154,10 +154,10 @@ class ResultsDirectory:
         except (SplitNotFoundError, UnknownNameError) as error:
             if path is None and isinstance(error, SplitNotFoundError):
                 raise
-            was = f"{error}" if path is None else f"it was in {path!r}, and is not there any more"
+            cause = str(error) if path is None else f"it was in {path!r}, and is not there any more"
             raise SplitNotFoundError(
-                f"the split {name!r} of these results is not found: {was}; pass --split PATH with "
-                "the directory where it is"
+                f"the split {name!r} of these results is not found: {cause}; pass --split PATH "
+                "with the directory where it is"
             ) from None
 
     def records(self) -> list[Record]:

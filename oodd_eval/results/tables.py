@@ -249,7 +249,7 @@ def guaranteed(
 
 
 CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."
-"""What has to stand below a table with the delay that ranks."""
+"""Sentence below each table with the delay that ranks."""
 
 
 def missing_level(board: Board, suffix: str) -> list[str]:

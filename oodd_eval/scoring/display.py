@@ -43,7 +43,7 @@ class _Running:
 
 @dataclass(slots=True)
 class Pace:
-    """How many cells of a run are done, and from that how long the others will take.
+    """Number of finished cells of a run, and the time for the others at the same speed.
 
     Cells of an earlier run take no time, so that they say nothing of the speed. A unit's cells come
     all at once: between two units the speed stays that of the last.
@@ -67,17 +67,21 @@ class Pace:
             self._fresh, self._latest = self._fresh + 1, now
 
     def left(self, now: float) -> float:
-        """Return the seconds until the end; NaN while no cell of this run is finished."""
+        """Return the seconds until the end; NaN where that is not known.
+
+        No cell of this run may be finished, or its last units take longer than those before.
+        """
         if not self._fresh:
             return math.nan
         each = (self._latest - self.start) / self._fresh
-        return max((self.total - self.done) * each - (now - self._latest), 0.0)
+        left = (self.total - self.done) * each - (now - self._latest)
+        return left if left > 0 or self.done == self.total else math.nan
 
     def __str__(self) -> str:
         """Return a line such as ``8/16 cells, 0:00:32 so far, 0:00:32 left``."""
         now = time.perf_counter()
         spent, left = now - self.start, self.left(now)
-        ahead = "" if math.isnan(left) else f", {timedelta(seconds=round(left))} left"
+        ahead = "" if math.isnan(left) else f", {timedelta(seconds=math.ceil(left))} left"
         return f"{self.done}/{self.total} cells, {timedelta(seconds=int(spent))} so far{ahead}"
 
 
