@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, get_args
 
 from oodd_eval.errors import UsageError
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 """Version of split semantics, metrics and defaults together; a change of any of them bumps it."""
 
 Group = Literal["sensor", "dynamics"]

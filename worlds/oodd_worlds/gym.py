@@ -48,7 +48,7 @@ EQUATIONS: Final[Mapping[str, Callable[[], Equations]]] = {
 }
 
 FADING: Final = 0.99
-"""What is left of an excess after a row."""
+"""Share of an excess that is left after a row."""
 
 EXACT: Final = 1e-4
 """Median change of the rate of turning of a lander without engines, in rad/s, above which its
@@ -63,7 +63,7 @@ class JudgedEpisode(Protocol):
 
 
 class Judge(Protocol):
-    """What was learnt of one environment."""
+    """Noise and ranges learnt from the training part of one environment."""
 
     def begin(self, row: Floats) -> JudgedEpisode:
         """Return an episode after its first row."""
@@ -175,7 +175,7 @@ class LanderJudge:
 
 
 class GymOracle(StorableWindowDetector):
-    """How far a row is from what the true equations and the row's past allow.
+    """Distance of a row from what the true equations and the row's past allow.
 
     Acrobot and CartPole: the largest standardized chart of the innovations of an extended Kalman
     filter, whose noise is that of the sensors in training. LunarLander: the same; without noise, by

@@ -1,4 +1,4 @@
-"""What an engine's impulse does to LunarLander, and the ranges that its dispersion leaves.
+"""Effects of an engine's impulse on LunarLander, and the ranges that its dispersion leaves.
 
 In flight each row's velocities change by gravity and by at most one engine (Gymnasium's
 LunarLander, after Klimov). In the lander's own axes the engine's impulse is its power times a

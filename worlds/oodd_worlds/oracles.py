@@ -420,7 +420,7 @@ def judged(charts: Floats, standards: Floats) -> Floats:
 
 
 class OracleDetector(StorableWindowDetector):
-    r"""How unusual the innovations of a filter with the true equations are.
+    r"""Largest chart of the innovations of a filter with the true equations.
 
     .. math:: s_t = \max_c \frac{c_t - m_c}{q_c}
 

@@ -75,7 +75,7 @@ def similarities(rows: Floats, summary: Floats, bandwidth: float) -> Floats:
 
 
 class DeedeeDetector(StorableWindowDetector):
-    r"""How unusual the mean of the rows so far is, and how unlike training they are.
+    r"""Deviation of the mean of the rows so far from training, plus their distance from it.
 
     .. math:: a_t = \sqrt{\frac{1}{D} \sum_d \Big(\frac{m_{t,d}}{\sigma_d}\Big)^2}, \quad
               b_t = -\log \bar k_t, \quad

@@ -1,4 +1,4 @@
-"""How far from the middle of a Gaussian a learned flow carries a row: logpZO.
+"""The logpZO detector: squared length of a row that a learned flow carried to a Gaussian.
 
 After FAIL-Detect (Xu et al., RSS 2025, arXiv 2503.08558), from the paper alone.
 """

@@ -1,4 +1,4 @@
-"""How the rivals of networks train: initial weights, gradient steps, when to stop."""
+"""Training of the rivals' networks: initial weights, gradient steps, when to stop."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RIDGE: Final = 1e-6
 """Penalty of a linear forecast, relative to the mean square of standardized inputs."""
 
 LOOKS: Final = 25
-"""How often a training looks at the held-out loss."""
+"""Number of times that a training computes the held-out loss."""
 
 
 def draw(shapes: Shapes, seed: int) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What the rivals of trained networks share: fitting, standard units, single steps.
+"""Shared parts of the rivals with trained networks: fitting, standard units, single steps.
 
 Networks are trained in single precision by torch. Rows are judged by NumPy in double precision:
 beside a robot every row is a call of its own, and NumPy's calls take less time.
@@ -65,7 +65,7 @@ class NetworkRival(StorableWindowDetector):
     varying_: NDArray[np.int64]
     """Columns of the sensors that vary in training, the only ones that networks see: (V,)."""
     surprise_: float
-    """What a sensor adds to a sum of squares when it moves and never did: 2 log(episodes + 1).
+    """Term of a sensor that moves and never did in a sum of squares: 2 log(episodes + 1).
 
     The square of the largest normal residual to expect once in that many episodes, about. A sensor
     that was constant by chance must not outweigh all others.

@@ -1,4 +1,4 @@
-"""How much an observation changes what a world model believes: KL surprise of its latent.
+"""The wm-kl-a detector: KL divergence of a world model's latent after and before a row.
 
 After Zollicoffer et al., "Novelty detection in reinforcement learning with world models"
 (arXiv 2310.08731, ICML 2025).
