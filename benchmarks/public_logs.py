@@ -1,15 +1,17 @@
 """Import public logs by their recipes, run shipped rows on them, and fill docs/public-logs.md.
 
-``python benchmarks/public_logs.py --root DIR [--set skab,nab] [--detector mewma,clock]`` takes the
-files of set NAME from DIR/NAME. Cards are written from the comments of the recipes, tables from
-what is run; sets whose folder is missing keep the table that the page has. With ``--check`` the
-page is compared and not written; without ``--root`` it is the cards alone.
+``python benchmarks/public_logs.py --root DIR --results DIR [--set skab] [--detector mewma]`` takes
+the files of set NAME from DIR/NAME, runs all rows, and says on the page what was imported. A
+second call goes on where the first was interrupted. ``oodd-eval compare DIR --write-reference``
+makes of the results the records that are committed in ``leaderboard/suites/logs``.
+
+Without ``--root`` the page is filled: cards from the comments of the recipes, tables from the
+committed records. With ``--check`` it is compared and not written.
 """
 
 import argparse
 import re
 import sys
-import tempfile
 import textwrap
 import time
 import warnings
@@ -21,20 +23,26 @@ from oodd_eval.data.recipe import Recipe
 from oodd_eval.data.shipped_recipes import shipped_recipes
 from oodd_eval.errors import PromiseWarning
 from oodd_eval.results.board import boards
+from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render.text import markdown_table
 from oodd_eval.results.unpaired import UnpairedTables
 from oodd_eval.scoring.doubts import promises_of
 
-PAGE = Path(__file__).parents[1] / "docs" / "public-logs.md"
+ROOT = Path(__file__).parents[1]
+PAGE, RECORDS = ROOT / "docs" / "public-logs.md", ROOT / "leaderboard" / "suites" / "logs"
 
 ORDER = ("skab", "alfa", "rosa", "tep", "cwru", "nab", "ur3", "uci", "lerobot", "pi0")
 """Sets in the order of the page: labelled rows first, outcomes last."""
 
 DETECTORS = (
-    "panel", "mewma", "pca", "knn", "deedee", "mahalanobis", "range", "persistence", "rf", "pe",
-    "clock",
+    "panel", "pe", "riqn", "riqn-r", "n-riqn", "npn", "rf", "rf-ewma", "mewma", "knn", "pca",
+    "deedee", "logpzo", "paano", "rnd", "mahalanobis", "manifold", "range", "persistence", "clock",
+    "comb", "random",
 )  # fmt: skip
-"""Shipped rows; `pe` takes a minute a set, as does `panel` where its networks join."""
+WITH_ACTIONS = ("panel-a", "pe-a", "mewma-a", "logpzo-a", "rpt-a", "wm-kl-a")
+"""Shipped rows; the latter where a set has actions."""
+
+SEEDS = (0, 1, 2)
 
 
 def card(name):
@@ -74,67 +82,71 @@ def _promise(finding):
     return f"{subjects[finding.subject]}: p = {finding.p:.2g}{sensor}"
 
 
-def result(name, root, detectors, work):
-    """Return the tables of a set, what was imported, and what was said of the promise."""
+def run(name, root, detectors, results):
+    """Run rows on a set, and say what was imported and what of it puts the promise in doubt."""
     started = time.perf_counter()
     recipe = Recipe.load(shipped_recipes()[name])
-    split = import_recipe(recipe, root, work / name)
+    split = import_recipe(recipe, root, results / "splits" / name)
     print(f"{name}: imported in {time.perf_counter() - started:.1f} s", file=sys.stderr)
     data = split.environment(recipe.environment)
     parts = {"training": data.train, "calibration": data.calibration, "nominal test": data.twins}
     sizes = [f"{len(part)} {title}" for title, part in parts.items()]
     sizes += [f"{len(data.labelled(anomaly))} {anomaly}" for anomaly in data.anomalies]
     imported = f"Imported here, of a part of the set: {', '.join(sizes)} episodes; digest"
-    paragraphs = [f"{imported} `{split.digest[:12]}`."]
-    paragraphs.append("\n".join(f"- {_promise(finding)}." for finding in promises_of(data)))
+    doubts = "\n".join(f"- {_promise(finding)}." for finding in promises_of(data))
+    names = [n for n in detectors if n not in WITH_ACTIONS or data.actions]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PromiseWarning)  # the lines above say it
-        results = evaluate([*detectors], split, output=work / f"{name}-results")
-    failed = [(record.detector, record.reason) for record in results if not record.ok]
-    assert not failed, failed
-    (board,) = boards([*results])
-    seconds = {record.detector: record.seconds_fit + record.seconds_score for record in results}
-    print(f"{name}: { ({d: round(s, 1) for d, s in seconds.items()}) }", file=sys.stderr)
-    tables = UnpairedTables(board)
-    paragraphs += [
-        re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
-        for table in (tables.headline(), tables.outcomes(), tables.nominal())
-        if table
-    ]
-    return "\n\n".join(paragraphs)
+        records = evaluate(names, split, seed=SEEDS, output=results)
+    failed = [(record.detector, record.reason) for record in records if not record.ok]
+    print(f"{name}: {len(records)} records, failed: {failed or 'none'}", file=sys.stderr)
+    return f"{imported} `{split.digest[:12]}`.\n\n{doubts}"
 
 
-def filled(page, name, tables):
-    """Return the page with one set's card, and its tables where it was run."""
-    for kind, text in (("card", card(name)), ("table", tables.get(name))):
-        if text is None:
-            continue
-        pattern = rf"(<!-- {kind}: {name} -->\n).*?(<!-- end -->)"
-        page, count = re.subn(
-            pattern, lambda m, text=text: f"{m[1]}\n{text}\n\n{m[2]}", page, flags=re.DOTALL
-        )
-        assert count == 1, f"{PAGE} has {count} places for the {kind} of {name}, expected 1"
+def tables_of(records):
+    """Return the tables of each set, as Markdown, by its name."""
+    pages = {}
+    for board in boards(records):
+        (name,) = board.environments
+        tables = UnpairedTables(board)
+        shown = [
+            table for table in (tables.headline(), tables.outcomes(), tables.nominal()) if table
+        ]
+        texts = [re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip() for table in shown]
+        pages[name] = "\n\n".join(texts)
+    return pages
+
+
+def filled(page, **blocks):
+    """Return the page with blocks of some kinds, each given as texts by set."""
+    for kind, texts in blocks.items():
+        for name, text in texts.items():
+            pattern = rf"(<!-- {kind}: {name} -->\n).*?(<!-- end -->)"
+            page, count = re.subn(
+                pattern, lambda m, text=text: f"{m[1]}\n{text}\n\n{m[2]}", page, flags=re.DOTALL
+            )
+            assert count == 1, f"{PAGE} has {count} places for the {kind} of {name}, expected 1"
     return page
 
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, help="folder with a folder of files for each set")
+    parser.add_argument("--results", type=Path, help="with --root: where results are kept")
     parser.add_argument("--set", default=",".join(ORDER), help="names of recipes")
-    parser.add_argument("--detector", default=",".join(DETECTORS), help="names of detectors")
+    parser.add_argument("--detector", default=",".join(DETECTORS + WITH_ACTIONS))
     parser.add_argument("--check", action="store_true", help="write nothing; 1 where it differs")
     options = parser.parse_args(arguments)
     names = options.set.split(",")
     before = PAGE.read_text(encoding="utf-8")
-    page = before
-    with tempfile.TemporaryDirectory() as work:
-        tables = {
-            name: result(name, options.root / name, options.detector.split(","), Path(work))
-            for name in names
-            if options.root and (options.root / name).is_dir()
-        }
-    for name in names:
-        page = filled(page, name, tables)
+    if options.root:
+        present = [name for name in names if (options.root / name).is_dir()]
+        detectors = options.detector.split(",")
+        imported = {n: run(n, options.root / n, detectors, options.results) for n in present}
+        page = filled(before, imported=imported)
+    else:
+        tables = tables_of(ResultsDirectory(RECORDS).records())
+        page = filled(before, card={n: card(n) for n in names}, table=tables)
     if options.check:
         return int(page != before)
     PAGE.write_text(page, encoding="utf-8")

@@ -221,14 +221,14 @@ def test_a_recipe_comes_by_its_name(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", WRITERS)
 def test_the_page_has_the_card_of_the_recipe(name):
     advice = "run python benchmarks/public_logs.py"
-    assert public_logs.filled(public_logs.PAGE.read_text(), name, {}) == (
-        public_logs.PAGE.read_text()
-    ), advice
+    page = public_logs.PAGE.read_text()
+    assert public_logs.filled(page, card={name: public_logs.card(name)}) == page, advice
 
 
 def test_a_changed_card_is_seen():
     page = public_logs.PAGE.read_text()
-    assert public_logs.filled(re.sub("hard about it", "easy", page), "nab", {}) != page
+    card = {"nab": public_logs.card("nab")}
+    assert public_logs.filled(re.sub("hard about it", "easy", page), card=card) != page
 
 
 def test_twins_that_were_made_up_give_no_matched_auc(tmp_path, capsys):

@@ -297,6 +297,7 @@ _SPLITS: Final = (
     SplitDefinition("reduced-paper", 500, 50, 20, None, 5, "paper", "reduced"),
     SplitDefinition("noisy-1", 40, 40, 10, 300, 7, noise=0.01),
     SplitDefinition("noisy-5", 40, 40, 10, 300, 8, noise=0.05),
+    SplitDefinition("ladder-noisy-1", 40, 40, 10, 300, 7, "ladder", "noisy-1", noise=0.01),
     # Of the plug-in oodd_worlds, at the strengths of its ladder.
     SplitDefinition("worlds", 40, 40, 10, None, 9, "ladder", environments=WORLDS),
     SplitDefinition("worlds-standard", 500, 200, 50, None, 9, "ladder", environments=WORLDS),
