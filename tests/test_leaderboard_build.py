@@ -234,6 +234,13 @@ def test_a_page_has_every_table_of_every_board_and_the_entries():
     assert all(f"### {e.meta.id}: An entry" in text for e in entries())
 
 
+def test_a_board_says_who_ran_what():
+    first, second = page(sections(entries())).split("\n## Split mini")[1:]
+    ran = "Run by Somebody (4 detectors). Re-run by us: clock, persistence."
+    assert f"\n{ran} Nobody has run the others again.\n" in first
+    assert "\nRun by Somebody (2 detectors). Nobody has run them again.\n" in second
+
+
 def test_tables_for_programs_have_the_figures_of_the_ranking():
     section = sections(entries())[0]
     lines = lines_of(ranking_csv(section.ranks, section.trust))

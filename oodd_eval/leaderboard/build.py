@@ -212,6 +212,7 @@ def _section(section: LeaderboardSection) -> str:
         f"## {escape(body.title)}\n",
         f"{about_split(board)}\n",
         f"{size} As CSV: {files}.\n",
+        f"{_who_ran(section.entries)}\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
         f"**{escape(body.verdict)}**\n",
         markdown_table(tables.ranking(ranks, section.trust)),
@@ -221,6 +222,25 @@ def _section(section: LeaderboardSection) -> str:
         markdown_body(body),
     ]
     return "\n".join(parts)
+
+
+def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
+    """Return who ran the detectors of a board, and which of them somebody ran or scored again."""
+    ran: dict[str, set[str]] = {}
+    again: dict[tuple[str, str], set[str]] = {}
+    for entry in entries:
+        ran.setdefault(entry.meta.submitter or "nobody named", set()).update(entry.meta.detectors)
+        if entry.grant:
+            of = again.setdefault((entry.grant.trust, entry.grant.by), set())
+            of.update(entry.grant.means or entry.meta.detectors)
+    rows = [f"{who} ({counted(len(names), 'detector(s)')})" for who, names in sorted(ran.items())]
+    parts = [f"Run by {', '.join(rows)}."]
+    for (trust, who), names in sorted(again.items()):
+        parts.append(f"{trust.capitalize()} by {who}: {', '.join(sorted(names))}.")
+    rest = set().union(*ran.values()) - set().union(*again.values())
+    parts += ["Nobody has run the others again."] if again and rest else []
+    parts += [] if again else ["Nobody has run them again."]
+    return escape(" ".join(parts))
 
 
 def _suite(section: SuiteSection) -> str:
