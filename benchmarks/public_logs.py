@@ -105,15 +105,17 @@ def run(name, root, detectors, results):
 
 def tables_of(records):
     """Return the tables of each set, as Markdown, by its name."""
+    sets = {Recipe.load(path).environment: name for name, path in shipped_recipes().items()}
     pages = {}
     for board in boards(records):
-        (name,) = board.environments
+        (environment,) = board.environments
         tables = UnpairedTables(board)
-        shown = [
-            table for table in (tables.headline(), tables.outcomes(), tables.nominal()) if table
+        texts = [
+            re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
+            for table in (tables.headline(), tables.outcomes(), tables.nominal())
+            if table
         ]
-        texts = [re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip() for table in shown]
-        pages[name] = "\n\n".join(texts)
+        pages[sets[environment]] = "\n\n".join(texts)
     return pages
 
 

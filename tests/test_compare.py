@@ -516,6 +516,16 @@ def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
     assert not ran
 
 
+def test_a_record_keeps_those_of_the_chosen_metrics_that_it_has(tmp_path):
+    """Logs with labelled rows have other metrics than those whose outcome alone is known."""
+    terms = {"far": [0.1, 0.2], "auc_rows": [0.8, 0.6]}
+    one = make_record("rf", "ant", "iid", values=terms)
+    other = make_record("rf", "ant", "drift", values={"far": terms["far"]})
+    write_reference([one, other], tmp_path / "r.jsonl", keep=[*terms])
+    kept = {r.anomaly: {*r.per_trajectory} for r in read_record_set(tmp_path / "r.jsonl").records}
+    assert kept == {"iid": {"far", "auc_rows"}, "drift": {"far"}}
+
+
 @pytest.mark.parametrize(("ending", "magic"), [("gz", b"\x1f\x8b"), ("xz", b"\xfd7zXZ")])
 def test_a_reference_keeps_the_terms_of_chosen_metrics_alone(tmp_path, ending, magic):
     values = {"auc_matched": [0.8, 0.6], "far_twin": [0.1, 0.2]}

@@ -86,7 +86,8 @@ def compare(options: Options) -> int:
     if options.write_reference:
         if not now.records:
             return say(f"no record of {options.results} is selected: no reference written", 5)
-        keep = select("metric", options.keep, NAMES) if options.keep else ()
+        present = dict.fromkeys(name for record in now.records for name in record.metrics)
+        keep = select("metric", options.keep, present) if options.keep else ()
         write_reference(now.records, options.write_reference, keep=keep)
         if options.verbosity >= 0:
             print(f"{counted(len(now.records), 'cell(s)')} written to {options.write_reference}")

@@ -247,7 +247,8 @@ def _suite(section: SuiteSection) -> str:
     """Return what rows find on a further test suite, with a link to all tables."""
     address = f"{SUITES}/{section.name}/{PAGE}"
     several = len({row.horizon for row in section.board.entries}) > 1
-    texts = TEXTS["suites"]["graded" if section.graded else "horizons" if several else "nominal"]
+    kind = "graded" if section.graded else "horizons" if several else "nominal"
+    texts = TEXTS["suites"][kind if section.board.paired else "logs"]
     title = f"## {texts['title']}: {escape(_title(section.board))}\n"
     text = texts["text"].format(split=escape(section.board.split), place=address)
     return "\n".join([title, text, *map(markdown_table, section.tables[:1])])
