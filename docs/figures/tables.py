@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from oodd_eval.leaderboard.entry import read_entries, read_grants
+from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
@@ -89,10 +89,10 @@ def by_environment(name: str) -> str:
         return mean("mini", row, metric, environments=[name], anomalies=group)
 
     pairs = [
-        ", ".join(f"{value(row, 'auc_matched', group):.1f}" for row in ("pe", "pe-a"))
+        ", ".join(f"{value(row, 'auc_matched', group):.1f}" for row in ("panel", "pe-a"))
         for group in (sensor, dynamics)
     ]
-    missed = (value(row, "missed_at_5pct", dynamics) for row in ("mewma-a", "pe", "pe-a"))
+    missed = (value(row, "missed_at_5pct", dynamics) for row in ("mewma-a", "panel", "pe-a"))
     return " | ".join([*pairs, *(f"{share:.0f}" for share in missed)])
 
 
@@ -109,17 +109,6 @@ def at_horizons(name: str) -> str:
     return cells(mean("horizons", Setting(name, h), m) for m in HEADLINE for h in (1, 10, 20))
 
 
-def run_again(name: str) -> str:
-    """Return the means of a row's entry and of its re-run, in turn."""
-    means = {
-        row: pairs
-        for g in read_grants(BOARD / "results").values()
-        for row, pairs in g.means.items()
-    }
-    units = {"auc_matched": 100, "false_episodes_at_5pct": 100, "delay_censored_at_5pct": 1}
-    return cells(unit * value for metric, unit in units.items() for value in means[name][metric])
-
-
 def under_noise(name: str) -> str:
     """Return three metrics of a detector, each without noise and with two amounts of it."""
     metrics = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
@@ -128,10 +117,10 @@ def under_noise(name: str) -> str:
 
 
 def of_protocols(name: str) -> str:
-    """Return matched AUC under protocol 1, from the archive, and today."""
-    archive = (ROOT / "docs" / "archive" / "protocol-1.md").read_text(encoding="utf-8")
-    mini = archive.split("## Board of mini")[1].split("## Board of reduced")[0]
-    (old,) = re.findall(rf"\| {name}(?: \(trivial\))? \| Δ=1(?:, 3 seeds)? \| ([\d.]+) ", mini)
+    """Return matched AUC under protocol 2, from the archive, and today."""
+    archive = (ROOT / "docs" / "archive" / "protocol-2.md").read_text(encoding="utf-8")
+    mini = archive.split("## Board of mini")[1].split("\n## ")[0]
+    (old,) = re.findall(rf"\| {name} \| Δ=1(?:, 3 seeds)? \| [a-z-]+ \| ([\d.]+) ", mini)
     return f"{old} → {100 * float(ranking('mini')[name]['auc_matched']):.1f}"
 
 
@@ -195,7 +184,6 @@ TABLES: dict[str, Row] = {
     "environments": by_environment,
     "papers": by_group,
     "horizons": at_horizons,
-    "run again": run_again,
     "noise": under_noise,
     "protocols": of_protocols,
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
@@ -214,7 +202,7 @@ def filled(page: str) -> str:
         texts = []
         for line in match["rows"].splitlines():
             label = line.split("|")[1].strip()
-            named = re.match(r"`([a-z0-9-]+)`", label)  # behind the name may stand a description
+            named = re.match(r"`([A-Za-z0-9:._-]+)`", label)  # behind the name may stand a description
             texts.append(f"| {label} | {row(named[1] if named else label)} |\n")
         return match["head"] + "".join(texts)
 
