@@ -44,7 +44,7 @@ NOT_RUN = [
         "gets a robot that others published",
     ),
     Rule(
-        r"^rm -rf dist$|^python -m build$|^\.ci/check-dist", "test_packaging builds and tries both"
+        r"^rm -rf dist$|^python -m build$|\.ci/check-dist", "test_packaging builds and tries both"
     ),
     Rule(r"^(mkdir|cp) ", "moves what a command of PARSED_ONLY would have made"),
     Rule(r"^(dask |dask-)", "servers that stay; test_executors starts them"),
