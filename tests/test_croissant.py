@@ -84,7 +84,7 @@ def test_mlcroissant_reads_the_metadata_of_mini(tmp_path):
 
 
 def test_committed_metadata_are_those_of_the_committed_split():
-    """`oodd-eval data export mini --format croissant --output FOLDER` writes them, with a new day."""
+    """`oodd-eval data export mini --format croissant --output FOLDER` writes them, of today."""
     committed = json.loads((SHIPPED / "mini" / "croissant.json").read_text())
     split = load_split(SHIPPED / "mini")
     assert committed == croissant.describe(split, day=committed["datePublished"])

@@ -202,7 +202,8 @@ def filled(page: str) -> str:
         texts = []
         for line in match["rows"].splitlines():
             label = line.split("|")[1].strip()
-            named = re.match(r"`([A-Za-z0-9:._-]+)`", label)  # behind the name may stand a description
+            # Behind the name may stand a description.
+            named = re.match(r"`([A-Za-z0-9:._-]+)`", label)
             texts.append(f"| {label} | {row(named[1] if named else label)} |\n")
         return match["head"] + "".join(texts)
 
