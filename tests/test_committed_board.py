@@ -88,12 +88,10 @@ def test_every_number_of_the_committed_board_comes_from_its_records(
 def test_nominal_twins_look_alike_to_every_row_in_every_environment(committed):
     """Matched AUC of one twin against another: chance, unless the harness leaks something."""
     for board in (section.ranks.board for section in committed):
-        for row in board.entries:
-            for environment in board.environments:
-                placebo = board.mean(
-                    row, [environment], board.anomalies, "auc_placebo", intervals=True
-                )
-                assert placebo.low <= 0.5 <= placebo.high, (str(row), environment, placebo)
+        ran = dict.fromkeys((r.setting, r.environment) for r in board.records)
+        for row, environment in ran:  # an oracle has some environments alone
+            placebo = board.mean(row, [environment], board.anomalies, "auc_placebo", intervals=True)
+            assert placebo.low <= 0.5 <= placebo.high, (str(row), environment, placebo)
 
 
 @pytest.mark.artefacts
