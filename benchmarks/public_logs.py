@@ -6,7 +6,7 @@ second call goes on where the first was interrupted. ``oodd-eval compare DIR --w
 makes of the results the records that are committed in ``leaderboard/suites/logs``.
 
 Without ``--root`` the page is filled: cards from the comments of the recipes, tables from the
-committed records. With ``--check`` it is compared and not written.
+committed records where there are some. With ``--check`` it is compared and not written.
 """
 
 import argparse
@@ -139,6 +139,8 @@ def main(arguments=None):
     parser.add_argument("--detector", default=",".join(DETECTORS + WITH_ACTIONS))
     parser.add_argument("--check", action="store_true", help="write nothing; 1 where it differs")
     options = parser.parse_args(arguments)
+    if bool(options.root) != bool(options.results):
+        parser.error("--root is where the files are, --results where results go: give both")
     names = options.set.split(",")
     before = PAGE.read_text(encoding="utf-8")
     if options.root:
@@ -147,7 +149,7 @@ def main(arguments=None):
         imported = {n: run(n, options.root / n, detectors, options.results) for n in present}
         page = filled(before, imported=imported)
     else:
-        tables = tables_of(ResultsDirectory(RECORDS).records())
+        tables = tables_of(ResultsDirectory(RECORDS).records()) if RECORDS.is_dir() else {}
         page = filled(before, card={n: card(n) for n in names}, table=tables)
     if options.check:
         return int(page != before)

@@ -57,6 +57,7 @@ NOT_RUN = [
 """Commands that no test of this module runs."""
 
 PARSED_ONLY = [
+    Rule(r"^oodd-eval compare RESULTS\b", "needs results on files that others published"),
     Rule(r"leaderboard verify --changed-against", "needs a repository; test_changes makes one"),
     Rule(r"^oodd-eval data build (standard|paper|reduced)\b", "hours of simulation"),
     Rule(r"^oodd-eval data (build ladder|calibrate)\b", "minutes of simulation; test_ladder"),

@@ -237,8 +237,8 @@ def test_a_page_has_every_table_of_every_board_and_the_entries():
 def test_a_board_says_who_ran_what():
     first, second = page(sections(entries())).split("\n## Split mini")[1:]
     ran = "Run by Somebody (4 detectors). Re-run by us: clock, persistence."
-    assert f"\n{ran} Nobody has run the others again.\n" in first
-    assert "\nRun by Somebody (2 detectors). Nobody has run them again.\n" in second
+    assert f"\n{ran} Nobody has run or scored the others again.\n" in first
+    assert "\nRun by Somebody (2 detectors). Nobody has run or scored them again.\n" in second
 
 
 def test_tables_for_programs_have_the_figures_of_the_ranking():

@@ -87,7 +87,7 @@ def compare(options: Options) -> int:
         if not now.records:
             return say(f"no record of {options.results} is selected: no reference written", 5)
         present = dict.fromkeys(name for record in now.records for name in record.metrics)
-        keep = select("metric", options.keep, present) if options.keep else ()
+        keep = select("metric of these results", options.keep, present) if options.keep else ()
         write_reference(now.records, options.write_reference, keep=keep)
         if options.verbosity >= 0:
             print(f"{counted(len(now.records), 'cell(s)')} written to {options.write_reference}")

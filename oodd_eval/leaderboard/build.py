@@ -238,8 +238,8 @@ def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
     for (trust, who), names in sorted(again.items()):
         parts.append(f"{trust.capitalize()} by {who}: {', '.join(sorted(names))}.")
     rest = set().union(*ran.values()) - set().union(*again.values())
-    parts += ["Nobody has run the others again."] if again and rest else []
-    parts += [] if again else ["Nobody has run them again."]
+    parts += ["Nobody has run or scored the others again."] if again and rest else []
+    parts += [] if again else ["Nobody has run or scored them again."]
     return escape(" ".join(parts))
 
 
