@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 pytest.importorskip("gymnasium")
 from oodd_recording import build
@@ -53,6 +55,16 @@ def test_two_workers_and_smaller_chunks_give_the_same_bytes(built, tmp_path, mon
     monkeypatch.setattr(build, "CHUNK", {"train": 1, "calibration": 2, "test": 1})
     build_split(SMALL, tmp_path / "again", jobs=2, **FEW)
     assert digest(tmp_path / "again") == digest(built)
+
+
+def test_every_x86_processor_with_avx2_records_with_the_same_kernels():
+    """In the worker, whose environment is set before NumPy is imported there."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("not a processor of x86")
+    with build.workers(1) as pool:
+        (library,) = pool.submit(threadpool_info).result()
+    assert library["architecture"] in ("Haswell", "Zen"), library
+    assert library["num_threads"] == 1
 
 
 def test_a_built_split_holds_what_recording_gives(built):

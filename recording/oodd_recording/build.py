@@ -23,6 +23,7 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_info
 
 from oodd_eval.data import croissant, layout
 from oodd_eval.data.condition import Condition, conditions_of, ladder_of
@@ -359,15 +360,21 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
             raise
 
 
+_AVX512: Final = {"SkylakeX", "Cooperlake", "SapphireRapids"}
+"""Kernels of OpenBLAS for processors with AVX-512: rewards differ by them in their last bit."""
+
+
 @contextlib.contextmanager
 def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
     """Start worker processes for recording, by default one per core; they end with this one."""
     context, count = multiprocessing.get_context("spawn"), jobs or available_cores()
-    # Sums depend on the number of threads of matrix libraries, which these read when they load,
-    # before any code of ours runs in a child.
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    # Sums depend on the number of threads of matrix libraries and on the registers that these use,
+    # both of which they read when they load, before any code of ours runs in a child.
+    alike = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    if any(library.get("architecture") in _AVX512 for library in threadpool_info()):
+        alike["OPENBLAS_CORETYPE"] = "Haswell"  # AMD's processors with AVX2 have the same kernels.
     with (
-        patch.dict(os.environ, single),
+        patch.dict(os.environ, alike),
         ProcessPoolExecutor(count, context, _begin, (registered(), dict(MEASURED))) as pool,
     ):
         yield pool
