@@ -36,7 +36,7 @@ def test_a_wrong_number_in_a_table_is_put_right():
     assert tables.filled(PAGE.replace(row, row.replace(".", ".9"))) == PAGE
 
 
-@pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5", "horizons", "worlds"])
+@pytest.mark.parametrize("suite", ["ladder", "noisy-1", "noisy-5", "horizons", "worlds", "logs"])
 def test_the_page_of_a_suite_is_printed_from_its_records(suite, capsys):
     directory = BOARD / "suites" / suite
     assert main(["show", str(directory), "--stored", "--markdown"]) == 0

@@ -22,6 +22,12 @@ from oodd_eval.results.identity import Setting
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
+"""Sets of public logs that have anomalous episodes, in the order of columns."""
+
+OUTCOMES = ("pi0-libero",)
+"""Sets of logs whose episodes are known by their outcome alone."""
+
 HEADLINE = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
 
 Row = Callable[[str], str]
@@ -164,6 +170,31 @@ def in_worlds(name: str) -> str:
 
 
 @functools.cache
+def logs() -> dict[str, Board]:
+    """Return the boards of public logs by environment."""
+    of_splits = boards(ResultsDirectory(BOARD / "suites" / "logs").records())
+    return {board.environments[0]: board for board in of_splits}
+
+
+def on_logs(environments: Iterable[str], metric: str) -> Row:
+    """Return a detector's mean of a metric in each of several sets of logs; a dash where not run.
+
+    Of a set whose episodes are known by their outcome the AUC is that of outcomes.
+    """
+
+    def value(name: str, environment: str) -> str:
+        board = logs()[environment]
+        outcome = metric == "auc_pool" and environment in OUTCOMES
+        of_set = "auc_outcome" if outcome else metric
+        if Setting(name) not in board.entries:
+            return "–"  # noqa: RUF001  an en dash
+        mean = board.mean(Setting(name), board.environments, board.anomalies, of_set)
+        return f"{100 * mean.value:.1f}"
+
+    return lambda name: " | ".join(value(name, environment) for environment in environments)
+
+
+@functools.cache
 def claims(split: str) -> dict[tuple[str, str], dict[str, str]]:
     """Return the judgements of a reproduction by claim and measure."""
     return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}
@@ -191,6 +222,8 @@ TABLES: dict[str, Row] = {
     "ladder": of_ladder,
     "worlds": in_worlds,
     "claims": verdicts,
+    "logs": on_logs(LOGS, "auc_pool"),
+    "logs false": on_logs(LOGS, "false_episodes_at_10pct"),
 }
 
 
