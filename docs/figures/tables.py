@@ -119,12 +119,25 @@ def under_noise(name: str) -> str:
     return cells(mean(split, name, m, seed=seed) for m in metrics for split, seed in splits)
 
 
-def of_protocols(name: str) -> str:
-    """Return matched AUC under protocol 2, from the archive, and today."""
+@functools.cache
+def archived(split: str) -> dict[str, dict[str, str]]:
+    """Return the cells of a board of protocol 2 by detector, at Δ = 1, and column."""
     archive = (ROOT / "docs" / "archive" / "protocol-2.md").read_text(encoding="utf-8")
-    mini = archive.split("## Board of mini")[1].split("\n## ")[0]
-    (old,) = re.findall(rf"\| {name} \| Δ=1(?:, 3 seeds)? \| [a-z-]+ \| ([\d.]+) ", mini)
-    return f"{old} → {100 * float(ranking('mini')[name]['auc_matched']):.1f}"
+    section = archive.split(f"## Board of {split}:")[1].split("\n## ")[0]
+    rows = [[c.strip() for c in x.split("|")[1:-1]] for x in section.splitlines() if x[:1] == "|"]
+    head, _, *rows = rows
+    named = (dict(zip(head, row, strict=True)) for row in rows)
+    return {r["detector"]: r for r in named if r["settings"].removesuffix(", 3 seeds") == "Δ=1"}
+
+
+def of_protocols(name: str) -> str:
+    """Return two metrics on two splits, each under protocol 2, from the archive, and today."""
+    metrics = {"matched AUC": "auc_matched", "found within 20": "found_within_20_at_5pct"}
+    return " | ".join(
+        f"{archived(split)[name][column].split()[0]} → {of_board(split, metric)(name)}"
+        for column, metric in metrics.items()
+        for split in ("mini", "standard")
+    )
 
 
 def of_reproductions(table1: str, losses: str) -> Row:
