@@ -93,18 +93,21 @@ def both(pattern, kind="paper", factor=100, digits=1):
     return [x for name in names for x in points(name, kind, factor, "mini-paper", digits=digits)]
 
 
-def level(split, group, kind, other=None):
+def of_all_models():
+    """AUC of all models by group: the paper's, ours at Table 1's strengths, at equal losses."""
+    cells = [float(c) for c in tables.of_reproductions("mini", "mini-paper")("AVG").split(" | ")]
+    return cells[:3], cells[3:]
+
+
+def level(of):
     """By how many points AUC of all models at equal losses is above Table 1's, or the paper's."""
-    table1, losses = {"mini-paper": "mini", "reduced-paper": "standard"}[split], split
-    cells = [float(c) for c in tables.of_reproductions(table1, losses)("AVG").split(" | ")]
-    paper, ours, same = cells[:3] if group == "sensor" else cells[3:]
-    return f"{same - {'paper': paper, 'table 1': ours}[kind]:.0f}"
+    return [f"{group[2] - group[of]:.0f}" for group in of_all_models()]
 
 
 def between_groups():
     """By how many points the paper's AUC of sensor anomalies is the higher one."""
-    cells = [float(c) for c in tables.of_reproductions("mini", "mini-paper")("AVG").split(" | ")]
-    return [f"{cells[0] - cells[3]:.0f}"]
+    sensor, dynamics = of_all_models()
+    return [f"{sensor[0] - dynamics[0]:.0f}"]
 
 
 def differing():
@@ -201,9 +204,9 @@ SENTENCES = [
      lambda: [list(counted("reduced-paper").values()).count("not run")]),
     ("{} of {} verdicts differ", differing),
     ("AUCs are {} points higher for sensor anomalies and {} for dynamics anomalies",
-     lambda: [level("mini-paper", group, "table 1") for group in ("sensor", "dynamics")]),
+     lambda: level(1)),
     ("which the paper found less often, lie {} points above them",
-     lambda: [level("mini-paper", "dynamics", "paper")]),
+     lambda: level(0)[1:]),
     ("In the paper they are, by {} points of AUC.", between_groups),
     ("RIQN (by {} and {} points of AUC, {} and {} of matched AUC)",
      lambda: [*both("riqn-above-riqn-ms-{}", factor=-100),
