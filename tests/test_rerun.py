@@ -1,8 +1,9 @@
-"""Re-runs: seeds drawn once for one version of an entry, what is run, and the whole command."""
+"""Re-runs: seeds drawn once for versions of entries, what is run, and the whole command."""
 
 import dataclasses
 import itertools
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -41,9 +42,9 @@ def on(verdict, split):
 
 def test_bits_are_drawn_once_and_stay(verdict, tmp_path):
     assert read_order(tmp_path / "again") is None
-    first = draw(verdict, tmp_path / "again", NAMES)
-    assert first == draw(verdict, tmp_path / "again", NAMES) == read_order(tmp_path / "again")
-    others = {draw(verdict, tmp_path / str(k), NAMES).bits for k in range(20)}
+    first = draw([verdict], tmp_path / "again", NAMES)
+    assert first == draw([verdict], tmp_path / "again", NAMES) == read_order(tmp_path / "again")
+    others = {draw([verdict], tmp_path / str(k), NAMES).bits for k in range(20)}
     assert len(others) == 20
     # All 128 bits are drawn: each is 0 in one of these and 1 in another.
     ones, zeros = 0, 0
@@ -53,18 +54,19 @@ def test_bits_are_drawn_once_and_stay(verdict, tmp_path):
 
 
 def test_bits_count_for_one_version_of_an_entry_and_its_environments(verdict, tmp_path):
-    draw(verdict, tmp_path / "again", NAMES)
-    with pytest.raises(UsageError, match="on acrobot, cartpole, hopper, expected hopper"):
-        draw(verdict, tmp_path / "again", ["hopper"])
+    draw([verdict], tmp_path / "again", NAMES)
+    draw([verdict], tmp_path / "again", ["hopper"])  # less, which a grant waits for
+    with pytest.raises(UsageError, match="on acrobot, cartpole, hopper, expected ant"):
+        draw([verdict], tmp_path / "again", ["ant"])
     changed = dataclasses.replace(verdict, digest="e" * 64)
     with pytest.raises(UsageError, match="seeds are drawn for one version of an entry"):
-        draw(changed, tmp_path / "again", NAMES)
+        draw([changed], tmp_path / "again", NAMES)
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{}", "[]", '{"schema": 2}', "\x00", "{" * 9999,
-     '{"entry": "", "bits": "7", "day": "", "environments": []}'],
+    ["", "{}", "[]", '{"schema": 3}', "\x00", "{" * 9999,
+     '{"entries": [], "bits": "7", "day": "", "environments": []}'],
 )  # fmt: skip
 def test_a_damaged_order_is_told(tmp_path, text):
     (tmp_path / ORDER).write_text(text)
@@ -165,6 +167,36 @@ def test_rows_are_added_one_by_one_until_all_of_them_can_be_granted(path, capsys
     assert {r.split_digest[:12] for r in earlier(ResultsDirectory(directory))} == {
         load_split(directory / "split").digest[:12]
     }
+
+
+def test_entries_of_a_split_share_one_that_is_recorded_once(path, submitted, capsys):
+    shutil.rmtree(path)  # it has their rows
+    home, results = submitted[0].parents[1], path.parent
+    apart = [
+        submit(home / "out", results, Statement(id=name, submitter="A. Tester"), detectors=name)
+        for name in ("persistence", "random")
+    ]
+    paths = [str(one.path) for one in apart]
+    assert rerun(*paths) == 4
+    assert "several entries need --output" in " ".join(capsys.readouterr().err.split())
+    assert rerun(*paths, "--output", "again") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.count("established here: re-run") == 2
+    assert "for 2 entries" in out
+    granted = []
+    for one in paths:
+        assert rerun(one, "--output", "again", "--grant", "Hopper") == 0
+        granted.append(read_entry(Path(one)).grant)
+    assert [grant.trust for grant in granted] == ["re-run", "re-run"]
+    assert [*granted[0].means] == ["persistence"]
+
+
+def test_entries_of_several_splits_are_refused(path, submitted, monkeypatch, capsys):
+    other = dataclasses.replace(submitted[1], test=11)
+    definitions = iter((submitted[1], other))
+    monkeypatch.setattr(recording, "definition_of", lambda _verdict: next(definitions))
+    assert rerun(path, path, "--output", "again") == 4
+    assert "are on several splits" in capsys.readouterr().err
 
 
 def test_what_is_interrupted_goes_on_with_the_same_seeds(path, monkeypatch, capsys):

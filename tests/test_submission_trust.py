@@ -117,7 +117,7 @@ def test_who_grants_is_plain_text(submissions, tmp_path, name, capsys):
 def compared(draft, fresh, **changes):
     """The verdict on an entry with a re-run of these records, under an order of seeds."""
     verdict = verify_entry(draft.path)
-    order = RerunOrder(verdict.digest, "0" * 32, "2026-11-26", list(THREE), **changes)
+    order = RerunOrder([verdict.digest], "0" * 32, "2026-11-26", list(THREE), **changes)
     again = compare_rerun(verdict.records, fresh, order, verdict.findings)
     return dataclasses.replace(verdict, rerun=again)
 

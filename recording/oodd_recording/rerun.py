@@ -1,4 +1,4 @@
-"""``oodd-eval leaderboard rerun``: run an entry's detectors again, on seeds drawn after it.
+"""``oodd-eval leaderboard rerun``: run entries' detectors again, on seeds drawn after them.
 
 Entries are data; this is the only action that runs a detector for one.
 """
@@ -61,60 +61,82 @@ from oodd_recording.commands import record_split
     "leaderboard rerun leaderboard/results/mine-standard --grant Hopper",
     plugins=True,
 )
-@click.argument("path", type=DIRECTORY, metavar="ENTRY", help="directory of the entry")
+@click.argument(
+    "paths",
+    nargs=-1,
+    type=DIRECTORY,
+    metavar="ENTRY...",
+    required=True,
+    help="entries of one split; several are run on the same fresh seeds",
+)
 @click.option("--detector", default="all", type=Names("detectors"), help=NAMES)
 @click.option("--env", default="all", type=Names("envs"), help=NAMES)
 @click.option("--seed", type=SEEDS, help="seeds of the detectors (default: those of the entry)")
 @click.option(
     "--output",
     type=DIRECTORY,
-    help="directory of the re-run (default: rerun-ENTRY); the same command goes on where it was "
-    "interrupted, and other detectors are added",
+    help="directory of the re-run (default: rerun-ENTRY, of one entry); the same command goes on "
+    "where it was interrupted, and other detectors are added",
 )
-@click.option("--grant", help="once all rows agree, grant the entry the level re-run in this name")
+@click.option("--grant", help="once all rows agree, grant one entry the level re-run in this name")
 @jobs_option
 @limit_options("a fit with its scores", "3h")
 def rerun(options: Options) -> int:
-    """Run an entry's detectors again on seeds drawn now, in a sandbox and row by row, and compare.
+    """Run entries' detectors again on seeds drawn now, in a sandbox and row by row, and compare.
 
-    The exit code is 1 when the entry is better than chance explains or a fit failed, and 2 when the
+    The exit code is 1 when an entry is better than chance explains or a fit failed, and 2 when the
     re-run was interrupted.
     """
-    verdict, console = sound(options.path), make_console()
-    records = chosen(verdict, options)
+    if len(options.paths) > 1 and (options.grant or not options.output):
+        raise UsageError(
+            "several entries need --output, and --grant is for one: run them again together, then "
+            "name each with the same --output and --grant"
+        )
+    verdicts, console = sound(options.paths), make_console()
+    records = chosen(verdicts, options)
     environments = in_order((record.environment for record in records), ENVIRONMENTS)
-    results = ResultsDirectory(options.output or Path(f"rerun-{verdict.name}"))
+    results = ResultsDirectory(options.output or Path(f"rerun-{verdicts[0].name}"))
     if missing := unfinished(records, results):
         require_sandbox()
         limits = Limits(options.timeout, options.memory, (str(results.path.absolute()),))
         plugins = discovered(options, limits)
         check_installed(missing, plugins)
-    order = draw(verdict, results.path, environments)
-    if missing and not _run(verdict, missing, order, plugins, results, options):
-        return 2
-    again = compare_rerun(verdict.records, earlier(results), order, verdict.findings)
-    verdict = replace(verdict, rerun=again)
-    for table in figures(again, ranked_by(records)):
-        print_table(table, console)
-    report(console, verdict, options.verbosity)
+    order = draw(verdicts, results.path, environments)
+    if missing:
+        definition = definition_of(verdicts[0], int(order.bits, 16))
+        if not _run(definition, missing, order, plugins, results, options):
+            return 2
+    fresh = earlier(results)
+    for i, verdict in enumerate(verdicts):
+        again = compare_rerun(verdict.records, fresh, order, verdict.findings)
+        verdicts[i] = replace(verdict, rerun=again)
+        for table in figures(again, ranked_by(records)):
+            print_table(table, console)
+        report(console, verdicts[i], options.verbosity)
     if options.grant:
-        return write_grant(console, options.path, verdict, options.grant)
-    return int(not verdict.ok)
+        return write_grant(console, options.paths[0], verdicts[0], options.grant)
+    return int(not all(verdict.ok for verdict in verdicts))
 
 
-def sound(path: Path) -> EntryVerdict:
-    """Return the verdict on an entry that can be run again; `UsageError` for any other."""
-    verdicts = [*verify(path)]
-    if len(verdicts) != 1 or not verdicts[0].ok:
-        raise UsageError(f"{str(path)!r}: expected one valid entry, see leaderboard verify")
-    verdict = verdicts[0]
-    if not all(record.paired for record in verdict.records.values()):
-        raise UsageError(
-            f"{verdict.name} is of logs, which cannot be recorded again: without a re-run its "
-            "trust is at most re-scored, by leaderboard verify from its scores"
-        )
-    definition_of(verdict)
-    return verdict
+def sound(paths: Sequence[Path]) -> list[EntryVerdict]:
+    """Return verdicts on entries that can be run again together; `UsageError` for others."""
+    verdicts = []
+    for path in paths:
+        of_path = [*verify(path)]
+        if len(of_path) != 1 or not of_path[0].ok:
+            raise UsageError(f"{str(path)!r}: expected one valid entry, see leaderboard verify")
+        verdicts += of_path
+    for verdict in verdicts:
+        if not all(record.paired for record in verdict.records.values()):
+            raise UsageError(
+                f"{verdict.name} is of logs, which cannot be recorded again: without a re-run its "
+                "trust is at most re-scored, by leaderboard verify from its scores"
+            )
+    first, *others = (definition_of(verdict) for verdict in verdicts)
+    if any(other != first for other in others):
+        names = ", ".join(verdict.name for verdict in verdicts)
+        raise UsageError(f"{names} are on several splits: expected entries of one")
+    return verdicts
 
 
 def definition_of(verdict: EntryVerdict, bits: int = 0) -> SplitDefinition:
@@ -131,15 +153,16 @@ def definition_of(verdict: EntryVerdict, bits: int = 0) -> SplitDefinition:
     return replace(definition, name=f"rerun-{drawn[:12]}", seed_base=0, drawn=drawn)
 
 
-def chosen(verdict: EntryVerdict, options: Options) -> list[Record]:
-    """Return the records of an entry that the options choose."""
-    records = [*verdict.records.values()]
+def chosen(verdicts: Sequence[EntryVerdict], options: Options) -> list[Record]:
+    """Return the records of entries that the options choose."""
+    records = [record for verdict in verdicts for record in verdict.records.values()]
     environments = in_order((record.environment for record in records), ENVIRONMENTS)
     environments = select("environment", options.env, environments)
     detectors = select("detector", options.detector, {record.detector for record in records})
     known = sorted({record.seed for record in records})
     if not set(options.seed or known) <= set(known):
-        raise UsageError(f"--seed: {verdict.name} has seeds {', '.join(map(str, known))}")
+        names = ", ".join(verdict.name for verdict in verdicts)
+        raise UsageError(f"--seed: {names} has seeds {', '.join(map(str, known))}")
     return [
         record
         for record in records
@@ -155,7 +178,7 @@ def earlier(results: ResultsDirectory) -> list[Record]:
 
 
 def unfinished(records: Sequence[Record], results: ResultsDirectory) -> list[Record]:
-    """Return those of an entry's records that were not run again with the same outcome."""
+    """Return those of entries' records that were not run again with the same outcome."""
     again = {cell_of(record): record.status for record in earlier(results)}
     return [record for record in records if again.get(cell_of(record)) != record.status]
 
@@ -185,24 +208,30 @@ def _version(plugin: str, version: str, source: str) -> str:
     return f"{plugin} {version}, source {source[:12]}"
 
 
-def draw(verdict: EntryVerdict, directory: Path, environments: Sequence[str]) -> RerunOrder:
-    """Draw bits for an entry and write the order, or go on with the one that is there.
+def draw(
+    verdicts: Sequence[EntryVerdict], directory: Path, environments: Sequence[str]
+) -> RerunOrder:
+    """Draw bits for entries and write the order, or go on with one that is there for them.
 
-    `UsageError`: the order there is for another entry, another version of it, or environments.
+    `UsageError`: the order there is for other entries, other versions of them, or lacks an
+    environment.
     """
     order = read_order(directory)
     if order is None:
         day = datetime.now(UTC).date().isoformat()
-        order = RerunOrder(verdict.digest, secrets.token_hex(16), day, list(environments))
+        digests = [verdict.digest for verdict in verdicts]
+        order = RerunOrder(digests, secrets.token_hex(16), day, list(environments))
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
-    if order.entry != verdict.digest:
-        raise UsageError(
-            f"{str(directory)!r} is a re-run of entry.json {order.entry[:12]}, but {verdict.name} "
-            f"has {verdict.digest[:12]}: seeds are drawn for one version of an entry; name another "
-            "--output"
-        )
-    if order.environments != list(environments):
+    for verdict in verdicts:
+        if verdict.digest not in order.entries:
+            drawn_for = ", ".join(digest[:12] for digest in order.entries)
+            raise UsageError(
+                f"{str(directory)!r} is a re-run of entry.json {drawn_for}, but {verdict.name} "
+                f"has {verdict.digest[:12]}: seeds are drawn for one version of an entry; name "
+                "another --output"
+            )
+    if not set(environments) <= set(order.environments):
         raise UsageError(
             f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
             f"{', '.join(environments)}: name another --output"
@@ -211,7 +240,7 @@ def draw(verdict: EntryVerdict, directory: Path, environments: Sequence[str]) ->
 
 
 def _run(
-    verdict: EntryVerdict,
+    definition: SplitDefinition,
     records: Sequence[Record],
     order: RerunOrder,
     plugins: Plugins,
@@ -220,7 +249,7 @@ def _run(
 ) -> bool:
     """Record the split as far as it is not there, and run what is missing; False if interrupted."""
     bits, directory = int(order.bits, 16), results.path / SPLIT_DIRECTORY
-    record_split(definition_of(verdict, bits), options, order.environments, directory, bits=bits)
+    record_split(definition, options, order.environments, directory, bits=bits)
     split = load_split(directory)
     hidden = (*split_places(split), str(results.path.absolute()))
     settings = RunSettings(
@@ -236,7 +265,7 @@ def _run(
 
 
 def plan_of(records: Sequence[Record], split: Split, plugins: Plugins) -> Plan:
-    """Return the plan of all fits that records of an entry are of, in another split."""
+    """Return the plan of all fits that records of entries are of, in another split."""
     # One record stands for all of an environment, row and seed.
     fits = {(r.environment, r.setting, r.seed): r for r in records}
     plans = [

@@ -122,8 +122,8 @@ def test_whatever_stands_in_an_entry_is_valid_or_refused(fuzzed, results, name):
 
 
 GRANT = {"entry": "0" * 64, "trust": "re-run", "by": "us", "day": "2026-11-23", "how": "so"}
-ORDERED = {"entry": "0" * 64, "bits": "f" * 32, "day": "2026-11-23", "environments": ["ant"],
-           "schema": 2}  # fmt: skip
+ORDERED = {"entries": ["0" * 64], "bits": "f" * 32, "day": "2026-11-23", "environments": ["ant"],
+           "schema": 3}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 The directory of a re-run is a results directory with the split that was built for it, ``split``,
 and the order, ``rerun.json``. The order is written before anything is recorded, and names the
-digest of ``entry.json``: seeds that were drawn for one entry do not count for another.
+digests of each ``entry.json``: seeds that were drawn for some entries do not count for others.
 
 A re-run uses the same code, by its digest, on a split of seeds that the submitter could not know,
 so its numbers differ by chance: by the choice of test, calibration and training episodes. An entry
@@ -27,6 +27,7 @@ from oodd_eval.metrics.bootstrap import (
     sample_cells,
 )
 from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.names import counted
 from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -68,16 +69,16 @@ _FIELDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RerunOrder:
-    """128 random bits drawn on a `day` (ISO 8601) for an entry, by the digest of ``entry.json``.
+    """128 random bits drawn on a `day` (ISO 8601) for entries, by digests of ``entry.json``.
 
     `bits` are 32 hexadecimal digits.
     """
 
-    entry: str
+    entries: list[str]
     bits: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     day: str
     environments: list[str]
-    schema: Literal[2] = 2  # version of the layout; others are refused
+    schema: Literal[3] = 3  # version of the layout; others are refused
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 
@@ -202,7 +203,8 @@ def compare_rerun(
         f"{len(set(map(part, run)))} of {len(set(map(part, records.values())))} {name}"
         for name, part in _PARTS.items()
     ]
-    seeds = f"seeds of 128 random bits, {order.bits}, drawn on {order.day} for this entry"
+    entries = counted(len(order.entries), "entr(y/ies)")
+    seeds = f"seeds of 128 random bits, {order.bits}, drawn on {order.day} for {entries}"
     digests = ", ".join(sorted({record.split_digest[:12] for record in fresh})) or "none"
     how = f"{seeds} (split digest {digests}), row by row in a sandbox: {', '.join(counts)}"
     drawn = {cell_of(r)[:3] for r in records.values() if r.environment in order.environments}
