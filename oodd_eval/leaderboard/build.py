@@ -11,7 +11,7 @@ from typing import Final
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS
-from oodd_eval.data.files import GZIP, compress, decompress, write_bytes, write_text
+from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.leaderboard import site
@@ -130,9 +130,9 @@ def _files(output: Path) -> set[str]:
 
 
 def _content(path: Path) -> bytes:
-    """Return what a file says: versions of zlib compress the same content differently."""
+    """Return what a file says: other versions compress the same content differently."""
     content = path.read_bytes()
-    return decompress(content) if path.suffix == GZIP else content
+    return decompress(content) if path.suffix in PACKED else content
 
 
 def _has_content(path: Path, compressed: bytes) -> bool:
@@ -203,7 +203,7 @@ def _section(section: LeaderboardSection) -> str:
     ]
     body = Section(
         _title(board),
-        verdict=verdict_of(board),
+        verdict=_verdict(ranks),
         findings=findings_of(board),
         tables=[table for table in body_tables if table],
         notes=tables.notes(board),
@@ -222,6 +222,20 @@ def _section(section: LeaderboardSection) -> str:
         markdown_body(body),
     ]
     return "\n".join(parts)
+
+
+def _verdict(ranks: RankedBoard) -> str:
+    """Return the sentence that comes first, and before it which rows share the first rank.
+
+    A single comparison of two rows is not corrected for all pairs of the board, as ranks are.
+    """
+    first = [str(s.entry) for s in ranks.standings if s.rank == 1 and s.primary and not s.below]
+    if len(first) < 2:
+        return verdict_of(ranks.board)
+    return (
+        f"{', '.join(first)} share the first rank: over all pairs of rows (Holm) no difference is "
+        f"shown. As a single comparison: {verdict_of(ranks.board)}"
+    )
 
 
 def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
