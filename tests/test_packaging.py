@@ -39,7 +39,7 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_eval/data/shipped/mini/croissant.json",
         "oodd_eval/plugins/template/templates/pyproject.toml.in",
         "oodd_eval/plugins/template/templates/gitignore.in",
-        "oodd_eval/leaderboard/published.jsonl.gz",
+        "oodd_eval/leaderboard/published.jsonl.xz",
         *(f"oodd_eval/data/recipes/{path.name}" for path in (ROOT / "recipes").glob("*.toml")),
     } <= names
     assert "oodd_recording/frozen/ant.npz" in names

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import lzma
 import re
 
 import numpy as np
@@ -11,7 +12,7 @@ from helpers_site import submitted
 
 from oodd_eval.cli import board as board_command
 from oodd_eval.cli.main import main
-from oodd_eval.data.files import compress, decompress
+from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard import published
 from oodd_eval.leaderboard.entry import SuiteSection, sections
@@ -26,6 +27,7 @@ from oodd_eval.leaderboard.published import (
 )
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.tables import Table
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
@@ -106,7 +108,8 @@ def run_of(records, directory):
 
 
 def suite_of(records):
-    return SuiteSection("graded", Board(records), [], graded=True)
+    table = Table("Detection thresholds", ["detector", "threshold"], [[records[0].detector, "0.9"]])
+    return SuiteSection("graded", Board(records), [table], graded=True)
 
 
 def test_show_prints_further_suites_unless_one_board_is_asked_for(
@@ -343,7 +346,7 @@ def test_place_prints_the_rows_nearby_unless_all_are_asked_for(
 
 def test_the_file_is_read_from_a_compressed_copy_alone(shipped, tmp_path, monkeypatch):
     broken = tmp_path / published.PUBLISHED
-    broken.write_bytes(compress(b'{"schema": 1}\n'))
+    broken.write_bytes(lzma.compress(b'{"schema": 1}\n'))
     monkeypatch.setattr(published, "published_file", lambda: broken)
     with pytest.raises(ResultsError, match="has schema 1, expected 3"):
         read_published()

@@ -161,9 +161,10 @@ def thresholds(suite: str, name: str) -> list[str]:
     """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
     page = (BOARD / "suites" / suite / "README.md").read_text(encoding="utf-8")
     table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    rows = [[cell.strip().replace("\\", "") for cell in line.split("|")[1:-1]]
+            for line in table.splitlines()]  # fmt: skip
     (row,) = (row for row in rows if row[0] == name)
-    return [row[1].replace("\\", ""), *row[5:]]
+    return [row[1], *row[5:]]
 
 
 def of_ladder(name: str) -> str:
@@ -172,11 +173,12 @@ def of_ladder(name: str) -> str:
 
 
 def in_worlds(name: str) -> str:
-    """Return matched AUC over all cells and by world, and shares found by the loss's growth."""
+    """Return matched AUC, all and by world, shares found by the loss's growth, false episodes."""
     environments = board("worlds").environments
     means = [mean("worlds", name, "auc_matched", environments=[e]) for e in environments]
     aucs = cells([mean("worlds", name, "auc_matched"), *means])
-    return " | ".join([aucs, *thresholds("worlds", name)[1:]])
+    false = cells([mean("worlds", name, "false_episodes_at_5pct")])
+    return " | ".join([aucs, *thresholds("worlds", name)[1:], false])
 
 
 @functools.cache

@@ -38,7 +38,6 @@ from oodd_eval.results.render.data import ranking_csv
 from oodd_eval.results.render.text import markdown_section, print_prose, print_sections
 from oodd_eval.results.report import Section
 from oodd_eval.results.standings import Standing
-from oodd_eval.results.strengths import overview, thresholds
 from oodd_eval.results.tables import Table
 
 NEARBY: Final = 3
@@ -74,9 +73,9 @@ def show(options: Options) -> int:
         )
     if options.split or output.csv or output.quiet:
         return 0
-    for name, suite in published.suites.items():
-        table = overview(suite, thresholds(suite.records))
-        output.print(Section(f"Suite {name}, digest {suite.digest[:12]}", tables=[table]))
+    for suite in published.suites:
+        title = f"Suite {suite.name}, digest {suite.digest[:12]}"
+        output.print(Section(title, tables=[suite.thresholds]))
     return 0
 
 

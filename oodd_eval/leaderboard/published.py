@@ -2,30 +2,24 @@
 
 ``leaderboard build`` writes the file, the wheel ships it. It holds the records of all entries
 without what no ranking needs, as lines of JSON, compressed. Each record's provenance says which
-entry it is from, at which level of trust, and whether its row is primary; or of which further test
-suite it is. A run is placed by the code that ranks the board itself.
+entry it is from, at which level of trust, and whether its row is primary. A run is placed by the
+code that ranks the board itself. Of further test suites with several strengths it has the table of
+detection thresholds.
 """
 
+import json
+import lzma
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from oodd_eval.data.files import compress
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.leaderboard.entry import LeaderboardSection, SuiteSection
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.names import counted
-from oodd_eval.results.board import (
-    Board,
-    Conditions,
-    boards,
-    expected_cells,
-    grouped,
-    level_of,
-    ranked_by,
-)
+from oodd_eval.results.board import Conditions, boards, expected_cells, grouped, level_of, ranked_by
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record, same_terms
@@ -37,10 +31,9 @@ from oodd_eval.results.standings import (
     primary_settings,
     ranked,
 )
-from oodd_eval.results.strengths import DETECTION
 from oodd_eval.results.tables import Mean, Table, texts
 
-PUBLISHED: Final = "published.jsonl.gz"
+PUBLISHED: Final = "published.jsonl.xz"
 
 _SOON: Final = f"found_within_{FOUND_WITHIN[0]}"
 
@@ -57,7 +50,7 @@ def kept_metrics(records: Sequence[Record]) -> tuple[str, ...]:
     return *ranked_by(records), *(f"{name}_{level_of(records)}" for name in _BESIDE)
 
 
-_OF_SUITE: Final = '"provenance": {"suite": '  # in the line of a record of a further suite
+_OF_SUITE: Final = '{"suite": '  # begins the line of a further suite
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,18 +81,19 @@ class PublishedBoard:
         return str(self.conditions)
 
 
+class PublishedSuite(NamedTuple):
+    """A further test suite with several strengths: its name, its split's digest, thresholds."""
+
+    name: str
+    digest: str
+    thresholds: Table
+
+
 class Published(NamedTuple):
-    """All published boards, and the file that they are from."""
+    """All published boards, and further suites."""
 
     boards: list[PublishedBoard]
-    file: Path
-
-    @property
-    def suites(self) -> dict[str, Board]:
-        """The boards of further suites with several strengths, by name; reading them takes long."""
-        records = read_records(self.file, matches=lambda line: _OF_SUITE in line)
-        by_suite = grouped(records, lambda r: str(r.provenance["suite"]))
-        return {name: Board(records) for name, records in by_suite.items()}
+    suites: list[PublishedSuite]
 
 
 def published_bytes(
@@ -118,13 +112,14 @@ def published_bytes(
         for row in section.ranks.standings
         for record in row.records
     ]
-    records += [
-        slim(record, (DETECTION,), suite=suite.name)
-        for suite in suites
-        if suite.graded
-        for record in suite.board.records
-    ]
-    return compress("".join(record.to_json() + "\n" for record in records).encode())
+    lines = [record.to_json() for record in records]
+    for suite in suites:
+        if suite.graded:
+            first = {k: getattr(suite.tables[0], k) for k in ("title", "header", "rows", "note")}
+            lines.append(
+                json.dumps({"suite": suite.name, "digest": suite.board.digest, "table": first})
+            )
+    return lzma.compress("".join(line + "\n" for line in lines).encode())
 
 
 def published_file() -> Path:
@@ -146,15 +141,23 @@ def published_file() -> Path:
 def read_published(file: Path | None = None) -> Published:
     """Read the boards of the file, by default the one of this installation."""
     file = file or published_file()
+    suites: list[PublishedSuite] = []
+
+    def is_record(line: str) -> bool:
+        if of_suite := line.startswith(_OF_SUITE):
+            about = json.loads(line)
+            suites.append(PublishedSuite(about["suite"], about["digest"], Table(**about["table"])))
+        return not of_suite
+
     published = []
-    for board in boards(read_records(file, matches=lambda line: _OF_SUITE not in line)):
+    for board in boards(read_records(file, matches=is_record)):
         origin = {r.setting: r.provenance for r in board.records}
         entries, trust = (
             {row: about[k] for row, about in origin.items()} for k in ("entry", "trust")
         )
         primary = {row for row, about in origin.items() if about["primary"]}
         published.append(PublishedBoard(board.records, entries, trust, primary))
-    return Published(published, file)
+    return Published(published, suites)
 
 
 def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:
