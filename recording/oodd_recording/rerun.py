@@ -89,8 +89,8 @@ def rerun(options: Options) -> int:
     """
     if len(options.paths) > 1 and (options.grant or not options.output):
         raise UsageError(
-            "several entries need --output, and --grant is for one: run them again together, then "
-            "name each with the same --output and --grant"
+            "several entries need --output and no --grant: run them together first, then name each "
+            "one with the same --output and --grant"
         )
     verdicts, console = sound(options.paths), make_console()
     records = chosen(verdicts, options)

@@ -2,7 +2,7 @@
 
 The directory of a re-run is a results directory with the split that was built for it, ``split``,
 and the order, ``rerun.json``. The order is written before anything is recorded, and names the
-digests of each ``entry.json``: seeds that were drawn for some entries do not count for others.
+digest of each ``entry.json``: seeds that were drawn for some entries do not count for others.
 
 A re-run uses the same code, by its digest, on a split of seeds that the submitter could not know,
 so its numbers differ by chance: by the choice of test, calibration and training episodes. An entry
