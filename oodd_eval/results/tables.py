@@ -175,16 +175,18 @@ def over_all(
 def separability(board: Board, *, intervals: bool = False) -> Table:
     """Return matched AUC by anomaly group and by environment, the best mean first.
 
-    Beside the mean over all cells stand that of smoothed scores and that against another twin.
+    Beside the mean over all cells stand that of smoothed scores and that against another twin,
+    where records have them.
     """
     columns = _by_group(board, "mean", intervals=intervals)
     over = board.environments, board.anomalies
-    columns += [Mean(n[4:], n, *over, intervals) for n in _BESIDE_MATCHED]
+    present = board.present(_BESIDE_MATCHED)
+    columns += [Mean(name.removeprefix("auc_"), name, *over, intervals) for name in present]
     columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
     entries = best_first(board)
     rows = [[str(entry), *texts(board, entry, columns)] for entry in entries]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    beside = {c.title: c.metric for c in columns if c.metric in board.present(_BESIDE_MATCHED)}
+    beside = {c.title: c.metric for c in columns if c.metric in present}
     notes = [explained(beside), unranked(board), *reasons(board, entries, columns)]
     note = " ".join(filter(None, notes))
     return Table(title, ["detector", *(c.title for c in columns)], rows, note=note)
