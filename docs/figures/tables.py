@@ -46,11 +46,11 @@ def ranking(split: str) -> dict[str, dict[str, str]]:
 
 
 @functools.cache
-def board(name: str, seed: int | None = None) -> Board:
+def board(name: str) -> Board:
     """Return a suite's board, or that of the entries on mini."""
     if name == "mini":
         records = [r for e in read_entries(BOARD / "results") for r in e.records]
-        records = [r for r in records if r.split == "mini" and seed in (None, r.seed)]
+        records = [r for r in records if r.split == "mini"]
     else:
         records = ResultsDirectory(BOARD / "suites" / name).records()
     (of_split,) = boards(records)
@@ -62,12 +62,11 @@ def mean(
     row: str | Setting,
     metric: str,
     *,
-    seed: int | None = None,
     environments: Iterable[str] = (),
     anomalies: Iterable[str] = (),
 ) -> float:
     """Return a row's mean of a metric in per cent, by default over all cells."""
-    records = board(name, seed)
+    records = board(name)
     setting = row if isinstance(row, Setting) else Setting(row)
     over = [*environments] or records.environments, [*anomalies] or records.anomalies
     return 100 * records.mean(setting, *over, metric).value
@@ -112,11 +111,36 @@ def at_horizons(name: str) -> str:
     return cells(mean("horizons", Setting(name, h), m) for m in HEADLINE for h in (1, 10, 20))
 
 
+NOISE = ("mini", "noisy-1", "noisy-5")
+"""The suites without noise, and with 1 and 5 % of it."""
+
+
 def under_noise(name: str) -> str:
-    """Return three metrics of a detector, each without noise and with two amounts of it."""
+    """Return three metrics of a detector, each by the amount of noise."""
     metrics = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
-    splits = (("mini", 0), ("noisy-1", None), ("noisy-5", None))
-    return cells(mean(split, name, m, seed=seed) for m in metrics for split, seed in splits)
+    return cells(mean(suite, name, metric) for metric in metrics for suite in NOISE)
+
+
+def of_kind_under_noise(kind: str) -> str:
+    """Return what two detectors find of a kind of anomalies, each by the amount of noise."""
+    found = "found_within_20_at_5pct"
+    rows = ("pe-a", "mewma-a")
+    return cells(mean(suite, row, found, anomalies=[kind]) for row in rows for suite in NOISE)
+
+
+def beside_oracle(cells_of: str) -> str:
+    """Return matched AUC and what is found of the oracle and of `pe-a`, by the amount of noise.
+
+    The cells are named as ``cartpole, gravity`` or ``cartpole, all kinds``.
+    """
+    environment, kind = cells_of.split(", ")
+    kinds = [] if kind == "all kinds" else [kind]
+    return cells(
+        mean(suite, row, metric, environments=[environment], anomalies=kinds)
+        for row in ("oracle-gym", "pe-a")
+        for metric in HEADLINE[:2]
+        for suite in NOISE
+    )
 
 
 @functools.cache
@@ -225,6 +249,8 @@ TABLES: dict[str, Row] = {
     "papers": by_group,
     "horizons": at_horizons,
     "noise": under_noise,
+    "noise kinds": of_kind_under_noise,
+    "oracles": beside_oracle,
     "protocols": of_protocols,
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
     "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
