@@ -20,6 +20,8 @@ from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER, metric_info
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
+from oodd_eval.results.compare import write_reference
+from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import Rules, cell_metrics
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.text import print_prose, print_table
@@ -87,6 +89,16 @@ def test_markdown_has_every_table_with_its_columns_and_numbers():
     row = next(t for title, t in intervals.items() if title.startswith("Separability"))[2]
     assert re.fullmatch(r"67\.5 \\\[6\d\.\d, (67\.5|[67]\d\.\d)\]", row[1])
     assert "No records" in rendered([])
+
+
+def test_a_reference_with_chosen_metrics_has_no_tables_of_dashes(tmp_path):
+    """Without any metric, the tables say that all failed."""
+    kept = tmp_path / "records.jsonl"
+    write_reference([r for r in example() if r.ok], kept, keep=["found_within_20_at_5pct"])
+    titles = markdown_tables(rendered(ResultsDirectory(tmp_path).records()))
+    assert [*titles] == ["Guaranteed alarms at 5 % (%)"]
+    failed = [make_record("x", status="error", reason="none")]
+    assert any(title.startswith("Separability") for title in markdown_tables(rendered(failed)))
 
 
 class _Html(HTMLParser):

@@ -105,11 +105,13 @@ class Report:
     def _of_board(self, board: Board) -> Section:
         ok = sum(r.ok for r in board.records)
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
+        # Stored records have chosen metrics: tables of others would have dashes alone.
+        stored = any(record.metrics for record in board.records)
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
             findings_of(board, self.level),
-            [table for table in self._tables(board) if table],
+            [t for t in self._tables(board) if t and not (stored and t.blank)],
             notes=tables.notes(board),
             verdict=verdict_of(board, self.level),
         )
