@@ -18,6 +18,7 @@ from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.strengths import DETECTION, Strengths
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
@@ -181,19 +182,41 @@ def of_reproductions(table1: str, losses: str) -> Row:
     return row
 
 
-def thresholds(suite: str, name: str) -> list[str]:
-    """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
+def overview(suite: str, name: str) -> list[str]:
+    """Return the cells of a row of detection thresholds on a suite's page."""
     page = (BOARD / "suites" / suite / "README.md").read_text(encoding="utf-8")
     table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
     rows = [[cell.strip().replace("\\", "") for cell in line.split("|")[1:-1]]
             for line in table.splitlines()]  # fmt: skip
     (row,) = (row for row in rows if row[0] == name)
+    return row
+
+
+def thresholds(suite: str, name: str) -> list[str]:
+    """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
+    row = overview(suite, name)
     return [row[1], *row[5:]]
+
+
+LADDER = "ladder-noisy-1"
 
 
 def of_ladder(name: str) -> str:
     """Return a row of the overview on the ladder's page: threshold, and shares by rung."""
-    return " | ".join(thresholds("ladder", name))
+    return " | ".join(thresholds(LADDER, name))
+
+
+def by_rung(place: str) -> str:
+    """Return what a row finds of an environment's ladder by rung, named as ``acrobot, pe-a``."""
+    environment, name = place.split(", ")
+    own = [r for r in board(LADDER).records
+           if (r.environment, r.setting) == (environment, Setting(name))]  # fmt: skip
+    strengths = Strengths.of(own)
+    rungs = (Board(strengths.at(own, rung)) for rung in strengths.names)
+    return cells(
+        100 * rung.mean(Setting(name), rung.environments, rung.anomalies, DETECTION).value
+        for rung in rungs
+    )
 
 
 def in_worlds(name: str) -> str:
@@ -255,6 +278,7 @@ TABLES: dict[str, Row] = {
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
     "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
     "ladder": of_ladder,
+    "ladder oracles": by_rung,
     "worlds": in_worlds,
     "claims": verdicts,
     "logs": on_logs(),
